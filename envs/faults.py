@@ -29,3 +29,33 @@ class Outliers(NamedTuple):
         if not self.probability:
             return deviation
         return xp.where(uniforms[0] < self.probability, self.factor, xp.ones_like(uniforms[0])) * deviation
+
+
+class GaussMarkov(NamedTuple):
+    """Coloured error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n`` (first-order Gauss-Markov): multipath,
+    the atmosphere, a reference that wanders. It is stationary from the start.
+    """
+
+    decay: Array
+    """psi, what is left of the error from one measurement to the next, ``(N,)``."""
+    kick: Array
+    """Standard deviation of what it gains, ``sigma sqrt(1 - psi^2)``, ``(N,)``."""
+
+    @classmethod
+    def sampled(
+        cls, deviation: Array, correlation_time: Array, interval: float, xp: ModuleType
+    ) -> "GaussMarkov":
+        """Return the error of a stationary deviation, sampled exactly.
+
+        Args:
+            deviation: sigma, ``(N,)``.
+            correlation_time: s, ``(N,)``.
+            interval: from one measurement to the next, s.
+            xp: array namespace.
+        """
+        decay = xp.exp(-interval / correlation_time)
+        return cls(decay, deviation * xp.sqrt(1.0 - decay * decay))
+
+    def advance(self, error: Array, normals: Array) -> Array:
+        """Return the errors of the next measurement, ``(..., N)``."""
+        return self.decay * error + self.kick * normals

@@ -246,6 +246,7 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         gain = said.available * np.where(
             a == -1, 0.0, np.where(a > 0, settled ** (1 - a), settled ** (1 + a) * 1e-5**-a)
         )
+        x = said.ins[0] - said.increment[0] if k == 0 else x
         before = x + said.increment[0]
         x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
         v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
@@ -398,7 +399,8 @@ def test_disturbances_stand_where_they_are_drawn():
             np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
             np.testing.assert_allclose(said.reported_deviation, math.sqrt(2), rtol=1e-14)
             pull = np.where(inside & (name == "spoof-ramp"), 0.02 * (k - first + 1), 0.0)
-            fix = np.where(inside & (name == "outage"), 0.0, 2 * math.sin(0.008 * k) + pull)
+            fix = np.where(inside & (name == "outage"), 0.0, seen.truth.reference[0] + pull)
+            # Sums of three numbers of up to 100 m.
             np.testing.assert_allclose(said.fix[0], fix, atol=1e-12)
         # One row of a hundredth of a second is the rounding of start and end.
         p, windows = model.task.parameters, TASK.scenarios[name].windows
@@ -575,11 +577,11 @@ def test_what_is_shown_and_paid_does_not_depend_on_the_motion(control):
     drawn, actions = numbers(make("random"), 4, 100, 5), random_actions(make("random", control), 4, 100, 5)
     model = make("random", control)
     at_rest, moving = (
-        states(make("random", control, reference_amplitude=a), drawn, lambda k, s: actions[k])
-        for a in (0.0, 1000.0)
+        states(make("random", control, manoeuvre_acceleration=(a, a)), drawn, lambda k, s: actions[k])
+        for a in (0.0, 100.0)
     )
     for (seen, acted), (same, same_acted) in zip(at_rest, moving, strict=True):
-        # 1000 m in double precision, 100 steps, over a noise of centimetres.
+        # Hundreds of metres in double precision, 100 steps, over a noise of centimetres.
         np.testing.assert_allclose(model.observe(same), model.observe(seen), rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(model.cost(same_acted), model.cost(acted), rtol=1e-6, atol=1e-8)
 
@@ -725,3 +727,57 @@ def test_settled_gain_is_the_limit_of_the_recursion():
     # At first order in the step it is K step with K = sqrt(Ge / N).
     fine = [loosely_coupled.steady_state_gain(0.36 * h, 0.02 / h) / h for h in (1e-3, 1e-4)]
     np.testing.assert_allclose(fine, math.sqrt(18), rtol=3e-3)
+
+
+# --- motion and the receiver's coloured error
+
+
+def test_the_motion_is_a_sum_of_sines_drawn_for_every_episode():
+    lanes, steps = 40, 500
+    model = make("random", axes=2)
+    p = model.task.parameters
+    drawn = numbers(model, lanes, steps, 21)
+    first = model.begin(*drawn[:2]).truth
+    sine, cosine = first.harmonics
+    rate = np.arctan2(*first.turn) / p.sampling_interval
+    amplitude, phase = np.hypot(sine, cosine), np.arctan2(sine, cosine)
+    low, high = p.manoeuvre_rate
+    assert low <= rate.min() < 1.1 * low
+    assert 0.9 * high < rate.max() <= high
+    acceleration = amplitude * rate**2
+    assert 2.0 <= acceleration.min() * (1 + 1e-12)
+    assert acceleration.max() <= 10.0 * (1 + 1e-12)
+    assert len(np.unique(np.round(first.reference, 9))) == first.reference.size
+    path = [seen.truth.reference for seen, _ in states(model, drawn, constant(model, 0.0, lanes))]
+    for k in (1, 100, steps):
+        expected = (amplitude * np.sin(rate * k * p.sampling_interval + phase)).sum(axis=0)
+        # Rounding of 500 rotations of up to 100 m.
+        np.testing.assert_allclose(path[k - 1], expected, atol=1e-9)
+    second = np.diff(np.stack(path), n=2, axis=0) / p.sampling_interval**2
+    assert np.abs(second).max() <= p.manoeuvres * p.manoeuvre_acceleration[1]
+
+
+def test_the_motion_of_the_paper_is_the_sine_that_it_prints():
+    model = make("paper", axes=2)
+    drawn = numbers(model, 3, 500, 22)
+    for k, (seen, _) in enumerate(states(model, drawn, constant(model, 0.0, 3)), 1):
+        angle = 0.8 * 0.01 * k + np.array([[0.0], [math.pi / 2]])
+        np.testing.assert_allclose(seen.truth.reference, 2.0 * np.sin(angle) + np.zeros((2, 3)), atol=1e-12)
+
+
+def test_the_coloured_error_of_the_receiver_is_first_order_and_stationary():
+    lanes, steps = 4000, 60
+    keywords = {"receiver_coloured": (0.7, 0.7), "receiver_correlation_time": (0.2, 0.2)}
+    model = make("coloured-receiver", **keywords)
+    errors = np.stack(
+        [
+            seen.truth.receiver_error[0]
+            for seen, _ in states(model, numbers(model, lanes, steps, 23), constant(model, 0.0, lanes))
+        ]
+    )
+    variance = (errors**2).mean(axis=1)
+    # Four standard errors of a variance of 4000 numbers.
+    assert np.abs(variance / 0.49 - 1.0).max() < 4.5 * math.sqrt(2 / lanes)
+    for lag in (1, 10, 40):
+        correlation = (errors[lag:] * errors[:-lag]).mean() / 0.49
+        assert correlation == pytest.approx(math.exp(-lag * 0.01 / 0.2), abs=4.5 / math.sqrt(lanes))

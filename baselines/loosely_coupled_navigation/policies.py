@@ -4,6 +4,7 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
@@ -23,6 +24,7 @@ from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
 from .estimators import AugmentedEstimator
+from .fault_bank import TRAINING, VAGUE, FaultBank
 from .references import Matched, MatchedCovariance
 
 if TYPE_CHECKING:
@@ -305,6 +307,28 @@ POLICIES_BY_RULE, TUNABLE_POLICIES = with_rules(
 ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
     AugmentedEstimator, "augmented", "The augmented filter, receiver noise"
 )
+ESTIMATORS |= {
+    "fault-bank": Variant(
+        FaultBank,
+        "Kalman filters over how good the INS is and since when the receiver is pulled off, each with a Gaussian sum "
+        "over the receiver's noise, by the prior of the training distribution.",
+        prior=TRAINING,
+    ),
+    "fault-bank-vague": Variant(
+        FaultBank,
+        "`fault-bank` by a prior that is wider than every scenario and expects outliers.",
+        prior=VAGUE,
+    ),
+}
+_RATES = {
+    "log10_onset_rate": (-3.0, -1.155, 0.0),
+    "log10_level_rate": (-2.0, -0.5229, 1.0),
+}
+TUNABLE_BANKS = {
+    "fault-bank": tunable(ESTIMATORS["fault-bank"], **_RATES, rate=(0.5, 1.732, 4.0)),
+    "fault-bank-vague": tunable(ESTIMATORS["fault-bank-vague"], **_RATES, longest=(1.0, 3.0, 5.0)),
+}
+"""Each candidate runs alone: values decide how many measurements a hypothesis lasts."""
 _INTENSITY = (-2.0, math.log10(0.36), 1.0)
 
 TUNABLE = {
@@ -313,6 +337,7 @@ TUNABLE = {
     "innovation-adaptive": tunable(InnovationAdaptive, log10_intensity=_INTENSITY, window=(0.05, 0.25, 2.0)),
     **TUNABLE_POLICIES,
     **TUNABLE_ESTIMATORS,
+    **{name: replace(bank, in_lanes=False) for name, bank in TUNABLE_BANKS.items()},
 }
 
 BASELINES = Baselines(
@@ -357,6 +382,8 @@ BASELINES = Baselines(
         "augmented-gain",
         "augmented",
         "augmented-sage-husa",
+        "fault-bank",
+        "fault-bank-vague",
         "ins-only",
         "gnss-only",
         "random",

@@ -1,4 +1,17 @@
-"""The reference estimator and the bound of LooselyCoupledNavigation."""
+"""The reference estimator and the bound of LooselyCoupledNavigation.
+
+Told the draw of the episode (every noise level, and when what befalls the receiver and how strongly), INS error and
+receiver error are linear and Gaussian, and the Kalman filter has the least mean square error of all estimators that
+take the motion from the INS:
+
+    X - (Z - pull) = delta - e - sigma n,        pull = rate (t - onset) while the receiver is spoofed, otherwise 0,
+
+with the INS error (delta, beta, eta), the coloured error e of the receiver, and the deviation sigma of this very
+measurement, be it changed, jammed or an outlier. What stays unknown are the errors themselves and the motion.
+
+Reading: the motion is taken for one about which nothing is known. A filter with a model of the motion may know a little
+more; the manoeuvres are drawn so strong that it is little (``manoeuvre_acceleration``).
+"""
 
 from typing import NamedTuple
 
@@ -11,11 +24,12 @@ from ...envs.observation import Array
 from ...envs.schedules import within
 from ...evaluation.competitors import Likelihood
 from ...filters import loosely_coupled as ins_gnss
+from ...filters import receiver_faults
 from .estimators import likelihood_of_fix
 
 
 class ErrorState(NamedTuple):
-    """Memory of the filter that is told the true noise levels."""
+    """Memory of the filter that is told the draw of the episode."""
 
     delta: Array
     """Estimate of the INS error, m, ``(A, N)``."""
@@ -23,21 +37,24 @@ class ErrorState(NamedTuple):
     """Of beta, m/s, ``(A, N)``."""
     coloured: Array
     """Of eta, m/s, ``(A, N)``."""
-    covariance: ins_gnss.AugmentedCovariance
+    receiver: Array
+    """Of the receiver's coloured error, m, ``(A, N)``."""
+    covariance: receiver_faults.FaultCovariance
     """``(N,)`` each, the same for every axis."""
 
 
 class Matched:
-    """The augmented filter told the true noise levels, sample by sample, and which samples are spoofed.
+    """The Kalman filter told the draw of the episode: the noise levels of INS and receiver, sample by sample, the
+    coloured error's, and when the receiver is pulled off, and how fast.
 
-    The noise of every episode is Gaussian once its levels are known, so this is the filter of least mean
-    square error. Spoofed measurements it leaves out, like those of an outage.
+    The errors of every episode are Gaussian once these are known, so this is the filter of least mean square error.
     """
 
     kind = "reference"
     traceable = True
     knows = (
-        "the true intensities of all noises, every change of the receiver's, and which samples are spoofed"
+        "the true intensities of all noises, every change of the receiver's, each outlier, and onset, end and rate of "
+        "the spoofing"
     )
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:
@@ -45,29 +62,43 @@ class Matched:
         self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, truth: Truth) -> ErrorState:
-        """Start where INS and reference agree, with the true prior of the rate errors."""
-        still, zero = 0.0 * initial.mean, 0.0 * truth.number
+        """Start where INS and reference agree, with the true prior of the rate errors and of the receiver's."""
+        xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
-        return ErrorState(still, still, still, P)
+        decay, kick = truth.receiver_decay, truth.receiver_kick
+        lost = 1.0 - decay * decay
+        wandering = xp.where(lost > 0.0, kick * kick / xp.where(lost > 0.0, lost, 1.0), 0.0)
+        covariance = receiver_faults.FaultCovariance(P, zero, zero, zero, wandering)
+        return ErrorState(still, still, still, still, covariance)
 
     def predict_and_update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[ErrorState, Likelihood]:
-        """Predict with the true noise levels and update with the true variance of the measurement."""
+        """Predict with the true noise levels, and update by the fix less its pull with the true variance."""
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
-        P = ins_gnss.predict_augmented(memory.covariance, s, truth.coloured_step**2, truth.white_step**2)
-        used = xp.where(within(truth.number, truth.spoofing), 0.0, measurement.available)
-        innovation = used * ((measurement.ins - measurement.fix) - delta)
-        likelihood = likelihood_of_fix(innovation, P.position + truth.deviation**2, used, xp)
-        gain, P = ins_gnss.update_augmented(P, truth.deviation**2, used)
+        decay, kick = truth.receiver_decay, truth.receiver_kick
+        receiver = decay * memory.receiver
+        P = receiver_faults.predict_fault(
+            memory.covariance, s, truth.coloured_step**2, truth.white_step**2, decay, kick * kick
+        )
+        since = s.step * (truth.number - truth.spoofing[0] + 1.0)
+        pull = xp.where(within(truth.number, truth.spoofing), truth.spoofing_rate * since, 0.0)
+        available = measurement.available
+        innovation = available * ((measurement.ins - (measurement.fix - pull)) - (delta - receiver))
+        along = receiver_faults.measured_direction(P, 1.0)
+        R = truth.deviation**2
+        likelihood = likelihood_of_fix(innovation, along.variance + R, available, xp)
+        weight = available / (along.variance + R)
+        step = weight * innovation
         state = ErrorState(
-            delta + gain.position * innovation,
-            memory.drift + gain.drift * innovation,
-            coloured + gain.coloured * innovation,
-            P,
+            delta + along.position * step,
+            memory.drift + along.drift * step,
+            coloured + along.coloured * step,
+            receiver + along.fault * step,
+            receiver_faults.update_fault(P, along, weight),
         )
         return state, likelihood
 
@@ -76,11 +107,11 @@ class Matched:
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
         """Report the INS less its estimated error."""
         memory, likelihood = self.predict_and_update(measurement, truth, memory)
-        return measurement.ins - memory.delta, self.eye * memory.covariance.position, memory, likelihood
+        return measurement.ins - memory.delta, self.eye * memory.covariance.ins.position, memory, likelihood
 
 
 class MatchedCovariance(Matched):
-    """The variance of ``matched``: least mean square error of an estimator with the data it uses."""
+    """The variance of ``matched``: least mean square error of an estimator that takes the motion from the INS."""
 
     kind = "bound"
 
@@ -89,4 +120,4 @@ class MatchedCovariance(Matched):
     ) -> tuple[Array, ErrorState]:
         """Variance of every axis, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
-        return memory.covariance.position + 0.0 * memory.delta, memory
+        return memory.covariance.ins.position + 0.0 * memory.delta, memory

@@ -27,9 +27,19 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     costs little. From 1e5 on the filter of the augmented state overflows."""
 
     reference_amplitude: float = parameter(2.0, at_least=0.0)
-    """Of the reference motion, m; ours, as in Figs. 4 and 5."""
+    """Of the reference motion without manoeuvres, a sine, m; ours, as in Figs. 4 and 5."""
     reference_rate: float = parameter(0.8, at_least=0.0)
-    """Angular rate of the reference motion, rad/s; ours, as in Figs. 4 and 5."""
+    """Angular rate of the reference motion without manoeuvres, rad/s; ours, as in Figs. 4 and 5."""
+    manoeuvres: int = parameter(0, at_least=0, at_most=16)
+    """Harmonics of the reference motion on each axis, drawn anew for every episode; 0 (paper) is the sine above, the
+    same in every episode."""
+    manoeuvre_rate: tuple[float, float] = parameter((0.4, 8.0), above=0.0, ascending=True)
+    """Interval of their angular rates, rad/s, drawn log-uniformly; ours: from half of the paper's rate, whose period is
+    longer than the episode, to ten times it, beyond the bandwidth of every sensible gain."""
+    manoeuvre_acceleration: tuple[float, float] = parameter((2.0, 10.0), at_least=0.0, ascending=True)
+    """Interval of the peak acceleration of each, m/s^2, drawn uniformly, so that no axis accelerates more than
+    ``manoeuvres`` times the upper limit; ours: 4 g at most with four, an agile aircraft. Of weaker motion a filter that
+    models its acceleration would know more than INS and receiver say, and the problem would be another one."""
 
     drift: float = parameter(0.6, at_least=0.0)
     """Modelled standard deviation of the constant rate error beta, m/s; ours: the INS leaves the picture."""
@@ -90,6 +100,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """That a measurement is an outlier, each one on its own; nobody says so."""
     outlier_factor: float = parameter(100.0, above=0.0)
     """Intensity of the noise of an outlier over that of the others; ours: ten times the noise."""
+
+    receiver_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Interval of the stationary standard deviation of the receiver's coloured error (first-order Gauss-Markov), beside
+    the white one, on each axis, m, drawn uniformly; nobody reports it."""
+    receiver_correlation_time: tuple[float, float] = parameter((2.0, 2.0), above=0.0, ascending=True)
+    """Interval of the correlation time of that error, s, drawn log-uniformly; ours: multipath of a moving antenna,
+    which lasts for seconds."""
 
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability of an episode in which nothing fails and all noises are as modelled."""

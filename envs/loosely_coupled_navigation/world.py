@@ -7,7 +7,7 @@ import numpy
 
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, draw_between
-from ..faults import Outliers
+from ..faults import GaussMarkov, Outliers
 from ..filter import Initial
 from ..observation import Array
 from ..schedules import Steps, within
@@ -26,6 +26,10 @@ class Truth(NamedTuple):
     """Measurements so far, ``(N,)``."""
     reference: Array
     """Position Xr, m, ``(A, N)``."""
+    harmonics: Array
+    """Motions that it is the sum of, m, and the same a quarter of a period ahead, ``(2, M, A, N)``."""
+    turn: Array
+    """Sine and cosine of what their phases gain from one measurement to the next, ``(2, M, A, N)``."""
     ins: Array
     """Position X that the INS has come to, m, ``(A, N)``."""
     drift: Array
@@ -54,6 +58,12 @@ class Truth(NamedTuple):
     """Standard deviation of the receiver noise under jamming over that without, ``(N,)``."""
     spoofing_rate: Array
     """Rate at which every axis is pulled off, m/s, ``(N,)``."""
+    receiver_decay: Array
+    """What is left of the receiver's coloured error from one measurement to the next, ``(N,)``."""
+    receiver_kick: Array
+    """Standard deviation of what it gains, m, ``(N,)``."""
+    receiver_error: Array
+    """That error, m, ``(A, N)``; zero where the task has none."""
     deviation: Array
     """True standard deviation of this measurement, m, ``(N,)``."""
     reported_deviation: Array
@@ -82,7 +92,7 @@ class Measurement(NamedTuple):
 
 
 class InsGnssWorld(World[Task, Truth, Measurement]):
-    """A sine motion, an inertial system with three rate errors, and a satellite receiver."""
+    """A motion of harmonics, an inertial system with three rate errors, and a satellite receiver."""
 
     own_parameters = ("duration",)
     parameters: LooselyCoupledNavigationParameters
@@ -91,8 +101,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         axes = self.parameters.axes
-        self.initial_normals, self.normals = 2 * axes, 3 * axes
         p = self.parameters
+        self.receiver_is_coloured = p.receiver_coloured[1] > 0.0
+        kinds = 3 if self.receiver_is_coloured else 2
+        self.initial_normals, self.normals = kinds * axes, (kinds + 1) * axes
         self.outliers = Outliers(p.outlier_probability, math.sqrt(p.outlier_factor))
         self.row_uniforms = self.outliers.row_uniforms
         self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
@@ -129,12 +141,21 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         for level, silent in zip(levels[1:], unreported, strict=True):
             reported.append(xp.where(silent, reported[-1], level))
 
-        beta, eta = normals[: p.axes], normals[p.axes :]
+        beta, eta = normals[: p.axes], normals[p.axes : 2 * p.axes]
         zeros = 0.0 * beta
-        reference = zeros + p.reference_amplitude * xp.sin(self.phase)
+        harmonics, turn = self._motion(draws, zeros)
+        reference = ordered_sum(harmonics[0])
+        wandering = draw_between(draws.uniform, "receiver_coloured", p.receiver_coloured)
+        coloured = zeros[0] + unless_calm(zeros[0] + wandering, 0.0)
+        lasting = zeros[0] + draw_between(
+            draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time
+        )
+        receiver = GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp)
         truth = Truth(
             number=zeros[0],
             reference=reference,
+            harmonics=harmonics,
+            turn=turn,
             ins=reference,
             drift=drift_deviation * beta if p.fixed_drift is None else zeros + p.fixed_drift,
             coloured=coloured_deviation * eta,
@@ -151,11 +172,36 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
                 zeros[0] + draw_between(draws.log_uniform, "jamming_factor", p.jamming_factor)
             ),
             spoofing_rate=zeros[0] + draw_between(draws.uniform, "spoofing_rate", p.spoofing_rate),
+            receiver_decay=receiver.decay,
+            receiver_kick=receiver.kick,
+            receiver_error=coloured * normals[2 * p.axes :] if self.receiver_is_coloured else zeros,
             deviation=levels[0],
             reported_deviation=reported[0],
             available=zeros[0] + 1.0,
         )
         return truth, Initial(reference, self.no_covariance + zeros[0])
+
+    def _motion(self, draws: Draws, zeros: Array) -> tuple[Array, Array]:
+        """Harmonics at the start, m, and how they turn; each ``(2, M, A, N)``."""
+        xp, p = self.xp, self.parameters
+        count, many = max(p.manoeuvres, 1), zeros[None] + xp.zeros((max(p.manoeuvres, 1), 1, 1))
+        if p.manoeuvres:
+            drawn = [
+                xp.reshape(draw(f"manoeuvre_{name}", limits, count * p.axes), many.shape)
+                for draw, name, limits in (
+                    (draws.log_uniform, "rate", p.manoeuvre_rate),
+                    (draws.uniform, "acceleration", p.manoeuvre_acceleration),
+                    (draws.uniform, "phase", (0.0, 2.0 * math.pi)),
+                )
+            ]
+            rate, amplitude, phase = drawn[0], drawn[1] / (drawn[0] * drawn[0]), drawn[2]
+        else:
+            rate, amplitude, phase = many + p.reference_rate, many + p.reference_amplitude, many + self.phase
+        angle = p.sampling_interval * rate
+        return (
+            xp.stack([amplitude * xp.sin(phase), amplitude * xp.cos(phase)]),
+            xp.stack([xp.sin(angle), xp.cos(angle)]),
+        )
 
     def _number_at(self, time: Array) -> Array:
         """Number of the measurement nearest to a time in s."""
@@ -170,13 +216,16 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver, outliers."""
+        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver's white and
+        coloured, outliers."""
         xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
         number = truth.number + 1.0
         kick = truth.coloured_step * noise[:n]
         slip = s.step * truth.drift + s.drive * truth.coloured + s.coupling * kick
-        angle = (p.reference_rate * p.sampling_interval) * number + self.phase
-        reference = p.reference_amplitude * xp.sin(angle)
+        # Sines by the addition theorem: four products in place of a sine for each harmonic.
+        (sine, cosine), (across, along) = truth.harmonics, truth.turn
+        harmonics = xp.stack([along * sine + across * cosine, along * cosine - across * sine])
+        reference = ordered_sum(harmonics[0])
         increment = (reference - truth.reference) + (slip + truth.white_step * noise[n : 2 * n])
         ins = truth.ins + increment
 
@@ -187,8 +236,13 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             deviation, reported = (Steps(level, truth.change).at(number, xp) for level in levels)
         if p.jamming_probability:
             deviation = xp.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
-        deviation = self.outliers.amplify(deviation, noise[3 * n :], xp)
+        deviation = self.outliers.amplify(deviation, noise[self.normals :], xp)
         fix = reference + deviation * noise[2 * n : 3 * n]
+        error = truth.receiver_error
+        if self.receiver_is_coloured:
+            process = GaussMarkov(truth.receiver_decay, truth.receiver_kick)
+            error = process.advance(error, noise[3 * n : 4 * n])
+            fix = fix + error
         if p.spoofing_probability:
             pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
             fix = fix + xp.where(within(number, truth.spoofing), pull, 0.0)
@@ -198,8 +252,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         truth = truth._replace(
             number=number,
             reference=reference,
+            harmonics=harmonics,
             ins=ins,
             coloured=s.decay * truth.coloured + kick,
+            receiver_error=error,
             deviation=deviation,
             reported_deviation=reported,
             available=available,
@@ -253,6 +309,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             **windows,
             "jamming_gain": truth.jamming_gain,
             "spoofing_rate": truth.spoofing_rate,
+            "receiver_decay": truth.receiver_decay,
+            "receiver_kick": truth.receiver_kick,
             "drift": truth.drift,
             "receiver_deviation": truth.deviation,
             "available": truth.available,

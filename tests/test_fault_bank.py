@@ -1,0 +1,211 @@
+"""The bank over faults of LooselyCoupledNavigation: against all hypotheses one by one, compiled, and in the field."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from filtergym.baselines.loosely_coupled_navigation import fault_bank
+from filtergym.baselines.loosely_coupled_navigation.fault_bank import TRAINING, FaultBank
+from filtergym.baselines.table import Variant
+from filtergym.envs.filter import Initial
+from filtergym.envs.loosely_coupled_navigation.world import Measurement
+from filtergym.evaluation.filters import put_in_loop
+from filtergym.evaluation.rollout import rollout
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.filters.linear_systems import van_loan
+from filtergym.filters.loosely_coupled import error_model
+from models import make_model
+
+import filtergym  # noqa: F401  # registers the environments
+
+ID = "filtergym/LooselyCoupledNavigation-v0"
+INTERVAL = 0.1
+
+
+def measurements(seed, steps=7, axes=1):
+    """A few measurements of noise, a ramp and a missing fix, one lane."""
+    rng = np.random.default_rng(seed)
+    ins = np.cumsum(rng.normal(0.0, 0.3, (steps, axes, 1)), axis=0)
+    for k in range(steps):
+        available = np.array([0.0 if k == 4 else 1.0])
+        fix = ins[k] + rng.normal(0.0, 1.5, (axes, 1)) + 0.5 * max(k - 2, 0)
+        before = ins[k - 1] if k else np.zeros((axes, 1))
+        yield Measurement(
+            np.array([k + 1.0]), ins[k], ins[k] - before, available * fix, available, np.array([1.2])
+        )
+
+
+def enumerated(bank, task, seen):
+    """Log-likelihood and estimate by every sequence of INS level, onset, end and receiver level, none merged.
+
+    A pull begins at a multiple of the spacing; being there with its age, it ends with the hazard of its duration.
+    """
+    p, prior, T, steps = task.parameters, bank.prior, INTERVAL, len(seen)
+    levels, L = np.array(prior.levels), len(prior.levels)
+    stay = math.exp(-prior.level_rate * T)
+    change = stay * np.eye(L) + (1.0 - stay) / L
+    share = prior.onset_rate * bank.spacing * T
+    begins = share / (1.0 + share)
+    # Histories of the pull: onset and end, numbers of measurements, None for never.
+    births = [None, *range(bank.spacing, steps + 1, bank.spacing)]
+    histories = []
+    for onset in births:
+        ends = [None] if onset is None else [None, *range(onset + 1, steps + 1)]
+        histories += [(onset, end) for end in ends]
+    total, parts = [], []
+    drift, coloured = np.ravel(bank.drift), np.ravel(bank.coloured)
+    white = np.ravel(bank.white_growth) - p.sampling.residual * coloured**2
+    for j, (onset, end) in itertools.product(range(len(drift)), histories):
+        A, W, P0 = error_model(drift[j], coloured[j], p.correlation_time, white[j] / T)
+        F, Q = np.eye(4), np.zeros((4, 4))
+        F[:3, :3], Q[:3, :3] = van_loan(A, W, T)
+        weight = math.log(float(np.ravel(bank.ins_weights)[j]))
+        for k in range(1, steps + 1):
+            pulled = onset is not None and onset <= k and (end is None or k < end)
+            if onset is None or k < onset:
+                weight += math.log(1.0 - begins) if k % bank.spacing == 0 else 0.0
+            elif k == onset:
+                weight += math.log(begins)
+            elif end is None or k <= end:
+                age = T * (k - onset + 0.5 * (bank.spacing + 1))
+                hazard = min(T / max(prior.longest - age, T), 1.0) if age > prior.shortest else 0.0
+                weight += math.log(1.0 - hazard) if pulled else math.log(hazard) if hazard else -math.inf
+            elif k % bank.spacing == 0:
+                weight += math.log(1.0 - begins)  # and a second pull is left out
+        if weight == -math.inf:
+            continue
+        first = (1.0 - prior.distrust) * np.isclose(levels, 1.0) + prior.distrust / L
+        for sequence in itertools.product(range(L), repeat=steps):
+            log, x, P = weight, np.zeros(4), np.zeros((4, 4))
+            P[:3, :3] = P0
+            for k, said in enumerate(seen, 1):
+                log += math.log(first[sequence[0]] if k == 1 else change[sequence[k - 2], sequence[k - 1]])
+                if k == onset:
+                    P[3, 3] = prior.rate**2
+                x, P = F @ x, F @ P @ F.T + Q
+                pulled = onset is not None and onset <= k and (end is None or k < end)
+                h = T * (k - onset + 0.5 * (bank.spacing + 1)) if pulled else 0.0
+                if said.available[0]:
+                    H = np.array([1.0, 0.0, 0.0, -h])
+                    S = H @ P @ H + levels[sequence[k - 1]] * said.reported_deviation[0] ** 2
+                    nu = said.ins[0, 0] - said.fix[0, 0] - H @ x
+                    log += -0.5 * (nu**2 / S + math.log(2.0 * math.pi * S))
+                    x, P = x + P @ H * nu / S, P - np.outer(P @ H, P @ H) / S
+            total.append(log)
+            parts.append((x[0], P[0, 0]))
+    total = np.array(total)
+    weights = np.exp(total - total.max())
+    likelihood = total.max() + math.log(weights.sum())
+    weights /= weights.sum()
+    means, variances = np.array(parts).T
+    mean = weights @ means
+    return likelihood, seen[-1].ins[0, 0] - mean, weights @ (variances + (means - mean) ** 2)
+
+
+def of_bank(bank, seen):
+    """The same of the bank."""
+    memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))), 1)
+    total = 0.0
+    for said in seen:
+        mean, covariance, memory, likelihood = bank.update(said, memory)
+        total += np.nan_to_num(likelihood.log_likelihood[0])
+    return total, mean[0, 0], covariance[0, 0, 0]
+
+
+def small(**changed):
+    """A bank of few hypotheses and its task."""
+    task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=7).task
+    prior = {
+        "points": 2,
+        "onsets": 3,
+        "shortest": 5.0,
+        "longest": 0.9,
+        "onset": (0.0, 9.0),
+        "onset_rate": 0.5,
+    }
+    return FaultBank(task, TRAINING, **{**prior, "levels": (1.0,), **changed}), task
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_without_merging_the_bank_is_the_enumeration_of_all_hypotheses(seed):
+    """No pull ends, and the receiver has one level."""
+    bank, task = small()
+    seen = list(measurements(seed))
+    np.testing.assert_allclose(of_bank(bank, seen), enumerated(bank, task, seen), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_merging_costs_little(seed):
+    """With ends and two levels the bank merges, which no bound limits; what it loses here is small."""
+    bank, task = small(
+        shortest=0.0, levels=(1.0, 6.0), points=1, onsets=4, longest=1.2, level_rate=1.0, onset_rate=0.2
+    )
+    seen = list(measurements(seed, 5))
+    found, exact = of_bank(bank, seen), enumerated(bank, task, seen)
+    assert found[0] == pytest.approx(exact[0], abs=0.15)
+    assert found[1] == pytest.approx(exact[1], abs=0.2 * math.sqrt(exact[2]))
+    assert found[2] == pytest.approx(exact[2], rel=0.25)
+
+
+def test_the_first_fix_gives_the_exact_mixture():
+    bank, task = small(levels=(1.0, 6.0), distrust=0.4)
+    (first, *_) = measurements(3)
+    memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))), 1)
+    _, _, memory, found = bank.update(first, memory)
+    p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
+    density = 0.0
+    mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
+    for weight, drift, coloured, white in zip(
+        *(np.ravel(x) for x in (bank.ins_weights, bank.drift, bank.coloured, bank.white_growth)), strict=True
+    ):
+        s = p.sampling
+        V = (
+            (s.step * drift) ** 2
+            + (s.drive * coloured) ** 2
+            + (s.coupling * s.coloured * coloured) ** 2
+            + white
+        )
+        for q, level in zip(mixed, (1.0, 6.0), strict=True):
+            S = V + level * 1.44
+            density += weight * q * math.exp(-0.5 * nu**2 / S) / math.sqrt(2.0 * math.pi * S)
+    assert found.log_likelihood[0] == pytest.approx(math.log(density), rel=1e-12)
+
+
+def test_probabilities_stay_probabilities_and_covariances_positive():
+    model = make_model(ID, "gain", "random", axes=2)
+    bank = FaultBank(model.task, TRAINING, points=3, onsets=4)
+    found = []
+
+    class Watched:
+        kind = "estimator"
+        start = bank.start
+
+        def update(self, measurement, memory):
+            answer = bank.update(measurement, memory)
+            found.append(answer)
+            return answer
+
+    for _ in rollout(model, Watched(), episode_seeds("test", 4, 30)):
+        pass
+    for mean, covariance, memory, likelihood in found[::25]:
+        np.testing.assert_allclose(memory.weights.sum(axis=(0, 1)), 1.0, rtol=1e-12)
+        np.testing.assert_allclose(memory.levels.sum(axis=0), 1.0, rtol=1e-12)
+        assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
+        assert (memory.covariance.ins.position > 0.0).all()
+        assert np.isfinite(mean).all()
+        assert (np.isnan(likelihood.log_likelihood) == np.isnan(likelihood.nis)).all()
+
+
+def test_it_compiles_and_gives_the_same():
+    pytest.importorskip("llvmlite")
+    competitor = Variant(FaultBank, "small", prior=fault_bank.VAGUE, points=1, onsets=2)
+    answers = []
+    for backend in ("numpy", "compiled"):
+        model = make_model(ID, "gain", "random", backend=backend, horizon=80)
+        if backend == "compiled":
+            assert type(put_in_loop(model, competitor, "estimator", "bank", 4)).__name__ == "CompiledModel"
+        states = [state for state, _ in rollout(model, competitor, episode_seeds("test", 3, 4))]
+        answers.append(np.stack([state.filter.mean for state in states]))
+    # Exponentials of two libraries over 80 measurements.
+    np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-9)
