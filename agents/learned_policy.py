@@ -71,6 +71,8 @@ class LearnedPolicy(Policy):
         ValueError: if the model does not show one of the fields.
     """
 
+    traceable = True
+
     def __init__(
         self,
         model: Model,
