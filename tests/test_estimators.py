@@ -242,7 +242,16 @@ def test_lost_episodes_stand_in_table_records_and_results(command, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     Path("losing.py").write_text(LOSING)
-    words = ["evaluate", ID, "--episodes", 14, "--set", "horizon=4", "--set", "detection_probability=(1.0, 1.0)"]
+    words = [
+        "evaluate",
+        ID,
+        "--episodes",
+        14,
+        "--set",
+        "horizon=4",
+        "--set",
+        "detection_probability=(1.0, 1.0)",
+    ]
     words += ["--policy", "losing:Losing", "--policy", "imm", "--json", "records.json"]
     code, output, errors = command(*words, "--strict")
     assert (code, errors.count("\n")) == (2, 1)

@@ -123,7 +123,7 @@ def test_files_say_the_same_bits_where_there_is_numpy_alone(written, tmp_path):
     lanes = {}
     for i, (case, text) in enumerate(written.items()):
         (alone / f"filter_{i}.py").write_text(text)
-        lanes[f"filter_{i}"] = replay(*case)
+        lanes[f"filter_{i}"] = replay(*case, episodes=2 if i else 16)  # one of which misses scans
     (alone / "replay.pickle").write_bytes(pickle.dumps(lanes))
     run = subprocess.run(
         [sys.executable, "-I", "-S", "-c", ALONE, str(alone)],
