@@ -168,7 +168,11 @@ def test_list_names_everything(tmp_path):
     for word in (ENV, "evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt"):
         assert word in result.stdout
     # What a reader needs to judge a number: whose algorithm it is, and what a reference is told.
-    for word in ("Bakulev", "knows when every manoeuvre begins and ends", "knows the acceleration in every scan"):
+    for word in (
+        "Bakulev",
+        "knows when every manoeuvre begins and ends",
+        "knows the acceleration in every scan",
+    ):
         assert word in result.stdout
 
 
@@ -231,7 +235,10 @@ def test_a_flight_from_a_file(tmp_path, run):
 
 def test_a_table_says_what_its_references_know(run):
     result = run("evaluate", ENV, "--policy", "imm", "--policy", "known-turn", "--episodes", "4")
-    assert "known-turn knows when every manoeuvre begins and ends, its acceleration or turn rate" in result.stdout
+    assert (
+        "known-turn knows when every manoeuvre begins and ends, its acceleration or turn rate"
+        in result.stdout
+    )
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from filtergym.filters import contaminated_normal, coordinated_turn, kalman, sem
 from models import make_model
 from scipy.stats import multivariate_normal
 
+from filtergym import evaluate
+
 ID = "filtergym/ManeuveringTarget-v0"
 T, LANES = 6.0, 8
 
@@ -224,3 +226,10 @@ def test_survives_what_its_prior_rules_out():
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_is_compiled_with_the_world():
+    # What cannot be traced runs as Python code, and a warning says so.
+    assert SemiMarkov.traceable
+    evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")

@@ -34,7 +34,9 @@ class KnownTurn(KalmanModel):
     """
 
     kind = "reference"
-    knows = "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every scan"
+    knows = (
+        "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every scan"
+    )
 
     def start(self, initial: Initial, truth: Truth) -> TurnMemory:
         """Start where everyone starts."""
