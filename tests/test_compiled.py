@@ -282,7 +282,7 @@ def test_evaluation_and_tuning_say_the_same_on_both_backends():
     keywords = {"episodes": 16, "horizon": 20}
     one, other = (
         filtergym.evaluate(
-            "ManeuveringTarget", ["imm", "kalman-imm", "known-turn"], backend=backend, **keywords
+            "ManeuveringTarget", ["imm", "semi-markov", "known-turn"], backend=backend, **keywords
         )
         for backend in ("compiled", "numpy")
     )

@@ -11,6 +11,8 @@ from filtergym.filters import contaminated_normal, coordinated_turn, kalman, sem
 from models import make_model
 from scipy.stats import multivariate_normal
 
+from filtergym import evaluate
+
 ID = "filtergym/ManeuveringTarget-v0"
 T, LANES = 6.0, 8
 
@@ -212,15 +214,22 @@ def test_stays_near_the_enumeration_where_it_merges(model):
 
 
 def test_survives_what_its_prior_rules_out():
-    # Jumps of thousands of sigma leave no hypothesis a weight that a float64 can hold.
+    # Jumps of 3000 sigma leave no hypothesis a weight that a float64 can hold.
     model = make_model(ID, None, "random", detection_probability=(1.0, 1.0), scan_jitter=(0.0, 0.0))
     for settings in ({}, {"hazards": (0.0, 1.0)}, VAGUE_PRIOR):
         filter = SemiMarkov(model.task, **settings)
         initial, measurements, _ = answers_of(model, filter, 12)
         memory = filter.start(initial, LANES)
         for k, m in enumerate(measurements):
-            moved = m._replace(position=m.position + (1e6 if k % 5 == 4 else 0.0))
+            moved = m._replace(position=m.position + (3e5 if k % 5 == 4 else 0.0))
             mean, covariance, memory, likelihood = filter.update(moved, memory)
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_is_compiled_with_the_world():
+    # What cannot be traced runs as Python code, and a warning says so.
+    assert SemiMarkov.traceable
+    evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
