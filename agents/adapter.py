@@ -20,10 +20,9 @@ from ..envs.environment import TaskEnv, TaskVectorEnv
 from .gate import Gate
 from .residual import check_residual
 
-
 STAGGERED_GROUPS = 16
-"""Of environments that finish together, where episodes are staggered: a step in which some begin anew costs much more than
-another, and sixteen parts of an episode in a rollout are as good as all."""
+"""Of environments that finish together, where episodes are staggered: a step in which some begin anew costs much more
+than another, and with sixteen a rollout shows the parts of an episode alike."""
 
 
 def to_sb3(
