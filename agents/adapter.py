@@ -20,6 +20,10 @@ from ..envs.environment import TaskEnv, TaskVectorEnv
 from .gate import Gate
 from .residual import check_residual
 
+STAGGERED_GROUPS = 16
+"""Of environments that finish together, where episodes are staggered: a step in which some begin anew costs much more
+than another, and with sixteen a rollout shows the parts of an episode alike."""
+
 
 def to_sb3(
     vector_env: Any, staggered: bool = False, residual_to: Any = None, gate: Gate | None = None
@@ -33,7 +37,8 @@ def to_sb3(
     Args:
         vector_env: from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
         staggered: cut the episodes that a reset starts to lengths spread evenly over the horizon, so that
-            environments finish one after another instead of all in one step; later episodes are whole. For
+            environments finish one after another, many of them in groups, instead of all in one step; later episodes
+            are whole. For
             training only: a score over the shortened ones is not a score of whole episodes.
         residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
         gate: that decides whether the agent acts; see :mod:`.gate`.
@@ -104,7 +109,9 @@ class TaskVecEnv(VecEnv):
             )
         count = self.num_envs
         if self.staggered:
-            options["shortened_by"] = numpy.arange(count) * self.env.last_decision // count
+            groups = min(count, STAGGERED_GROUPS)
+            group = numpy.arange(count) * groups // count
+            options["shortened_by"] = group * self.env.last_decision // groups
         observation, _ = self.env.reset(seed=self._seeds, options=options)
         self.returns[:] = 0.0
         self.lengths[:] = 0
