@@ -2,10 +2,10 @@
 
     python benchmarks/particle_bank.py [--episodes 40] [--particles 2000] [--seed 0]
 
-**What it is.** Every particle draws what the scenario ``random`` draws for an episode, levels of the INS, changes of the
-receiver's noise, jamming, and onset and end of the spoofing, from the same distributions; the rate of the pull and the
-INS errors it leaves to a Kalman filter (Doucet, de Freitas, Murphy and Russell, "Rao-Blackwellised particle filtering
-for dynamic Bayesian networks", UAI 2000). What is drawn never changes in an episode, so this is importance sampling:
+**What it is.** Every particle draws what the scenario ``random`` draws for an episode, levels of the INS, changes of
+the receiver's noise, jamming, and onset and end of the spoofing, from the same distributions; the rate of the pull
+and the INS errors it leaves to a Kalman filter (Doucet, de Freitas, Murphy and Russell, "Rao-Blackwellised
+particle filtering for dynamic Bayesian networks", UAI 2000). What is drawn never changes in an episode, so this is importance sampling:
 nothing is resampled, no particle is an approximation, and the posterior mean is exact but for the number of particles
 (and for what a change of the report says by itself, which neither filter weighs).
 How many of them carry the weight (the effective number) stands beside the costs: where it is small, the filter is worse
@@ -25,11 +25,11 @@ from filtergym.envs.backend import make_model
 from filtergym.envs.draws import Draws
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.envs.loosely_coupled_navigation.world import Truth
+from filtergym.envs.schedules import Steps, within
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import receiver_faults
 from filtergym.filters.loosely_coupled import AugmentedCovariance
-from filtergym.envs.schedules import Steps, within
 
 
 class Particles:
@@ -67,7 +67,7 @@ class Particles:
     def update(self, measurement: Any, memory: Any) -> Any:
         """Predict and update every particle, weigh it, and mix."""
         (delta, drift, eta, rate), P, log_weights, truth = memory
-        p, s, N = self.task.parameters, self.task.parameters.sampling, len(measurement.number)
+        s, N = self.task.parameters.sampling, len(measurement.number)
         number, available, ins, fix = (
             numpy.tile(values, self.count)
             for values in (measurement.number, measurement.available, measurement.ins[0], measurement.fix[0])

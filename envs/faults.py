@@ -32,8 +32,8 @@ class Outliers(NamedTuple):
 
 
 class GaussMarkov(NamedTuple):
-    """Coloured error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n`` (first-order Gauss-Markov): multipath,
-    the atmosphere, a reference that wanders. It is stationary from the start.
+    """Coloured error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n`` (first-order Gauss-Markov):
+    multipath, the atmosphere, a reference that wanders. It is stationary from the start.
     """
 
     decay: Array

@@ -18,7 +18,7 @@ A filter of one Gaussian then updates by the score of the density of its innovat
 
 the exact mean and covariance of the mixture of L Kalman updates, whose gains all lie along ``P H^T``.
 
-References:
+Sources of these:
 
 * Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans. AC 17(4), 1972.
 * Masreliez, "Approximate non-Gaussian filtering with linear state and observation relations", IEEE Trans. AC 20(1),

@@ -1,4 +1,4 @@
-r"""A bank of Kalman filters over what may be wrong in LooselyCoupledNavigation: the INS, the receiver's noise, spoofing.
+r"""A bank of Kalman filters over the faults of LooselyCoupledNavigation: INS level, receiver's noise, spoofing.
 
 Every hypothesis is a pair: how good the INS is (J points of its drift, coloured and white noise), and since when the
 receiver is pulled off (not at all, or since one of B onsets). Its filter estimates the INS error and the rate of the

@@ -26,13 +26,14 @@ SCENARIOS: Mapping[str, Scenario] = {
     for scenario in (
         Scenario(
             "paper",
-            "The fusion example as printed: one sine as the motion of every episode, noises as modelled, no disturbance.",
+            "The fusion example as printed: the same sine in every episode, noises as modelled, no disturbance.",
             {},
             _LATE,
         ),
         Scenario(
             "random",
-            "Training distribution: a motion of the episode's own; drift, coloured and white noise from far less than modelled to three times it; "
+            "Training distribution: a motion of the episode's own; "
+            "drift, coloured and white noise from far less than modelled to three times it; "
             "receiver noise over a decade, with up to two changes, unreported half of the time; outages, jamming and "
             "spoofing in some episodes each; in one of six nothing fails.",
             {

@@ -1,10 +1,11 @@
 r"""Loosely coupled navigation: an INS that drifts, corrected by a GNSS receiver through one gain.
 
 After Benkafo and Lobaty, "Features of application of Kalman-Bucy filters in orientation and navigation
-complexes". The reference ``Xr`` is ``amplitude sin(rate t)``; the INS integrates it with the rate errors of
-:mod:`filtergym.filters.loosely_coupled`, the receiver measures it with white noise. On every axis
+complexes". The reference ``Xr`` is ``amplitude sin(rate t)``, or a sum of such harmonics that is drawn anew for every
+episode; the INS integrates it with the rate errors of :mod:`filtergym.filters.loosely_coupled`, the receiver measures
+it with white noise, and where the scenario says so with a coloured error e beside it. On every axis
 
-    X += dXr + T beta + drive eta + dd,   eta = decay eta + de,   Z = Xr + sigma n
+    X += dXr + T beta + drive eta + dd,   eta = decay eta + de,   Z = Xr + e + sigma n
     Xh' = Xh + dX,   nu = Z - Xh',   Xh = Xh' + gain nu                                         (3)
 
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
@@ -64,8 +65,10 @@ class LooselyCoupledNavigation(Task):
     position. A filter without a measurement has the innovation zero, and its averages stand still. What is
     predicted under noise, for these as well, is predicted with the noises of the last action.
 
-    The increments of the INS are not shown: the reference motion is always the same, so whoever knows it by
-    heart could read the rate errors off them. All that is shown depends on the errors alone.
+    The increments of the INS are not shown: in ``paper`` the reference motion is always the same, so whoever knows it
+    by heart could read the rate errors off them. All that is shown depends on the errors alone, so that an agent does
+    the same whatever the motion. An estimator sees the increments; in every scenario but ``paper`` the motion is drawn
+    anew for every episode, and one that answers from the clock alone costs far more than the paper's filter.
 
     ### Rewards
 
@@ -86,7 +89,7 @@ class LooselyCoupledNavigation(Task):
     ### Arguments
 
     ``scenario``: "random" (default; noise levels over a decade, changes of the receiver noise, outages),
-    "paper", "outage", "jamming", "spoof-ramp", "quiet". ``control``: "noise", "gain", "mode", "weights". Every field
+    "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver". ``control``: "noise", "gain", "mode", "weights". Every field
     of :class:`LooselyCoupledNavigationParameters` is a keyword.
 
     ### Version History

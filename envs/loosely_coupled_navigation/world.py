@@ -217,7 +217,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
         """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver's white and
-        coloured, outliers."""
+        coloured, outliers.
+        """
         xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
         number = truth.number + 1.0
         kick = truth.coloured_step * noise[:n]
