@@ -28,6 +28,9 @@ from ...filters.imm import log_probabilities
 from ...filters.loosely_coupled import AugmentedCovariance
 from ...filters.ordered_sums import ordered_sum
 
+LEVELS = tuple(10 ** (i / 2) for i in range(-2, 7))
+"""Variances of the receiver over the reported one that are told apart."""
+
 
 class FaultPrior(NamedTuple):
     """What a bank expects before it has seen anything; times in s."""
@@ -50,7 +53,7 @@ class FaultPrior(NamedTuple):
     longest: float = 2.0
     rate: float = 3**0.5
     """Standard deviation of the rate of a pull, m/s."""
-    levels: tuple[float, ...] = tuple(10 ** (i / 2) for i in range(-2, 7))
+    levels: tuple[float, ...] = LEVELS
     """Variances of the receiver over the reported one, ascending, one of them 1."""
     level_rate: float = 0.3
     """Changes of the level expected in a second."""
@@ -189,8 +192,8 @@ class FaultBank:
         )
         covariance = faults.FaultCovariance(
             moved,
-            *(replace(v, zero, xp.where(born, 0.0, v[:, 1:])) for v in P[1:4]),
-            replace(P.fault, zero, xp.where(born, prior.rate**2, P.fault[:, 1:])),
+            *(replace(v, zero, xp.where(born, 0.0, v[:, 1:])) for v in P[1:4]),  # type: ignore[call-arg]
+            fault=replace(P.fault, zero, xp.where(born, prior.rate**2, P.fault[:, 1:])),
         )
         means = (
             replace(v, m, copy(v, v[..., 0, :]))
