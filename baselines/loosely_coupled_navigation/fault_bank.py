@@ -190,10 +190,17 @@ class FaultBank:
         moved = AugmentedCovariance(
             *(replace(v, m, copy(v, v[..., 0, :])) for v, m in zip(old, ins, strict=True))
         )
+
+        def couple(values: Array) -> Array:
+            """Covariances with the rate of the pull: none of those born."""
+            return replace(values, zero, xp.where(born, 0.0, values[:, 1:]))
+
         covariance = faults.FaultCovariance(
             moved,
-            *(replace(v, zero, xp.where(born, 0.0, v[:, 1:])) for v in P[1:4]),  # type: ignore[call-arg]
-            fault=replace(P.fault, zero, xp.where(born, prior.rate**2, P.fault[:, 1:])),
+            couple(P.position_fault),
+            couple(P.drift_fault),
+            couple(P.coloured_fault),
+            replace(P.fault, zero, xp.where(born, prior.rate**2, P.fault[:, 1:])),
         )
         means = (
             replace(v, m, copy(v, v[..., 0, :]))
