@@ -4,11 +4,11 @@
 
 **What it is.** Every particle draws what the scenario ``random`` draws for an episode, levels of the INS, changes of
 the receiver's noise, jamming, and onset and end of the spoofing, from the same distributions; the rate of the pull
-and the INS errors it leaves to a Kalman filter (Doucet, de Freitas, Murphy and Russell, "Rao-Blackwellised
-particle filtering for dynamic Bayesian networks", UAI 2000). What is drawn never changes in an episode, so this is
-importance sampling: nothing is resampled, no particle is an approximation, and the posterior mean is exact but for the
-number of particles (and for what a change of the report says by itself, which neither filter weighs). How many of them
-carry the weight (the effective number) stands beside the costs: where it is small, the filter is worse than exact Bayes.
+and the INS errors it leaves to a Kalman filter (Doucet, de Freitas, Murphy and Russell, "Rao-Blackwellised particle
+filtering for dynamic Bayesian networks", UAI 2000). What is drawn never changes in an episode, so this is importance
+sampling: nothing is resampled, no particle is an approximation, and the posterior mean is exact but for the number of
+particles (and for what a change of the report says by itself, which neither filter weighs). How many of them carry
+the weight (the effective number) stands beside the costs: where it is small, the filter is worse than exact Bayes.
 
 **What is compared.** Mean cost of the episodes, and the paired difference with its standard error.
 """
