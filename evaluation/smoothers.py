@@ -6,6 +6,7 @@ from typing import Any
 import numpy
 
 from ..compiler.functions import map_arrays
+from ..envs.compiled import can_step
 from ..envs.failures import explain_errors
 from ..envs.filter import Initial
 from ..envs.lanes import Lanes, whole_episode
@@ -67,11 +68,9 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
     Raises:
         ValueError: if what it returns has other shapes.
     """
-    python = looped.filter.in_python
-    measurements, memories = (
-        _step_forward(looped, lanes, length) if python else _run_compiled(looped, lanes, length)
-    )
-    own = looped.filter.own.own if python else looped.filter.own
+    run = _run_compiled if can_step(looped, report_forward) else _step_forward
+    measurements, memories = run(looped, lanes, length)
+    own = looped.filter.own.own if looped.filter.in_python else looped.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
     C = len(looped.task.components)

@@ -12,6 +12,7 @@ from .envs.scenario_choice import find_scenario
 from .evaluation.competitors import kind_of, make_competitor
 from .evaluation.evaluate import control_of
 from .evaluation.online import OnlineFilter
+from .evaluation.stepping import SteppingPolicy
 from .names import find_competitor, import_problem, with_normalisation
 
 
@@ -70,5 +71,5 @@ def online(
         watch = WatchedPolicy(estimator.network, range)
         estimator.filter.decider.ask = watch.act
         return OnlineFilter(model, estimator, kind, name, tracks, watch)
-    watch = WatchedPolicy(make_competitor(maker, model), range)
+    watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), range)
     return OnlineFilter(model, watch, kind, name, tracks, watch)

@@ -279,7 +279,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
     name, maker = _named_policy(problem, policy, trust)
     control = control_of(maker, "policy", experiment.control, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
-    model = make_model(problem.task, control, experiment.scenario, **keywords)
+    model = make_model(problem.task, control, experiment.scenario, backend=experiment.backend, **keywords)
     return _stepping(name, maker, model, experiment.scenario, keywords)
 
 

@@ -16,7 +16,7 @@ from filtergym.evaluation.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 from models import make_model
 
-from filtergym import evaluate
+from filtergym import evaluate, make_policy
 
 ALLOWED_WARNINGS = (
     "A Box observation space minimum value is -infinity",  # innovations have no bound
@@ -320,7 +320,7 @@ def test_evaluation_replays_what_gymnasium_shows(env_id, short):
     maker = known.policies[known.score_paper]
     result = evaluate(env_id, [known.score_paper], episodes=3, seed=5, **short)
     env = gym.make(env_id, control=maker.control, detailed_info=True, disable_env_checker=True, **short)
-    policy = maker(env.unwrapped.model)
+    policy = make_policy(env, known.score_paper)
     interval = env.unwrapped.task.decision_interval
     for episode, seed in enumerate(result.episode_seed.values):
         observation, _ = env.reset(seed=int(seed))

@@ -275,7 +275,7 @@ def test_innovation_adaptive_equals_a_naive_filter():
     seeds = [1, 2]
     _, states = steered("innovation-adaptive", "jamming", seeds, outage_probability=1.0, outage_start=(0.5, 0.5),
                         outage_duration=(0.3, 0.3), jamming_start=(2.0, 2.0), jamming_duration=(1.0, 1.0),
-                        horizon=300)  # fmt: skip
+                        horizon=300, manoeuvres=0)  # fmt: skip
     rate = 1 - math.exp(-0.01 / 0.25)
     for lane in range(len(seeds)):
         x, v, squares = 0.0, 0.0, None

@@ -270,7 +270,7 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
 def test_scaled_noises_are_those_of_a_textbook_filter(seed):
     """Van Loan's matrices of the scaled intensities in a plain filter of (delta, beta, eta)."""
     lanes, steps = 4, 200
-    model = make("random", "noise", axes=2, noise_changes=(2, 2), outage_probability=1.0)
+    model = make("random", "noise", axes=2, noise_changes=(2, 2), outage_probability=1.0, noise_reach=1.0)
     drawn, actions = numbers(model, lanes, steps, seed), random_actions(model, lanes, steps, seed)
     run = list(states(model, drawn, lambda k, seen: actions[k]))
     clipped = np.clip(actions, -1, 1)

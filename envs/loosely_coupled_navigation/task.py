@@ -130,7 +130,7 @@ class LooselyCoupledNavigation(Task):
     causes = CAUSES
     start_measurements = 50
     cost_description = "squared error of position over the nominal variance of a measurement"
-    reward_unit = 0.15
+    reward_unit = 0.16
     # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
     reward = "log-relative"
     paper_policy = PaperPolicy("gain", (0.0,))
