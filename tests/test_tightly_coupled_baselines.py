@@ -224,8 +224,8 @@ def test_fallback_says_nothing_of_other_sensors():
 
 
 OPEN_LOOP = {"aperture": False}
-"""Tracking loops expect what the bank's hypotheses predict together, or what follows from an estimator's estimate. Where
-they have an aperture, they may lose other signals."""
+"""Tracking loops expect what the bank's hypotheses predict together, or what follows from an estimator's estimate.
+Where they have an aperture, they may lose other signals."""
 
 
 def test_huber_without_thresholds_is_the_paper():
