@@ -205,7 +205,9 @@ def _summarise(
     done = [0] * len(asked)
     sizes = [sum(piece.measurements for piece in batch) for batch in work]
     run = workers.run(functools.partial(_one_after_another, summarise), work, sizes, progress)
-    for (i, piece), found in ((which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)):
+    for (i, piece), found in (
+        (which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)
+    ):
         if isinstance(found, Summary):
             yield i, found
             continue
