@@ -24,6 +24,9 @@ from .threads import one_thread
 
 TOGETHER = 4 * BLOCK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+BATCH = 600_000
+"""Measurements that another process is given at once, where several pieces of work share a model: about a second. A
+longer batch would leave the others idle at the end, and lose more where the work is interrupted."""
 
 
 class EvaluationRequest(NamedTuple):
@@ -195,12 +198,16 @@ def _summarise(
         for i in missing:
             check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
     pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
-    work = [piece for _, piece in pieces]
+    batches = [[piece] for piece in pieces] if workers.alone else _batches(pieces)
+    work = [[piece for _, piece in batch] for batch in batches]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}
     done = [0] * len(asked)
-    for k, found in workers.run(summarise, work, [piece.measurements for piece in work], progress):
-        i, piece = pieces[k]
+    sizes = [sum(piece.measurements for piece in batch) for batch in work]
+    run = workers.run(functools.partial(_one_after_another, summarise), work, sizes, progress)
+    for (i, piece), found in (
+        (which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)
+    ):
         if isinstance(found, Summary):
             yield i, found
             continue
@@ -213,6 +220,32 @@ def _summarise(
             with one_thread():
                 whole = added.pop(i).summary(_resampling(asked[i].episodes), asked[i].metrics)
             yield i, whole
+
+
+def _one_after_another(
+    function: Callable[[EvaluationRequest, Progress], Summary | Part],
+    batch: Sequence[EvaluationRequest],
+    tick: Progress,
+) -> list[Summary | Part]:
+    return [function(piece, tick) for piece in batch]
+
+
+def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
+    """Group pieces of work that share a model, which every process that runs one of them would trace for itself.
+
+    A batch stands where its first piece stood, and holds at most ``BATCH`` measurements, or one piece.
+    """
+    batches: list[list[tuple[int, EvaluationRequest]]] = []
+    last: dict[Any, tuple[list[tuple[int, EvaluationRequest]], int]] = {}
+    for i, piece in pieces:
+        shared = id(piece.experiment), getattr(piece.maker, "control", None)
+        batch, size = last.get(shared, ([], 0))
+        if not batch or size + piece.measurements > BATCH:
+            batch, size = [], 0
+            batches.append(batch)
+        batch.append((i, piece))
+        last[shared] = batch, size + piece.measurements
+    return batches
 
 
 @one_thread()
