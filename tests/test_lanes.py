@@ -10,7 +10,7 @@ from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs import episode_noise
 from filtergym.envs.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.reward import paper_model
+from filtergym.envs.reward import reference
 from filtergym.evaluation.rollout import start_lanes
 from models import make_model
 
@@ -129,7 +129,7 @@ def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend
         return np.asarray(lanes.pay(action, "relative")), np.asarray(lanes.observe())
 
     restarts = {2: [7], 3: [0, 7, 19], 5: [*range(1, 12)], 8: [7]}
-    together = begun(Lanes(model, count, paper_model(model)), range(count))
+    together = begun(Lanes(model, count, reference("relative", model)), range(count))
     found = []
     for step in range(10):
         found.append(paid(together))
@@ -137,7 +137,7 @@ def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend
             together.restart(restarts[step])
             found.append((found[-1][0], np.asarray(together.observe())))
     for lane in (0, 7, 11):
-        alone, step_of = begun(Lanes(model, 1, paper_model(model)), [lane]), iter(found)
+        alone, step_of = begun(Lanes(model, 1, reference("relative", model)), [lane]), iter(found)
         for step in range(10):
             reward, shown = next(step_of)
             own_reward, own = paid(alone)
