@@ -469,10 +469,13 @@ class Stepper:
         fields = predict.outputs[-1].shape[0] if world_of is None else 0
         self._shown, self._given = numpy.empty((width, fields)), False
         self._reported = memory(tell.outputs)
-        # Episodes go to and fro between two copies, which share what stays as it is.
-        outputs = [*advance.outputs, *predict.outputs[:-1]]
-        stays = [i < len(advance.same) and advance.same[i] is not None for i in range(len(outputs))][shared:]
-        outputs = outputs[shared:]
+        knows = bool(model.filter.knows)
+        # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
+        # not read any more when the prediction is written: all but what the update has handed on.
+        outputs = [*advance.outputs, *predict.outputs[:-1]][shared:]
+        ahead_of_filter = truths if knows else 0
+        handed_on = [ahead_of_filter + i in update.same for i in range(states)]
+        stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)][shared:]
         self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
         self._going: list[numpy.ndarray] = []
         """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
@@ -490,13 +493,15 @@ class Stepper:
         begun = model.programs.first
         self._drawn = memory(world.inputs)
         self._initial = memory(world.outputs[truths:]) if world_of is None else world_of._initial
-        knows = bool(model.filter.knows)
         for now, then in ((first, second), (second, first)):
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
             updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
             ahead, predicted = then[: truths + measured], then[truths + measured :]
-            step = [update.bound(given, written), tell.bound([*truth, *measurement, *updated[:states]], self._reported)]
+            step = [
+                update.bound(given, written),
+                tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+            ]
             begin = [start.bound([*self._initial, *(truth if knows else [])], written)]
             came = ahead[truths:]
             if world_of is None:
