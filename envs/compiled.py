@@ -456,7 +456,7 @@ class Stepper:
         tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
         self.width, self._threads, self._model, self._report = width, model.threads, model, report
-        self._world_of, shared = world_of, truths + measured if world_of else 0
+        self._world_of, self._shared = world_of, 0 if world_of is None else truths + measured
         count = itertools.count()
         self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -472,27 +472,30 @@ class Stepper:
         knows = bool(model.filter.knows)
         # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
         # not read any more when the prediction is written: all but what the update has handed on.
-        outputs = [*advance.outputs, *predict.outputs[:-1]][shared:]
+        outputs = [*advance.outputs, *predict.outputs[:-1]][self._shared :]
         ahead_of_filter = truths if knows else 0
         handed_on = [ahead_of_filter + i in update.same for i in range(states)]
-        stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)][shared:]
+        stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)]
+        stays = stays[self._shared :]
         self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
         self._going: list[numpy.ndarray] = []
         """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
-        copies: list[list[numpy.ndarray]] = []
+        self._copies: list[list[numpy.ndarray]] = []
         for world in ([], []) if world_of is None else world_of._copies:
             numbers, going = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if not s], width)
             self._going.append(numbers)
             kept, own = iter(staying), iter(going)
-            copies.append([*world[:shared], *(next(kept if s else own) for s in stays)])
-        self._copies = first, second = copies
+            self._copies.append([*world[: self._shared], *(next(kept if s else own) for s in stays)])
+        first, second = self._copies
         written = memory(update.outputs)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
         world, start = model.programs.start
         begun = model.programs.first
         self._drawn = memory(world.inputs)
-        self._initial = memory(world.outputs[truths:]) if world_of is None else world_of._initial
+        self._initial: list[numpy.ndarray] = (
+            memory(world.outputs[truths:]) if world_of is None else world_of._initial
+        )
         for now, then in ((first, second), (second, first)):
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
@@ -529,7 +532,8 @@ class Stepper:
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
-        for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
+        own = zip(self._copies[self._now], leaves(episode), strict=True)
+        for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values
         if shown is not None:
             self._shown[...] = shown.T
