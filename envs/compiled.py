@@ -73,6 +73,11 @@ def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
     return predicted, model.observe(Episode(None, measurement, predicted))
 
 
+def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
+    """Filter at the measurement, of which nothing is shown."""
+    return model.filter.predict(state, measurement)
+
+
 def _begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any]:
     """Truth at the start of the track, and the initial estimate."""
     return model.task.world.begin(Draws(uniforms, model.task.xp), normals)
@@ -230,6 +235,20 @@ class Programs:
         if shapes[0] != shapes[1] or first.advance.same != later.advance.same:
             raise NotTraceable("the arrays of an episode change their shapes from step to step")
         return later
+
+    @_Once
+    def unseen_predictions(self) -> tuple[Specialised, Specialised]:
+        """The filter at the first measurement and at later ones, where nobody looks at what it shows."""
+        states = self.start[1].example()[0], self.first.update.example()[0]
+        predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
+        return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether the filter gives nothing back to the world."""
+        started, first, later = self.start[1], self.first.update, self.later.update
+        states = len(leaves(self.later.episode.filter))
+        return all(len(program.outputs) == states for program in (started, first, later))
 
     @property
     def row(self) -> numpy.ndarray:
@@ -400,6 +419,11 @@ def warn_of(what: str, error: BaseException) -> None:
     warnings.warn(f"{what} is not compiled and runs with NumPy: {error}{line}", stacklevel=2)
 
 
+def share_world(model: Any, other: Any) -> bool:
+    """Whether two compiled models are of one task, and neither filter gives anything back to its world."""
+    return model.task is other.task and model.programs.is_open_loop and other.programs.is_open_loop
+
+
 def can_step(model: Any, report: Report) -> bool:
     """Whether a model's steps are compiled, and a report on them can be."""
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
@@ -420,16 +444,19 @@ class Stepper:
         model: compiled.
         report: made of every episode after the action.
         width: lanes, a multiple of eight.
+        world_of: a stepper of the same task, both filters in an open loop. Its world is this one's too, and nobody
+            looks at what this one shows. Whatever is done with both is done with it first.
 
     Attributes:
         action: applied at every step, ``(..., width)``.
     """
 
-    def __init__(self, model: Any, report: Report, width: int) -> None:
+    def __init__(self, model: Any, report: Report, width: int, world_of: "Stepper | None" = None) -> None:
         update, advance, predict, episode = model.programs.later
         tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
         self.width, self._threads, self._model, self._report = width, model.threads, model, report
+        self._world_of, self._shared = world_of, 0 if world_of is None else truths + measured
         count = itertools.count()
         self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -439,51 +466,64 @@ class Stepper:
 
         self.action = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
-        self._shown, self._given = numpy.empty((width, *predict.outputs[-1].shape)), False
+        fields = predict.outputs[-1].shape[0] if world_of is None else 0
+        self._shown, self._given = numpy.empty((width, fields)), False
         self._reported = memory(tell.outputs)
-        # Episodes go to and fro between two copies, which share what stays as it is.
-        outputs = [*advance.outputs, *predict.outputs[:-1]]
-        stays = [i < len(advance.same) and advance.same[i] is not None for i in range(len(outputs))]
+        knows = bool(model.filter.knows)
+        # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
+        # not read any more when the prediction is written: all but what the update has handed on.
+        outputs = [*advance.outputs, *predict.outputs[:-1]][self._shared :]
+        ahead_of_filter = truths if knows else 0
+        handed_on = [ahead_of_filter + i in update.same for i in range(states)]
+        stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)]
+        stays = stays[self._shared :]
         self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
         self._going: list[numpy.ndarray] = []
         """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
-        copies = []
-        for _ in range(2):
+        self._copies: list[list[numpy.ndarray]] = []
+        for world in ([], []) if world_of is None else world_of._copies:
             numbers, going = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if not s], width)
             self._going.append(numbers)
-            shared, own = iter(staying), iter(going)
-            copies.append([next(shared if s else own) for s in stays])
-        self._copies = first, second = copies
+            kept, own = iter(staying), iter(going)
+            self._copies.append([*world[: self._shared], *(next(kept if s else own) for s in stays)])
+        first, second = self._copies
         written = memory(update.outputs)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
         world, start = model.programs.start
-        self._drawn = memory(world.inputs)
-        initial = memory(world.outputs[truths:])
         begun = model.programs.first
-        knows = bool(model.filter.knows)
+        self._drawn = memory(world.inputs)
+        self._initial: list[numpy.ndarray] = (
+            memory(world.outputs[truths:]) if world_of is None else world_of._initial
+        )
         for now, then in ((first, second), (second, first)):
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
             updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
-            ahead = then[: truths + measured]
-            predicted = [*then[truths + measured :], self._shown]
-            self._calls.append(
-                (
-                    update.bound(given, written),
-                    tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+            ahead, predicted = then[: truths + measured], then[truths + measured :]
+            step = [
+                update.bound(given, written),
+                tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+            ]
+            begin = [start.bound([*self._initial, *(truth if knows else [])], written)]
+            came = ahead[truths:]
+            if world_of is None:
+                step += [
                     advance.bound([*truth, *updated[states:], row], ahead),
-                    predict.bound([*updated[:states], *ahead[truths:]], predicted),
-                )
-            )
-            self._begin.append(
-                (
-                    world.bound(self._drawn, [*truth, *initial]),
-                    start.bound([*initial, *(truth if knows else [])], written),
+                    predict.bound([*updated[:states], *came], [*predicted, self._shown]),
+                ]
+                begin = [
+                    world.bound(self._drawn, [*truth, *self._initial]),
+                    *begin,
                     begun.advance.bound([*truth, *written[states:], row], ahead),
-                    begun.predict.bound([*written[:states], *ahead[truths:]], predicted),
-                )
-            )
+                    begun.predict.bound([*written[:states], *came], [*predicted, self._shown]),
+                ]
+            else:
+                at_first, later = model.programs.unseen_predictions
+                step.append(later.bound([*updated[:states], *came], predicted))
+                begin.append(at_first.bound([*written[:states], *came], predicted))
+            self._calls.append(step)
+            self._begin.append(begin)
         self._now = 0
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
@@ -492,7 +532,8 @@ class Stepper:
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
-        for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
+        own = zip(self._copies[self._now], leaves(episode), strict=True)
+        for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values
         if shown is not None:
             self._shown[...] = shown.T
@@ -526,7 +567,8 @@ class Stepper:
         """
         small = self._small.get(noise.width)
         if small is None:
-            small = self._small[noise.width] = Stepper(self._model, self._report, noise.width)
+            beside = None if self._world_of is None else self._world_of._small[noise.width]
+            small = self._small[noise.width] = Stepper(self._model, self._report, noise.width, beside)
         small.begin(uniforms, normals, noise)
         for numbers, begun in (
             (self._staying, small._staying),
@@ -548,7 +590,8 @@ class Stepper:
     def _run(self, calls: Sequence[Call], noise: EpisodeNoise) -> None:
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
-        calls[2].table[self._row_entry] = noise.address
+        if self._world_of is None:
+            calls[2].table[self._row_entry] = noise.address
         calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
         if self.width <= TILE:

@@ -20,7 +20,7 @@ import numpy
 from ..compiler.emission import LANES
 from ..compiler.functions import Specialised, map_arrays, round_up_lanes
 from ..filters.ordered_sums import ordered_sum
-from .compiled import Report, Stepper, can_step
+from .compiled import Report, Stepper, can_step, share_world
 from .episode_noise import EpisodeNoise
 from .model import Episode, Model
 from .observation import Array
@@ -321,9 +321,11 @@ class Lanes:
         if self._moving is self._steppers.get(report):
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
-            self._steppers[report] = [Stepper(model, report, self.width) for model in self._models]
+            steppers = self._steppers[report] = [Stepper(self.model, report, self.width)]
             if self.beside is not None:
-                self._steppers[report][1].take(self._beside_action(self.width))
+                world_of = steppers[0] if share_world(*self._models) else None
+                steppers.append(Stepper(self.beside.model, report, self.width, world_of))
+                steppers[1].take(self._beside_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:
             self._settle()
@@ -339,8 +341,9 @@ class Lanes:
         """Let the models' functions step the episodes, in arrays of their own."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
-            for old, new in zip(before, self._moving, strict=True):
-                new.load(old.episode(), old.observation_by_field().copy() if self._averaged else None)
+            for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
+                averaged = i == 0 and self._averaged
+                new.load(old.episode(), old.observation_by_field().copy() if averaged else None)
 
     @property
     def has_episodes(self) -> bool:

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs import episode_noise
+from filtergym.envs.compiled import share_world
 from filtergym.envs.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.reward import reference
+from filtergym.envs.model import Model
+from filtergym.envs.reward import OWN_PAY, reference
+from filtergym.envs.task import Task
 from filtergym.evaluation.rollout import start_lanes
 from models import make_model
 
@@ -147,6 +150,46 @@ def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend
                 if lane in restarts[step]:
                     alone.restart()
                 np.testing.assert_array_equal(np.asarray(alone.observe())[0], next(step_of)[1][lane])
+
+
+@pytest.mark.parametrize("kind", ["relative", "log-relative"])
+def test_what_runs_beside_equals_lanes_of_its_own(env_id, kind):
+    """Also where it has no world of its own: after restarts of few lanes, growth, a snapshot and other reports."""
+    pytest.importorskip("llvmlite")
+    model = make_model(env_id, backend="compiled")
+    beside = reference(kind, model)
+    count, report, space = 24, OWN_PAY[kind], model.action_space
+    lanes, own, other = (
+        Lanes(*each) for each in ((model, count, beside), (model, count), (beside.model, count))
+    )
+    everywhere = (lanes, own, other)
+    for each in everywhere:
+        for lane in range(32):
+            each.seed(lane, np.random.default_rng(lane))
+        each.restart()
+    assert share_world(model, beside.model) == (model.task.feedback.__func__ is Task.feedback)
+    space.seed(0)
+    for step in range(12):
+        if step in (2, 3, 7):
+            for each in everywhere:
+                each.restart([1, 5, 20] if step != 3 else range(16))
+        if step == 5:
+            for each in everywhere:
+                each.grow(32)
+        if step == 6:
+            for each in everywhere:
+                snapshot = each.snapshot()
+                each.decide(np.zeros((each.count, *each.model.action_space.shape)))
+                each.restore(snapshot)
+        shown = Model.cost if step == 9 else report
+        action, theirs = (
+            np.stack([np.asarray(one)] * lanes.count) for one in (space.sample(), beside.action)
+        )
+        expected = own.decide(action, shown), other.decide(theirs, shown)
+        for found, ours, others in zip(lanes.decide(action, shown), *expected, strict=True):
+            np.testing.assert_array_equal(found[0], ours[0])
+            np.testing.assert_array_equal(found[1], others[0])
+        np.testing.assert_array_equal(lanes.observe(), own.observe())
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda noise: pickle.loads(pickle.dumps(noise))])
