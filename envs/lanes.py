@@ -24,7 +24,7 @@ from .compiled import Report, Stepper, can_step, share_world
 from .episode_noise import EpisodeNoise
 from .model import Episode, Model
 from .observation import Array
-from .reward import OWN_PAY, Reference
+from .reward import OWN_PAY, RewardBaseline
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
@@ -157,7 +157,7 @@ class Lanes:
         self,
         model: Model,
         count: int,
-        beside: Reference | None = None,
+        beside: RewardBaseline | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
     ) -> None:

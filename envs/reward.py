@@ -79,7 +79,7 @@ REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 
 
-class Reference(NamedTuple):
+class RewardBaseline(NamedTuple):
     """What runs beside every episode on the same noise, for rewards that are relative."""
 
     model: Model
@@ -88,7 +88,7 @@ class Reference(NamedTuple):
     """That holds in every decision, as the control's space has it."""
 
 
-def reference(kind: str, model: Model) -> Reference | None:
+def reference(kind: str, model: Model) -> RewardBaseline | None:
     """Return what the reward of an agent is relative to; None where it is the agent's own.
 
     Args:
@@ -97,7 +97,7 @@ def reference(kind: str, model: Model) -> Reference | None:
     """
     if kind == "relative":
         paper = model.task.paper_policy
-        return Reference(model.under(paper.control), paper.action)
+        return RewardBaseline(model.under(paper.control), paper.action)
     if kind == "log-relative":
-        return Reference(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
+        return RewardBaseline(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
     return None
