@@ -4,6 +4,7 @@ Processor time of running the episodes of one competitor and keeping what an eva
 measurement; the second run in the process, of one thread.
 
     python benchmarks/rollouts.py --episodes 512 --episodes 2048
+    python benchmarks/rollouts.py ManeuveringTarget semi-markov bptt kalman-imm-turn-tuned
 """
 
 import argparse
@@ -43,11 +44,16 @@ def measure(environment: str, name: str, episodes: int) -> float:
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("environment", nargs="?", help="only this one")
+    parser.add_argument("competitor", nargs="*", help="of it; default: some")
     parser.add_argument("--episodes", type=int, action="append")
-    episodes = parser.parse_args().episodes or [512, 2048]
+    chosen = parser.parse_args()
+    episodes = chosen.episodes or [512, 2048]
+    only = chosen.environment
+    competitors = {only: chosen.competitor or COMPETITORS.get(only, ())} if only else COMPETITORS
     print("| environment | competitor |", " | ".join(f"{count} episodes, ns" for count in episodes), "|")
     print("|" + "---|" * (2 + len(episodes)))
-    for environment, names in COMPETITORS.items():
+    for environment, names in competitors.items():
         for name in names:
             cells = [f"{measure(environment, name, count):.0f}" for count in episodes]
             print("|", environment, "|", name, "|", " | ".join(cells), "|", flush=True)
