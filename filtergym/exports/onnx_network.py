@@ -125,7 +125,7 @@ def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
             f"{request.name!r} has no network of plain arrays: name a shipped agent or a .safetensors file, which "
             "filtergym export writes of a training run"
         )
-    model = make_model(request.problem.task, stored.control)
+    model = make_model(request.problem.task, stored.control, **stored.task_keywords)
     stored(model)  # refuses what does not fit
     return stored, model
 
@@ -158,6 +158,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
         "action": model.task.actions.get(header["control"], ""),
         "action_space": json.dumps(limits),
         "memory": "zeros at the start of a track; then what the last step returned",
+        "parameters": json.dumps(stored.task_keywords),
         "around": "; ".join(around),
     }
 
