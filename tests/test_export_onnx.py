@@ -97,7 +97,7 @@ def random_network(unit, output, activation, control):
         "activation": activation,
         "answers": 2,
     }
-    return types.SimpleNamespace(arrays=arrays, header=header, around=("", False)), model
+    return types.SimpleNamespace(arrays=arrays, header=header, around=("", False), task_keywords={}), model
 
 
 @pytest.mark.parametrize(
