@@ -26,6 +26,7 @@ from ..envs.backend import host_array
 from ..envs.environment import TaskVectorEnv
 from ..envs.model import Model
 from ..envs.scenario_choice import find_mixture
+from ..evaluation.competitors import Policy
 from ..evaluation.seeds import episode_seeds
 from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, as_trained
@@ -220,6 +221,11 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
+def _agent_of(policy: RecurrentPolicy, gated: bool, model: Model) -> Policy:
+    """Return the agent that a network in training is by now."""
+    return as_trained(model, LearnedPolicy(model, policy.arrays(), "tanh"), gated=gated)
+
+
 class Descent:
     """The network of a run, what trains it, and how far it is.
 
@@ -277,9 +283,7 @@ class Descent:
     def trainee(self) -> Trainee:
         """Return the agent as the bookkeeping takes it."""
         run, policy = self.run, self.policy
-
-        def agent(model: Model) -> LearnedPolicy:
-            return as_trained(model, LearnedPolicy(model, policy.arrays(), "tanh"), gated=run.gated)
+        agent = functools.partial(_agent_of, policy, run.gated)
 
         def save_agent(place: Path) -> None:
             write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")

@@ -5,6 +5,7 @@ one, from which ``--resume`` goes on, with the ``run.json`` of its time), ``best
 validation cost) and the log.
 """
 
+import copy
 import functools
 import importlib.metadata
 import importlib.util
@@ -609,7 +610,8 @@ class Validation:
     def score(self, policy: Any) -> ValidationEntry:
         """Return an entry of ``TrainingRun.validation``."""
         acts = self.run.algorithm not in ESTIMATORS
-        cost = self._costs(policy, self.run.control if acts else None)
+        # A maker of its own: what is compiled is kept by it, and the network has changed since the last validation.
+        cost = self._costs(copy.copy(policy), self.run.control if acts else None)
         entry: ValidationEntry = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry

@@ -1,5 +1,6 @@
 """Episodes from their seeds to their end, with whatever competes in the loop."""
 
+import types
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -236,6 +237,8 @@ def _steering_of(model: Model, competitor: Any, name: str) -> Specialised | None
 
     if not isinstance(model, CompiledModel):
         return None
+    if isinstance(competitor, types.FunctionType):  # it may return another one next time
+        return trace()
     try:
         return model.programs.keep((run_episodes, competitor), trace)
     except TypeError:  # it has no hash

@@ -174,6 +174,16 @@ def test_validation_is_that_of_evaluate(algorithm, tmp_path):
         assert entry["cost"] == pytest.approx(float(cost), rel=1e-5)
 
 
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt", "kalman-net"])
+def test_a_network_that_has_learned_is_validated_anew(algorithm, tmp_path):
+    """What is compiled of an agent is kept by what makes it."""
+    run = small_run(algorithm, 2400)
+    train(run, tmp_path, validate_every=800)
+    costs = [entry["cost"] for entry in run.validation]
+    assert len(costs) > 2
+    assert len(set(costs)) == len(costs)
+
+
 def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
     run = small_run("recurrent-ppo", 240)
     run.hyperparameters["policy_kwargs"]["n_lstm_layers"] = 2

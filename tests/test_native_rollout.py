@@ -139,3 +139,29 @@ def test_what_cannot_be_traced_is_asked_in_python_and_says_so():
 def test_a_method_that_is_replaced_is_not_taken_for_traceable():
     action = evaluate(ID, {"mine": Counting}, episodes=3, horizon=10)["action"].values
     np.testing.assert_allclose(action[0, 0, :, 0], 0.01 * np.arange(1, 11), rtol=1e-15)
+
+
+def test_a_function_may_make_another_policy_next_time():
+    """Of what makes it nobody knows whether it always makes the same."""
+    level = 0.1
+
+    class Level(Policy):
+        traceable = True
+        control = "gain"
+
+        def __init__(self, model, level):
+            super().__init__(model)
+            self.level = level
+
+        def act(self, observation, state, start):
+            return self.level + 0.0 * observation[:, :1], None
+
+    def make(model):
+        return Level(model, level)
+
+    make.control = "gain"
+    first = evaluate(ID, {"mine": make}, episodes=4, horizon=20)["action"].values
+    level = 0.2
+    second = evaluate(ID, {"mine": make}, episodes=4, horizon=20)["action"].values
+    assert (first == 0.1).all()
+    assert (second == 0.2).all()
