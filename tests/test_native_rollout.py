@@ -165,3 +165,19 @@ def test_a_function_may_make_another_policy_next_time():
     second = evaluate(ID, {"mine": make}, episodes=4, horizon=20)["action"].values
     assert (first == 0.1).all()
     assert (second == 0.2).all()
+
+
+def test_a_function_may_make_another_estimator_next_time():
+    """Likewise of what is compiled as a filter."""
+    known = problem_of(ID)
+    names = ["kalman-imm", "kalman-imm-turn"]
+
+    def make(task):
+        return known.competitor(names[0])(task)
+
+    make.kind = "estimator"
+    expected = evaluate(ID, names, episodes=4, horizon=20)["error"]
+    for name in list(names):
+        found = evaluate(ID, {"mine": make}, episodes=4, horizon=20)["error"]
+        np.testing.assert_array_equal(found.sel(policy="mine"), expected.sel(policy=name))
+        names.reverse()
