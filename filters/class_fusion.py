@@ -248,6 +248,61 @@ def channel_error_covariance(
     return result
 
 
+# --- coloured errors of the radar
+
+
+def add_coloured_errors(
+    models: Models, start: numpy.ndarray, share: float, decay: float
+) -> tuple[Models, numpy.ndarray]:
+    """Models whose states hold the coloured errors of the measured components, too; NumPy arrays.
+
+    With x the state and e the errors, ``e(k) = decay e(k-1) + w``, the new state is (x + H^T e, e): each measured
+    component comes with its error, so that measurements are the first m components and white errors. At the start these
+    components are those of a measurement.
+
+    Args:
+        models: of the classes, with ``H = [I 0]``.
+        start: covariances at scan 0, ``(n, n, M)``.
+        share: variance of a coloured error over that of the white one.
+        decay: what is left of it after a scan.
+
+    Returns:
+        The models and the covariances, of n + m states.
+    """
+    n, m = start.shape[0], models.H.shape[0]
+    white = numpy.diagonal(models.R)
+    mixing = numpy.eye(n + m)
+    mixing[range(m), range(n, n + m)] = 1.0
+    own, errors = slice(0, n), range(n, n + m)
+
+    def augmented(matrices: numpy.ndarray, diagonal: numpy.ndarray) -> numpy.ndarray:
+        whole = numpy.zeros((matrices.shape[-1], n + m, n + m))
+        whole[:, own, own] = numpy.moveaxis(matrices, -1, 0)
+        whole[:, errors, errors] = diagonal
+        return whole
+
+    Phi = mixing @ augmented(models.Phi, numpy.full(m, decay)) @ numpy.linalg.inv(mixing)
+    Q = mixing @ augmented(models.Q, share * (1.0 - decay**2) * white) @ mixing.T
+    P = augmented(start, share * white)
+    whole = Models(numpy.moveaxis(Phi, 0, -1), numpy.moveaxis(Q, 0, -1), numpy.eye(m, n + m), models.R)
+    return whole, numpy.moveaxis(P, 0, -1)
+
+
+def take_away_coloured_errors(mean: Array, covariance: Array, measured: int = 2) -> tuple[Array, Array]:
+    """State without the coloured errors of :func:`add_coloured_errors`.
+
+    Args:
+        mean: ``(n + m, N)``.
+        covariance: ``(n + m, n + m, N)``.
+        measured: m.
+    """
+    xp, n = namespace(mean), mean.shape[0] - measured
+    states = xp.concat([mean[:measured] - mean[n:], mean[measured:n]])
+    rows = xp.concat([covariance[:measured] - covariance[n:], covariance[measured:n]])
+    both = xp.concat([rows[:, :measured] - rows[:, n:], rows[:, measured:n]], axis=1)
+    return states, both
+
+
 # --- the ESM
 
 

@@ -168,7 +168,7 @@ def played(model, estimator, seeds, decisions):
 
 
 def test_ideal_is_the_channel_of_the_true_class():
-    model = make_model(ID, scenario="random", class_change=None)
+    model = make_model(ID, scenario="random", class_change=None, radar_coloured=(0.0, 0.0))
     _, states = played(model, Ideal(model.task), range(24), 120)
     for episode, mean, covariance in states:
         lane, true = numpy.arange(24), episode.truth.target_class
@@ -427,7 +427,21 @@ def test_metrics_follow_from_the_dataset(records):
         after_change.append(
             next((0.5 * (k - change) for k in range(change, 120) if P[lane, k] >= 0.9), math.inf)
         )
-    for name, times in (("time_to_recognise", first), ("time_to_recognise_change", after_change)):
+    best, detected, false = probability.argmax(-1), [], 0
+    for lane in range(len(true)):
+        change = next(k for k in range(120) if true[lane, k] != true[lane, 0])
+        right = best[lane] == true[lane]
+        detected.append(next((0.5 * (k - change) for k in range(change, 120) if right[k:].all()), math.inf))
+        false += sum(right[k - 1] and not right[k] and k != change for k in range(1, 120))
+    assert value("false_class_changes", "", "all") == pytest.approx(false / len(true), rel=1e-9)
+    assert value("right_class", "", "late") == pytest.approx((best == true)[:, 59:].mean(), rel=1e-9)
+    score = numpy.log(numpy.maximum(P, 1e-6)).mean()
+    assert value("class_log_score", "", "all") == pytest.approx(score, rel=1e-9)
+    for name, times in (
+        ("time_to_recognise", first),
+        ("time_to_recognise_change", after_change),
+        ("time_to_detect_change", detected),
+    ):
         for suffix, rank in (("median", 149), ("90_quantile", 269)):
             quantile = sorted(times)[rank]
             # None where the quantile lies among the runs that never got there.

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 CLASSES = 3
 SURE = 0.9
 """Probability from which a class counts as recognised."""
+LEAST = 1e-6
+"""Probability of the true class whose logarithm is the lowest score."""
 TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Seconds at which the probability of the true class is reported."""
 
@@ -106,19 +108,29 @@ def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
     waited = _first(sure & (numpy.arange(len(seconds)) >= change[:, None]))
     last = _last(seconds)
     wrong = (probability[:, last] >= SURE) & (numpy.arange(probability.shape[2]) != true_class[:, last, None])
-    excess = probability.max(axis=2) - (probability.argmax(axis=2) == true_class)
+    right = probability.argmax(axis=2) == true_class
+    excess = probability.max(axis=2) - right
+    stays = numpy.logical_and.accumulate(right[:, ::-1], axis=1)[:, ::-1]
+    detected = _first(stays & (numpy.arange(len(seconds)) >= change[:, None]))
+    false = right[:, :-1] & ~right[:, 1:] & (true_class[:, 1:] == true_class[:, :-1])
+    score = numpy.log(numpy.maximum(true_probability, LEAST))
     at_moments, at_last = _of_group(true_class[:, list(moments.values())]), _of_group(true_class[:, last])
     averaged = {
         "probability": true_probability[:, list(moments.values()), None] * at_moments,
         "share_at_moments": at_moments,
         "wrong": wrong.any(axis=1)[:, None] & at_last,
         "share_at_last": at_last,
-        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in slices_of(run).values()], axis=1),
+        "false_changes": false.sum(axis=1, keepdims=True).astype(float),
+        **{
+            name: numpy.stack([values[:, times].mean(axis=1) for times in slices_of(run).values()], axis=1)
+            for name, values in (("excess", excess), ("right", right), ("log_score", score))
+        },
     }
     each = {
         "first_class": true_class[:, 0],
         "recognised": _first(sure & same),
         "change": change,
+        "detected": numpy.where(detected < len(seconds), detected - change, len(seconds)),
         "recognised_again": numpy.where(waited < len(seconds), waited - change, len(seconds)),
     }
     return MetricInputs(each, {**errors.averaged, **averaged}, {"seconds": seconds})
@@ -142,7 +154,11 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     runs in which that never comes while the first class lasts; ``time_to_recognise_change_...`` the same
     after a change, counted from it; ``sure_and_wrong``, the share of runs with P >= 0.9 for a wrong class at
     60 s (or the end); ``calibration_ratio``, mean square error over mean reported variance;
-    ``confidence_excess``, mean probability of the most probable class minus how often it is the true one.
+    ``confidence_excess``, mean probability of the most probable class minus how often it is the true one;
+    ``time_to_detect_change_...``, from a change of class until the most probable class is the true one and stays so;
+    ``false_class_changes``, how often in an episode the most probable class leaves the true one that has not changed;
+    ``right_class``, the share of scans at which it is the true one; ``class_log_score``, the mean logarithm of the true
+    class's probability (at least 1e-6).
     A reference has no class probabilities: of it only errors and calibration.
     """
     if not gathered.averaged:
@@ -183,12 +199,21 @@ def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     if changed.any():
         name, again = "time_to_recognise_change", each["recognised_again"]
         yield from _recognition(name, bootstrap, again, changed, seconds - seconds[0], "")
+        name, detected = "time_to_detect_change", each["detected"]
+        yield from _recognition(name, bootstrap, detected, changed, seconds - seconds[0], "")
     for i in numpy.flatnonzero(means["share_at_last"][0]):
         ratio = _ratio(means["wrong"][:, i], means["share_at_last"][:, i])
         window = f"{seconds[_last(seconds)]:g} s"
         yield Measure("sure_and_wrong", GROUPS[i], window, bootstrap.interval(ratio), "1")
+    false = bootstrap.interval(means["false_changes"][:, 0])
+    yield Measure("false_class_changes", "", "all", false, "1")
     for j, window in enumerate(windows_of(evaluation)):
-        yield Measure("confidence_excess", "", window, bootstrap.interval(means["excess"][:, j]), "1")
+        for name, key, unit in (
+            ("confidence_excess", "excess", "1"),
+            ("right_class", "right", "1"),
+            ("class_log_score", "log_score", "nats"),
+        ):
+            yield Measure(name, "", window, bootstrap.interval(means[key][:, j]), unit)
 
 
 METRICS = OwnMetrics(gather, measures)

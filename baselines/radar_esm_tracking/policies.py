@@ -5,6 +5,7 @@ Equation numbers and readings are those of the task's paper (Ivanov, Seliverstov
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy
@@ -14,10 +15,11 @@ from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
-from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
+from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import ClassAlarm
+from .exact_bayes import TRAINING, VAGUE, ClassPrior, ExactBayes
 from .metrics import METRICS
-from .references import Ideal, KnownClassBound
+from .references import Ideal, KnownDrawBound
 
 
 class QuasiOptimal(PaperAction):
@@ -202,7 +204,39 @@ def _make_fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Ca
 
 _COUNTS = {"refused": (0.0, 0.0, 1.0), "esm": (0.0, 1.0, 1.0)}
 
+ESTIMATORS = {
+    "exact-bayes": Variant(
+        ExactBayes,
+        "Bayes' rule over class, its change, emitter types, silences and a second emitter, a Kalman filter for each "
+        "class and time of its change, by the prior of the training distribution.",
+        prior=TRAINING,
+    ),
+    "exact-bayes-vague": Variant(
+        ExactBayes,
+        "`exact-bayes` by one prior for all targets: the class may change again, types may be drawn anew for every "
+        "decision, and measurements of the radar may be outliers.",
+        prior=VAGUE,
+    ),
+}
+
+
+def _tunable_bayes(name: str, prior: ClassPrior, **limits: tuple[float, float, float]) -> Tunable:
+    """Each candidate runs alone: values make tables."""
+    change = (-4.0, math.log10(prior.change_rate), -1.0)
+    found = tunable(
+        ESTIMATORS[name], log10_change_rate=change, coloured=(0.05, prior.coloured, 0.7), **limits
+    )
+    return replace(found, in_lanes=False)
+
+
 TUNABLE = {
+    "exact-bayes": _tunable_bayes("exact-bayes", TRAINING, calm=(0.05, TRAINING.calm, 0.7)),
+    "exact-bayes-vague": _tunable_bayes(
+        "exact-bayes-vague",
+        VAGUE,
+        redrawn=(0.01, VAGUE.redrawn, 0.9),
+        log10_outliers=(-4.0, math.log10(VAGUE.outliers), -0.7),
+    ),
     "fixed-weights": tunable(
         FixedWeights, _make_fixed_weights, S0=(0.0, 1.0, 1.0), S1=(0.0, 1.0, 1.0), S2=(0.0, 1.0, 1.0)
     ),
@@ -232,8 +266,9 @@ BASELINES = Baselines(
         "fixed-weights": FixedWeights,
         "random": RandomPolicy,
     },
+    estimators=ESTIMATORS,
     references={"ideal": Ideal},
-    bounds={"known-class-bound": KnownClassBound},
+    bounds={"known-class-bound": KnownDrawBound},
     score_paper="quasi-optimal",
     score_reference="ideal",
     tunable=TUNABLE,
@@ -250,6 +285,7 @@ BASELINES = Baselines(
         "radar-only",
         "esm-only",
         "non-adaptive",
+        *ESTIMATORS,
         "random",
         "ideal",
         "known-class-bound",

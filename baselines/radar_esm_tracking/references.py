@@ -1,4 +1,9 @@
-"""The reference estimator of RadarEsmTracking, and its bound."""
+r"""The reference estimator of RadarEsmTracking, and its bound.
+
+Where the radar's errors are coloured the state has two more components, the coloured errors of range and range rate in
+m and m/s, with ``e(k) = psi e(k-1) + w``: the augmented filter of a first-order Gauss-Markov error (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.2).
+"""
 
 from typing import NamedTuple
 
@@ -7,40 +12,102 @@ from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start, Truth
 from ...evaluation.competitors import Likelihood
 from ...filters import bounds, kalman
+from ...filters.small_matrices import mirror_lower
+
+NOTHING = 1e-12
+"""Variance of a coloured error that is not there, in units of the white one: the covariance stays positive definite."""
 
 
 class Track(NamedTuple):
     """Estimate, and the class that governs the coming motion."""
 
     mean: Array
-    """``(3, N)``."""
+    """``(n, N)``; n = 3, or 5 with the radar's coloured errors."""
     covariance: Array
-    """``(3, 3, N)``."""
+    """``(n, n, N)``."""
     target_class: Array
     """``(N,)``."""
 
 
-class _KnownClass:
-    """Models that the true class chooses scan by scan."""
+class _KnownDraw:
+    """Models that the draw of the episode chooses scan by scan."""
 
-    knows = "the true class at every scan"
+    knows = (
+        "the true class at every scan, in which scans there is glint, how strong and how lasting the radar's coloured "
+        "errors are, and how its white ones are correlated"
+    )
     traceable = True
 
     def __init__(self, task: RadarEsmTracking) -> None:
-        self.task = task
-        self.start_covariance = task.constant(task.design_models(task.parameters)[1])
+        self.task, self.xp, p = task, task.xp, task.parameters
+        self.start_covariance = task.constant(task.design_models(p)[1])
+        self.coloured = p.radar_coloured[1] > 0.0
+        self.deviations = p.range_sigma, p.range_rate_sigma
+        # Range and range rate are measured, with their coloured errors.
+        self.H = task.constant(
+            [[float(j in (i, i + 3)) for j in range(5 if self.coloured else 3)] for i in range(2)]
+        )
 
     def start(self, initial: Start, truth: Truth) -> Track:
-        """Start where the filter of the true class starts."""
-        return Track(initial.mean, self.of(self.start_covariance, truth.target_class), truth.target_class)
+        """Start where the filter of the true class starts; the first measurement's errors are correlated as told."""
+        mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
+        white, zero = self.white(truth), 0.0 * truth.radar_correlation
+        start = [[P[i, j] if i == j else zero for j in range(3)] for i in range(3)]
+        for i in range(2):
+            for j in range(2):
+                start[i][j] = white[i, j]
+        if self.coloured:
+            mean = self.xp.concat([mean, 0.0 * mean[:2]])
+            share = truth.radar_coloured**2 + NOTHING
+            for row in start:
+                row += [zero, zero]
+            start += [[zero] * 5, [zero] * 5]
+            for i, sigma in enumerate(self.deviations):
+                variance = share * sigma**2
+                start[i][i] = start[i][i] + variance
+                start[i + 3][i + 3] = variance
+                start[i][i + 3] = start[i + 3][i] = -variance
+        return Track(mean, self.matrix(start), truth.target_class)
+
+    def matrix(self, rows: list[list[Array]]) -> Array:
+        """Stack the entries of a matrix."""
+        return self.xp.stack([self.xp.stack(row) for row in rows])
 
     def of(self, matrices: Array, target_class: Array) -> Array:
         """Matrix of each lane's class, ``(3, 3, N)``."""
-        return self.task.xp.take(matrices, target_class, axis=-1)
+        return self.xp.take(matrices, target_class, axis=-1)
+
+    def white(self, truth: Truth) -> Array:
+        """Covariance of this scan's white errors, ``(2, 2, N)``."""
+        (a, b), factor = self.deviations, truth.error_factor**2
+        cross = a * b * factor * truth.radar_correlation
+        return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
+
+    def motion(self, truth: Truth, governed: Array) -> tuple[Array, Array]:
+        """Transition and noise of the scan before this one, ``(n, n, N)``, under the class that governed it."""
+        models = self.task.models
+        F, Q = self.of(models.Phi, governed), self.of(models.Q, governed)
+        if not self.coloured:
+            return F, Q
+        zero, size = 0.0 * truth.radar_decay, range(5)
+        gained = truth.radar_kick**2 + NOTHING
+
+        def augment(matrix: Array, own: list[Array]) -> Array:
+            return self.matrix(
+                [
+                    [matrix[i, j] if max(i, j) < 3 else own[i - 3] if i == j else zero for j in size]
+                    for i in size
+                ]
+            )
+
+        return (
+            augment(F, [truth.radar_decay] * 2),
+            augment(Q, [gained * sigma**2 for sigma in self.deviations]),
+        )
 
 
-class Ideal(_KnownClass):
-    """The Kalman filter of the true class; where the class changes it switches its model at that scan."""
+class Ideal(_KnownDraw):
+    """The Kalman filter that is told the draw of the episode: the optimal one, given it."""
 
     kind = "reference"
 
@@ -48,27 +115,23 @@ class Ideal(_KnownClass):
         self, measurement: Measurement, truth: Truth, memory: Track
     ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the class that governed the motion, and update."""
-        models, governed = self.task.models, memory.target_class
-        mean, covariance = kalman.predict(
-            memory.mean, memory.covariance, self.of(models.Phi, governed), self.of(models.Q, governed)
-        )
-        result = kalman.update(mean, covariance, measurement.radar, models.H, models.R)
-        track = Track(result.mean, result.covariance, truth.target_class)
-        degrees = float(models.H.shape[0]) + 0.0 * result.log_likelihood
-        return result.mean, result.covariance, track, Likelihood(*result[2:], degrees)
+        F, Q = self.motion(truth, memory.target_class)
+        mean, covariance = kalman.predict(memory.mean, memory.covariance, F, Q)
+        result = kalman.update(mean, covariance, measurement.radar, self.H, self.white(truth))
+        covariance = mirror_lower(result.covariance)
+        track = Track(result.mean, covariance, truth.target_class)
+        degrees = 2.0 + 0.0 * result.log_likelihood
+        return result.mean[:3], covariance[:3, :3], track, Likelihood(*result[2:], degrees)
 
 
-class KnownClassBound(_KnownClass):
+class KnownDrawBound(_KnownDraw):
     """Exact mean square error of the ideal filter, by its covariance recursion: no estimator does better."""
 
     kind = "bound"
 
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
         """Bound after this scan: the diagonal of the covariance."""
-        models, governed = self.task.models, memory.target_class
-        P = bounds.predict_bound(
-            memory.covariance, self.of(models.Phi, governed), self.of(models.Q, governed)
-        )
-        P = bounds.posterior_cramer_rao_bound(P, models.H, models.R)
-        mean_square = self.task.xp.stack([P[i, i] for i in range(3)])
-        return mean_square, Track(memory.mean, P, truth.target_class)
+        F, Q = self.motion(truth, memory.target_class)
+        P = bounds.predict_bound(memory.covariance, F, Q)
+        P = bounds.posterior_cramer_rao_bound(P, self.H, self.white(truth))
+        return self.xp.stack([P[i, i] for i in range(3)]), Track(memory.mean, P, truth.target_class)

@@ -15,7 +15,17 @@ from ...filters import class_fusion, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank
-from ..observation import BOUNDED_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, linear_scale
+from ..observation import (
+    AVERAGE_OF_LOG1P,
+    BOUNDED_LOG,
+    KEPT_AS_LOG1P,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+    linear_scale,
+    within,
+)
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start
 
@@ -102,6 +112,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         time_factor = p.sampling_interval / TIME_SHOWN
         average = f"exponential average over {p.averaging_measurements:g} scans"
         count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
+        counted = within(0.0, (self.last_scan + 1) / COUNT_SHOWN)
 
         return (
             Block(
@@ -134,30 +145,32 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             ),
             Block(
                 "average_log_squared_innovation", lambda f, _: f.average_log_squared,
-                f"{average} of log_squared_innovation", classes,
+                f"{average} of log_squared_innovation", classes, AVERAGE_OF_LOG1P,
             ),
             Block(
                 "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, xp),
                 "1 where the ESM decides for this emitter type; none: for nothing at this scan",
-                (*types, "none"), over_interval="mean",
+                (*types, "none"), SHARE, over_interval="mean",
             ),
             Block(
                 "decision_refused",
                 lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
-                "1 where the bearing gate refuses the decision", over_interval="mean",
+                "1 where the bearing gate refuses the decision", shown=SHARE, over_interval="mean",
             ),
-            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types),
+            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types, counted),
             Block(
-                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types
+                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types, counted
             ),
             Block(
                 "bearing_difference", lambda f, measurement: measurement.bearing_difference,
-                "radar minus ESM bearing over the gate", shown=linear_scale(1.0 / self.gate), over_interval="mean",
+                "radar minus ESM bearing over the gate", over_interval="mean",
+                shown=linear_scale(1.0 / self.gate, limits=(-180.0, 180.0)),
             ),
-            Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes),
+            Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes, SHARE),
             Block(
                 "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * time_factor,
                 f"time since the start of the track over {TIME_SHOWN:g} s",
+                shown=within(0.0, self.last_scan * time_factor),
             ),
         )  # fmt: skip
 

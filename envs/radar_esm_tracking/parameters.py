@@ -104,8 +104,17 @@ class RadarEsmTrackingParameters(TaskParameters):
     """That both radar errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
     glint_factor: float = parameter(5.0, above=0.0)
     """Their standard deviation over that of the others (ours)."""
+    radar_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Limits of the stationary standard deviation of coloured errors (first-order Gauss-Markov) of range and of range
+    rate, beside the white ones and in units of theirs; drawn for each episode, one for both (ours)."""
+    radar_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
+    """Limits of their correlation time, s; likewise (ours)."""
+    radar_correlation: tuple[float, float] = parameter((0.0, 0.0), above=-1.0, below=1.0, ascending=True)
+    """Limits of the correlation of the white errors of range and range rate, as of a pulse with frequency modulation,
+    whose range shifts with the Doppler frequency; likewise (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode without silence, second emitter and change of class (ours)."""
+    """Probability of an episode without silence, second emitter, change of class, and coloured and correlated radar
+    errors (ours)."""
 
     @property
     def class_names(self) -> tuple[str, ...]:

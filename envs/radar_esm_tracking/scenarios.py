@@ -38,8 +38,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: any range and speed, one type each, failed associations; silences from none to "
-            "long ones, a second emitter heard up to six times of ten, a change of class in a third of the episodes; "
-            "in one of six nothing of these.",
+            "long ones, a second emitter heard up to six times of ten, a change of class in a third of the episodes, "
+            "coloured radar errors up to half of the white ones; in one of six nothing of these.",
             {
                 **_ANY_TARGET,
                 "radar_bearing_sigma": 1.5,
@@ -48,6 +48,8 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "second_emitter_probability": (0.0, 0.6),
                 "class_change": (5.0, 55.0),
                 "class_change_probability": 1.0 / 3.0,
+                "radar_coloured": (0.0, 0.5),
+                "radar_correlation_time": (2.0, 20.0),
                 "undisturbed": 1.0 / 6.0,
             },
             _WINDOWS,
@@ -83,6 +85,13 @@ SCENARIOS: Mapping[str, Scenario] = {
             "glint",
             "One scan in ten has radar errors five times as large; no training episode holds any.",
             {**_ANY_TARGET, "glint_probability": 0.1},
+            _WINDOWS,
+        ),
+        Scenario(
+            "correlated-errors",
+            "White errors of range and range rate whose correlation is -0.9 to -0.5, unreported; no training episode "
+            "holds any.",
+            {**_ANY_TARGET, "radar_correlation": (-0.9, -0.5)},
             _WINDOWS,
         ),
     )

@@ -8,7 +8,7 @@ import numpy
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, category, draw_between
-from ..faults import Outliers
+from ..faults import GaussMarkov, Outliers
 from ..observation import Array
 from ..world import World
 from .parameters import RadarEsmTrackingParameters
@@ -48,6 +48,18 @@ class Truth(NamedTuple):
     """Probability at each look that a silent target radiates again, ``(N,)``."""
     second_emitter: Array
     """Probability that the second emitter is heard instead of the target, ``(N,)``."""
+    radar_coloured: Array
+    """Stationary deviation of the radar's coloured errors, in units of the white ones', ``(N,)``."""
+    radar_decay: Array
+    """What is left of them from one scan to the next, ``(N,)``."""
+    radar_kick: Array
+    """Standard deviation of what they gain, in the same units, ``(N,)``."""
+    radar_correlation: Array
+    """Of the white errors of range and range rate, ``(N,)``."""
+    radar_error: Array
+    """Coloured errors of range and range rate now, in the same units, ``(2, N)``."""
+    error_factor: Array
+    """Deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there is glint."""
 
 
 class Measurement(NamedTuple):
@@ -83,13 +95,14 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     """A target of one class on one range channel, seen by a radar and heard by an ESM station."""
 
     parameters: RadarEsmTrackingParameters
-    initial_normals = 5
-    normals = 7
 
     def __init__(self, task: "RadarEsmTracking") -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
         self.glint = Outliers(p.glint_probability, p.glint_factor)
+        self.radar_is_coloured = p.radar_coloured[1] > 0.0
+        further = 2 if self.radar_is_coloured else 0
+        self.initial_normals, self.normals = 5 + further, 7 + further
         self.row_uniforms = 4 + self.glint.row_uniforms
         models, start = task.design_models(p)
         # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
@@ -136,6 +149,9 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         second_emitter = zero + draw_between(
             draws.uniform, "second_emitter_probability", p.second_emitter_probability
         )
+        coloured = zero + draw_between(draws.uniform, "radar_coloured", p.radar_coloured)
+        lasting = zero + draw_between(draws.log_uniform, "radar_correlation_time", p.radar_correlation_time)
+        correlation = zero + draw_between(draws.uniform, "radar_correlation", p.radar_correlation)
         if p.class_change_probability < 1.0:
             changes = draws.event("class_changes", p.class_change_probability)
             change = xp.where(changes, change, self.never)
@@ -143,6 +159,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             calm = draws.event("undisturbed", p.undisturbed)
             silence_start, second_emitter = (xp.where(calm, 0.0, x) for x in (silence_start, second_emitter))
             silence_end, change = xp.where(calm, 1.0, silence_end), xp.where(calm, self.never, change)
+            coloured, correlation = (xp.where(calm, 0.0, x) for x in (coloured, correlation))
+        wandering = GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp)
         acceleration = xp.take(self.acceleration_sigma, target_class, axis=0) * normals[0]
         truth = Truth(
             scan=xp.zeros_like(target_class),
@@ -159,8 +177,14 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             silence_start=silence_start,
             silence_end=silence_end,
             second_emitter=second_emitter,
+            radar_coloured=coloured,
+            radar_decay=wandering.decay,
+            radar_kick=wandering.kick,
+            radar_correlation=correlation,
+            radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[-2:],
+            error_factor=1.0 + zero,
         )
-        first = self._measure(truth, normals[1:3], normals[3:], draws.unit("first_intercept", 3))
+        first = self._measure(truth, normals[1:3], normals[3:5], draws.unit("first_intercept", 3))
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
 
@@ -176,11 +200,12 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
         """Fly one scan under the class at the previous one, let the class change and fall silent, and measure.
 
-        A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings; uniform ones for
-        the type, the decision, the source, falling silent, and glint where there is any.
+        A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings, 2 for the radar's coloured
+        errors where there are any; uniform ones for the type, the decision, the source, falling silent, and glint where
+        there is any.
         """
         xp, p = self.xp, self.parameters
-        scan = truth.scan + 1
+        scan, uniforms = truth.scan + 1, noise[self.normals :]
         f = xp.take(self.motion_table, truth.target_class, axis=1)
         x, w = truth.motion, noise
         motion = xp.stack(
@@ -198,10 +223,17 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
                 emitter_type=xp.where(changed, truth.next_type, truth.emitter_type),
             )
         if p.silence_start[1] > 0.0:
-            on = xp.where(truth.radiating, noise[10] >= truth.silence_start, noise[10] < truth.silence_end)
+            on = xp.where(
+                truth.radiating, uniforms[3] >= truth.silence_start, uniforms[3] < truth.silence_end
+            )
             truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
-        radar = self.glint.amplify(noise[3:5], noise[11:], xp)
-        return truth, self._measure(truth, radar, noise[5:7], noise[7:10])
+        if self.radar_is_coloured:
+            wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
+            truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
+        if p.glint_probability:
+            factor = self.glint.amplify(xp.ones_like(truth.error_factor), uniforms[4:], xp)
+            truth = truth._replace(error_factor=factor)
+        return truth, self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
 
     # --- the sensors
 
@@ -213,11 +245,18 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
 
         Args:
             truth: at this scan.
-            errors: of the radar's range and range rate, in units of their standard deviations, ``(2, N)``.
+            errors: what makes the radar's white errors of range and range rate, normal numbers, ``(2, N)``.
             bearings: of the radar's bearing and of the ESM's, likewise.
             uniforms: for the type, the decision and the source, ``(3, N)``.
         """
         xp, p = self.xp, self.parameters
+        if p.radar_correlation != (0.0, 0.0):
+            along = truth.radar_correlation
+            errors = xp.stack([errors[0], along * errors[0] + xp.sqrt(1.0 - along * along) * errors[1]])
+        if p.glint_probability:
+            errors = truth.error_factor * errors
+        if self.radar_is_coloured:
+            errors = errors + truth.radar_error
         radar = xp.stack(
             [truth.motion[0] + p.range_sigma * errors[0], truth.motion[1] + p.range_rate_sigma * errors[1]]
         )
@@ -279,8 +318,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Class and type of the target now, when they change (scan) and to what, the second emitter, and whether the
-        target is silent now.
+        """Class and type of the target now, when they change (scan) and to what, the second emitter, the radar's errors
+        beside the white ones, and whether the target is silent now.
         """
         p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
@@ -297,6 +336,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             "silence_start": truth.silence_start,
             "silence_end": truth.silence_end,
             "second_emitter": truth.second_emitter,
+            "radar_coloured": truth.radar_coloured,
+            "radar_decay": truth.radar_decay,
+            "radar_correlation": truth.radar_correlation,
+            "radar_error": truth.radar_error,
+            "error_factor": truth.error_factor,
             "radiating": xp.astype(truth.radiating, xp.float64),
         }
 

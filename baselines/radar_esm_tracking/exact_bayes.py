@@ -1,0 +1,388 @@
+r"""Bayes' rule over class, change of class, emitter types, silences and a second emitter of RadarEsmTracking.
+
+A hypothesis is a class, and since when: from the start, or since one of B onsets, or longer ago. Each has a Kalman
+filter of its own, updated with the class's model. The ESM is weighed by the forward recursion of
+:mod:`~filtergym.filters.emitter_association`. With s the class, o the onset, j the type and e what is not known of the
+second emitter and of the target's silences,
+
+    P(s, j, e)     = v(s) P(j | s) P(i(e) | s) T0(j, e)      for targets whose class has not changed            (1)
+    P(s, o, j, e)  = w(s, o, j) T1(j, e)                     for targets whose class has changed               (2)
+
+where T0 is the likelihood of all decisions, v and w hold the radar's, and T1 sums to one over e. (1) is exact on the
+grid of e: as long as no class changes, this is Bayes' rule. (2) supposes that, given the type of now, the time of the
+change tells nothing about the second emitter and the silences. What else is approximate:
+
+* Classes change at one scan of every ``spacing`` (the scans at which the ESM looks), and an onset that is older than B
+  of these is merged, by its moments, with all older ones of its class.
+* Where a change begins, the filters of the classes before are one Gaussian with their mean and covariance.
+* Rates of silence, and the share of looks at which the second emitter is heard, lie on a few points each; its bearing
+  on a few points on either side.
+* The radar's coloured errors have one strength and one correlation time for all targets.
+* Outliers, where the prior has any, are weighed by each filter on its own.
+"""
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...envs.observation import Array
+from ...envs.radar_esm_tracking.task import RadarEsmTracking
+from ...envs.radar_esm_tracking.world import Measurement, Start
+from ...evaluation.competitors import Likelihood
+from ...filters import class_fusion, contaminated_normal, imm, kalman, packed_covariance
+from ...filters import emitter_association as emitters
+from ...filters.ordered_sums import ordered_sum
+from ...filters.semi_markov import LEAST_PROBABILITY
+from ...filters.small_matrices import mirror_lower
+
+
+class ClassPrior(NamedTuple):
+    """What the filter expects before it has seen anything; times in s."""
+
+    change_rate: float = 0.0077
+    """Changes of class expected in a second."""
+    change: tuple[float, float] = (5.0, 55.0)
+    """When the class may change."""
+    again: bool = False
+    """Whether it may change more than once."""
+    onsets: int = 2
+    """B, times of a change that are told apart."""
+    redrawn: float = 0.0
+    """Probability that the type is drawn anew for every decision."""
+    second_emitter: tuple[float, ...] = (0.127, 0.473)
+    """Shares of the looks at which a second emitter is heard, all equally probable."""
+    silence_start: tuple[float, ...] = (0.25,)
+    """Probabilities at a look that the target falls silent, all equally probable."""
+    silence_end: tuple[float, ...] = (0.525,)
+    """That it radiates again, likewise."""
+    separation: tuple[float, float] = (2.0, 20.0)
+    """Limits of the second emitter's distance in bearing, degrees, to either side."""
+    sides: int = 3
+    """Points of it on either side."""
+    calm: float = 1.0 / 6.0
+    """Probability of a target without silences, change of class and second emitter."""
+    outliers: float = 0.0
+    """Probability of an outlier of the radar."""
+    outlier_factor: float = 5.0
+    """Its standard deviation over that of the others."""
+    coloured: float = 0.3
+    """Standard deviation of the radar's coloured errors, in units of the white ones; zero: they are not modelled."""
+    correlation_time: float = 6.0
+    """Of these errors."""
+
+
+TRAINING = ClassPrior()
+"""Of ``random``: a change between 5 and 55 s in a third of the disturbed episodes; the second emitter's share is
+uniform from 0 to 0.6, of which these are the two points of Gauss and Legendre; rates of silence at their means. Four
+points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
+0.03 %."""
+VAGUE = ClassPrior(
+    change_rate=0.004,
+    change=(0.0, math.inf),
+    again=True,
+    redrawn=0.2,
+    second_emitter=(0.0, 0.127, 0.473),
+    silence_end=(0.4,),
+    calm=0.3,
+    outliers=0.02,
+    coloured=0.2,
+)
+"""Ours, for targets of which little is known: the class may change at any time and again, types may be drawn anew, and
+measurements of the radar may be outliers."""
+
+
+class ClassTracks(NamedTuple):
+    """Memory; S classes, M = B + 2 hypotheses each (unchanged, B onsets, older), J labels of emitters."""
+
+    mean: Array
+    """``(3, S, M, N)``."""
+    covariance: Array
+    """Packed, ``(6, S, M, N)``."""
+    weights: Array
+    """Probabilities of the hypotheses, ``(S, M, N)``."""
+    unchanged: Array
+    """v, ``(S, N)``."""
+    changed: Array
+    """w, ``(S, M - 1, J, N)``."""
+    first: Array
+    """T0, ``(J, 2, V, N)``."""
+    later: Array
+    """T1, likewise."""
+
+
+class ExactBayes:
+    """Filter.
+
+    Args:
+        task: the problem.
+        prior: what it expects.
+        changed: fields of the prior that are otherwise.
+    """
+
+    kind = "estimator"
+    traceable = True
+
+    def __init__(self, task: RadarEsmTracking, prior: ClassPrior = TRAINING, **changed: Any) -> None:
+        self.prior = prior = prior._replace(**changed)
+        self.task, self.xp, p = task, task.xp, task.parameters
+        self.parameters, self.classes = p, task.classes
+        self.spacing = p.esm_period
+        models, start = task.design_models(p)
+        decay = math.exp(-p.sampling_interval / prior.correlation_time)
+        if prior.coloured:
+            models, start = class_fusion.add_coloured_errors(models, start, prior.coloured**2, decay)
+        self.states = start.shape[0]
+        self.F, self.Q, self.start_covariance = (
+            task.constant(matrix)[..., None, None] for matrix in (models.Phi, models.Q, start)
+        )
+        self.variance = task.constant([p.range_sigma**2, p.range_rate_sigma**2])[:, None, None, None]
+        self.deviation = math.hypot(p.radar_bearing_sigma, p.esm_bearing_sigma)
+        recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
+        redrawn = class_fusion.decision_probabilities(recognition, composition)
+        # Labels of the target: its type, or the class whose types are drawn anew.
+        labels = numpy.concatenate(
+            [(1.0 - prior.redrawn) * composition, prior.redrawn * numpy.eye(self.classes)], axis=1
+        )
+        used = labels.sum(axis=0) > 0.0
+        self.labels = labels[:, used]
+        self.confusion = numpy.concatenate([recognition, redrawn])[used]
+        self.other_confusion = recognition
+        others = (1.0 - numpy.eye(self.classes)) / (self.classes - 1)
+        self.others = others @ composition
+        """Probability of a second emitter's type by class of the target, ``(S, I)``."""
+        self.prior_of_class = task.constant(p.prior)[:, None]
+        q, f, g = prior.second_emitter, prior.silence_start, prior.silence_end
+        share = (1.0 - prior.calm) / (len(q) * len(f) * len(g))
+        rates = [(*point, share) for point in itertools.product(q, f, g)]
+        if prior.calm:
+            rates.append((0.0, 0.0, 1.0, prior.calm))
+        grid = emitters.surroundings(task.types, prior.separation, prior.sides, rates)
+        self.start_table = task.constant(emitters.start_table(grid, int(used.sum())))
+        disturbed = (grid.silence_start > 0.0) | (grid.second_emitter > 0.0)
+        self.disturbed = task.constant(disturbed.astype(float))
+        self.by_type = [numpy.flatnonzero(grid.other_type == i).tolist() for i in range(task.types)]
+        self.disturbed_by_type = [[v for v in points if disturbed[v, 0]] for points in self.by_type]
+        self.grid = emitters.Surroundings(grid.other_type, *(task.constant(part) for part in grid[1:]))
+
+    def start(self, initial: Start, N: int) -> ClassTracks:
+        """Start on the first radar measurement, and weigh the classes by the first look."""
+        xp, p, M = self.xp, self.prior, self.prior.onsets + 2
+        none = 0.0 * initial.mean[0]
+        state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
+        mean = state[:, None, None] + xp.zeros((1, self.classes, M, 1))
+        covariance = self.start_covariance + xp.zeros((1, 1, 1, M, 1)) + none
+        table = self.start_table + none
+        nothing = xp.zeros((self.classes, p.onsets + 1, table.shape[0], 1)) + LEAST_PROBABILITY + none
+        return self.weigh(
+            mean,
+            packed_covariance.pack(covariance),
+            self.prior_of_class + none,
+            nothing,
+            table * self.look(initial.first),
+            table,
+        )
+
+    def look(self, measurement: Measurement) -> Array:
+        """Likelihood of this scan's look, ``(J, 2, V, N)``."""
+        return emitters.look_likelihood(
+            self.grid,
+            self.confusion,
+            self.other_confusion,
+            measurement.decision,
+            measurement.bearing_difference,
+            self.deviation,
+            measurement.looked,
+        )
+
+    def of_classes(self, table: Array, points: list[list[int]]) -> Array:
+        """Sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``; over some points of the grid for each type."""
+        both = table[:, 0] + table[:, 1]
+        sums = [ordered_sum(both[:, v] for v in some) for some in points if some]
+        types = [i for i, some in enumerate(points) if some]
+        return self.xp.stack(
+            [
+                ordered_sum(
+                    self.labels[s, j]
+                    * ordered_sum(self.others[s, i] * part[j] for i, part in zip(types, sums, strict=True))
+                    for j in range(table.shape[0])
+                )
+                for s in range(self.classes)
+            ]
+        )  # fmt: skip
+
+    def weigh(
+        self, mean: Array, covariance: Array, unchanged: Array, changed: Array, first: Array, later: Array
+    ) -> ClassTracks:
+        """Normalise everything: T0 and T1 sum to one, and the probabilities of the hypotheses do."""
+        xp = self.xp
+        total = ordered_sum(ordered_sum(ordered_sum(first)))
+        first, unchanged = first / total, unchanged * total
+        sums = [ordered_sum(ordered_sum(part)) for part in later]
+        later = xp.stack([part / total for part, total in zip(later, sums, strict=True)])
+        weights = xp.concat(
+            [
+                (unchanged * self.of_classes(first, self.by_type))[:, None],
+                ordered_sum(changed[:, :, j] for j in range(changed.shape[2])),
+            ],
+            axis=1,
+        )
+        total = ordered_sum(ordered_sum(weights))
+        return ClassTracks(
+            mean,
+            covariance,
+            weights / total,
+            xp.clip(unchanged / total, LEAST_PROBABILITY, None),
+            xp.clip(changed / total, LEAST_PROBABILITY, None),
+            first,
+            later,
+        )
+
+    def update(
+        self, measurement: Measurement, memory: ClassTracks
+    ) -> tuple[Array, Array, ClassTracks, Likelihood]:
+        """One cycle: motion and radar, change of class, ESM. Its likelihood is that of the radar."""
+        xp, prior = self.xp, self.prior
+        P = packed_covariance.unpack(memory.covariance, self.states)
+        mean, P = kalman.predict(memory.mean, P, self.F, self.Q)
+        radar = contaminated_normal.update_position(
+            mean,
+            P,
+            measurement.radar[:, None, None],
+            self.variance,
+            prior.outliers,
+            prior.outlier_factor,
+        )
+        flat = xp.reshape(radar.log_likelihood, (-1, radar.log_likelihood.shape[-1]))
+        top = xp.max(flat, axis=0)
+        factor = xp.exp(radar.log_likelihood - top)
+        weights = factor * memory.weights
+        seen = ordered_sum(ordered_sum(weights))
+        nis = ordered_sum(ordered_sum(weights * radar.squared_distance)) / seen
+        likelihood = Likelihood(top + xp.log(seen), nis, 2.0 + 0.0 * nis)
+
+        moved = memory._replace(
+            mean=radar.mean,
+            covariance=packed_covariance.pack(radar.covariance),
+            weights=weights / seen,
+            unchanged=memory.unchanged * factor[:, 0] / seen,
+            changed=memory.changed * (factor[:, 1:] / seen)[:, :, None],
+        )
+        moved = self.change(moved, measurement.scan)
+        looked = measurement.looked
+        first, later = (
+            emitters.fall_silent(table, self.grid, looked) for table in (moved.first, moved.later)
+        )
+        look = self.look(measurement)
+        first, later = first * look, later * look
+        told = xp.stack([ordered_sum(ordered_sum(part)) for part in later])
+        memory = self.weigh(moved.mean, moved.covariance, moved.unchanged, moved.changed * told, first, later)
+        n, size = self.states, self.classes * (prior.onsets + 2)
+        P = packed_covariance.unpack(memory.covariance, n)
+        estimate, covariance = imm.combine(
+            xp.reshape(memory.mean, (n, size, -1)),
+            xp.reshape(P, (n, n, size, -1)),
+            xp.reshape(memory.weights, (size, -1)),
+        )
+        if self.prior.coloured:
+            estimate, covariance = class_fusion.take_away_coloured_errors(estimate, covariance)
+        return estimate, mirror_lower(covariance), memory, likelihood
+
+    def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
+        """Let the class change, at one scan of every ``spacing``."""
+        xp, prior, B, others = self.xp, self.prior, self.prior.onsets, self.classes - 1
+        p, S, n = self.parameters, range(self.classes), self.states
+        seconds = p.sampling_interval * scan
+        may = (scan % self.spacing == 0) & (seconds >= prior.change[0]) & (seconds <= prior.change[1])
+        hazard = xp.where(may, 1.0 - math.exp(-prior.change_rate * self.spacing * p.sampling_interval), 0.0)
+        again = hazard if prior.again else 0.0 * hazard
+
+        # What leaves each class, and its filter.
+        leaving = hazard * m.unchanged * self.of_classes(m.first, self.disturbed_by_type)
+        states, P = m.mean[:, :, 0], packed_covariance.unpack(m.covariance, self.states)
+        spreads = P[:, :, :, 0]
+        if prior.again:
+            parts = xp.concat(
+                [leaving[:, None], xp.stack([hazard * m.weights[:, 1 + b] for b in range(B + 1)], axis=1)],
+                axis=1,
+            )
+            leaving = ordered_sum(parts[:, b] for b in range(B + 2))
+            shares = parts / xp.clip(leaving, LEAST_PROBABILITY, None)[:, None]
+            states, spreads = imm.combine(
+                xp.moveaxis(m.mean, 2, 1), xp.moveaxis(P, 3, 2), xp.moveaxis(shares, 1, 0)
+            )
+        born, means, covariances = [], [], []
+        for s in S:
+            before = [r for r in S if r != s]
+            parts = xp.stack([leaving[r] / others for r in before])
+            total = ordered_sum(parts)
+            share = (parts + LEAST_PROBABILITY) / (total + others * LEAST_PROBABILITY)
+            mean, covariance = imm.combine(
+                xp.stack([states[:, r] for r in before], axis=1),
+                xp.stack([spreads[:, :, r] for r in before], axis=2),
+                share,
+            )
+            born.append(total)
+            means.append(mean)
+            covariances.append(covariance)
+        begun = xp.stack(born)
+        labels = xp.stack([xp.stack([number * b for number in self.labels[s]]) for s, b in enumerate(born)])
+        state = xp.concat(
+            [
+                xp.stack(means, axis=1),
+                packed_covariance.pack(xp.stack(covariances, axis=2)),
+            ]
+        )
+
+        # The oldest onset joins the older ones, and the new one takes its place.
+        everything = xp.concat([m.mean, m.covariance])
+        number = scan // self.spacing
+        chosen = [may & (number % B == b) for b in range(B)]
+        oldest = ordered_sum(xp.where(chosen[b], everything[:, :, 1 + b], 0.0) for b in range(B))
+        ending = ordered_sum(xp.where(chosen[b], m.changed[:, b], 0.0) for b in range(B))
+        older = m.changed[:, B]
+        parts = xp.stack([ordered_sum(x[:, j] for j in range(x.shape[1])) for x in (older, ending)])
+        kept = everything[:, :, B + 1]
+        mean, covariance = imm.combine(
+            xp.stack([kept[:n], oldest[:n]], axis=1),
+            xp.stack([packed_covariance.unpack(x[n:], n) for x in (kept, oldest)], axis=2),
+            parts / ordered_sum(parts),
+        )
+        merged = xp.concat([mean, packed_covariance.pack(covariance)])
+        slots = [xp.where(chosen[b], state, everything[:, :, 1 + b]) for b in range(B)]
+        everything = xp.stack([everything[:, :, 0], *slots, merged], axis=2)
+        stay = 1.0 - again
+        kept_weights = [xp.where(chosen[b], labels, stay * m.changed[:, b]) for b in range(B)]
+        changed = xp.stack([*kept_weights, stay * (older + ending)], axis=1)
+
+        first, later = self.change_tables(m, hazard, again, begun)
+        return ClassTracks(everything[:n], everything[n:], m.weights, m.unchanged, changed, first, later)
+
+    def change_tables(self, m: ClassTracks, hazard: Array, again: Array, born: Array) -> tuple[Array, Array]:
+        """T0 without what has left, T1 with it."""
+        xp, J, grid = self.xp, m.first.shape[0], self.grid
+        classes, types = range(self.classes), self.others.shape[1]
+        joint = [
+            xp.stack(
+                [
+                    ordered_sum(self.labels[s, j] * self.others[s, i] * m.unchanged[s] for s in classes)
+                    for i in range(types)
+                ]
+            )[grid.other_type]
+            for j in range(J)
+        ]
+        leaving = hazard * self.disturbed
+        came = ordered_sum(joint[j] * leaving * m.first[j] for j in range(J))
+        weights = [
+            ordered_sum(ordered_sum(m.changed[:, b, j]) for b in range(m.changed.shape[1])) for j in range(J)
+        ]
+        if self.prior.again:
+            came = came + again * ordered_sum(weights[j] * m.later[j] for j in range(J))
+        came = came / xp.clip(ordered_sum(ordered_sum(came)), LEAST_PROBABILITY, None)
+        later = []
+        for j in range(J):
+            begun = ordered_sum(self.labels[s, j] * born[s] for s in classes)
+            stay = (1.0 - again) * weights[j]
+            later.append((stay * m.later[j] + begun * came) / (stay + begun))
+        return (1.0 - leaving) * m.first, xp.stack(later)
