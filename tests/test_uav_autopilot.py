@@ -362,23 +362,24 @@ def test_observation_is_recomputed_from_the_measurements_alone(plant: str, contr
         Noise(model, N, 1, steps + 1),
         actions(model, 0, steps, N),
     )
-    drives = model.task.noise.normals - len(model.task.sensors)
+    readout = slice(model.task.world.drives, model.task.world.drives + len(model.task.sensors))
     one = model.begin(noise.uniforms, noise.initial)
     levels = one.truth.levels._replace(values=3.0 * one.truth.levels.values)
-    truth = one.truth._replace(state=5.0 * other.initial, level=levels.values[0], levels=levels)
+    truth = one.truth._replace(
+        state=5.0 * other.initial[: len(one.truth.state)], level=levels.values[0], levels=levels
+    )
     two = one._replace(truth=truth)
     sigmas = numpy.array(model.task.parameters.value("sensor_sigmas"))[:, None]
     for k in range(steps):
         one = model.measure(one, noise.rows[k])
         drive = other.rows[k].copy()
-        drive[drives:] = 0.0
+        drive[readout] = 0.0
         trial = model.measure(two, drive)
-        wanted = (
-            model.task.design.H @ one.truth.state + sigmas * one.truth.sensor_level * noise.rows[k][drives:]
+        without, wanted = (
+            model.task.design.H @ each.truth.state + each.truth.sensor_coloured for each in (trial, one)
         )
-        drive[drives:] = (wanted - model.task.design.H @ trial.truth.state) / (
-            sigmas * trial.truth.sensor_level
-        )
+        wanted = wanted + sigmas * one.truth.sensor_level * noise.rows[k][readout]
+        drive[readout] = (wanted - without) / (sigmas * trial.truth.sensor_level)
         two = model.measure(two, drive)
         assert numpy.abs(one.truth.state - two.truth.state).max() > 0.1
         # The readings agree to rounding, amplified by the filter for 80 steps.
@@ -626,9 +627,47 @@ def test_nothing_befalls_one_of_six() -> None:
     calm = (truth.levels.values == 1.0).all(axis=0)
     assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / N)
     assert (truth.sensor_levels.values[..., calm] == 1.0).all()
+    assert (truth.coloured_kick[:, calm] == 0.0).all()
+    assert (truth.sensor_coloured[:, calm] == 0.0).all()
+    assert (truth.coloured_kick[:, ~calm] > 0.0).all()
     assert (truth.sensor_levels.values[..., ~calm] != 1.0).all()
     assert (truth.dropout_stops[..., calm] == truth.dropout_starts[..., calm]).all()
     assert (truth.dropout_stops[..., ~calm] > truth.dropout_starts[..., ~calm]).all()
+
+
+@BOTH
+def test_slow_errors_of_sensors_are_as_stated(plant: str) -> None:
+    """Coloured errors have their stated deviation and correlation; a bias is constant, of the named sensor."""
+    keywords: dict[str, Any] = {
+        "sensor_coloured": (0.8, 0.8),
+        "sensor_correlation_time": (1.0, 1.0),
+        "sensor_bias": (1.0, 2.0),
+        "biased_sensors": ("rate",),
+    }
+    model, N = make(plant, "paper-noise", **keywords), 20_000
+    noise = Noise(model, N, 0, 1)
+    before = model.begin(noise.uniforms, noise.initial)
+    p, rate = model.task.parameters, list(model.task.sensors).index("rate")
+    sigmas = numpy.array(p.value("sensor_sigmas"))[:, None]
+    bias = before.truth.sensor_bias / sigmas
+    assert (numpy.delete(bias, rate, axis=0) == 0.0).all()
+    assert abs(bias[rate]).min() >= 1.0
+    assert abs(bias[rate]).max() <= 2.0
+    assert abs((bias[rate] > 0.0).mean() - 0.5) < 2.0 / math.sqrt(N)
+    after = model.measure(before, noise.rows[0])
+    error = after.measurement.reading - model.task.design.H @ after.truth.state
+    white = sigmas * noise.rows[0][model.task.world.drives :][: len(sigmas)]
+    # The sum of four numbers against three of them: rounding.
+    numpy.testing.assert_allclose(
+        error - white, after.truth.sensor_coloured + after.truth.sensor_bias, rtol=0, atol=1e-12
+    )
+    one, two = before.truth.sensor_coloured / sigmas, after.truth.sensor_coloured / sigmas
+    decay = math.exp(-p.value("sampling_interval"))
+    # Four standard errors of a sample variance of as many episodes.
+    for product, expected in ((one * one, 1.0), (two * two, 1.0), (one * two, decay)):
+        found = product.mean(axis=1) / 0.8**2
+        numpy.testing.assert_allclose(found, expected, rtol=0, atol=4.0 * math.sqrt(2.0 / N))
+    numpy.testing.assert_array_equal(after.truth.sensor_bias, before.truth.sensor_bias)
 
 
 def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:

@@ -11,7 +11,8 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.measurement_noise import VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
-from filtergym.baselines.uav_autopilot.metrics import METRICS
+from filtergym.baselines.uav_autopilot.level_bank import Kind, LevelBank
+from filtergym.baselines.uav_autopilot.metrics import METRICS, detect_raised_noise
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.theory import stationary
 from filtergym.envs.uav_autopilot.banks import MODES
@@ -108,6 +109,8 @@ def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
     assert theory("kalman") is not None
     assert theory("kalman", "random") is None
     assert theory("kalman", "actuator-lag") is None
+    assert theory("kalman", "gyro-bias") is None
+    assert theory("kalman", sensor_coloured=(0.1, 0.2)) is None
     assert theory("innovation-adaptive") is None
     # It follows the scales that the modes have, whatever an action of one does under gain.
     nominal = pytest.approx(theory("kalman"), rel=1e-12)
@@ -128,20 +131,25 @@ def innovations_of_matched(
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """NIS per available reading, and the innovation over its sigma of the output's sensor, ``(episodes, time)``."""
     model: Any = make_model(ID, "gain", scenario, plant=plant)
-    shown, i = model.task.measured.index(model.task.output), model.task.output
+    shown = model.task.measured.index(model.task.output)
     nis: list[numpy.ndarray] = []
     innovation: list[numpy.ndarray] = []
 
     class Watched(Matched):
         def update(self, measurement: Any, truth: Any, memory: Any) -> Any:
             mean, covariance = self.predict(measurement, truth, memory)
-            R, z, there = self.sensor_variances(truth), measurement.reading, measurement.available
-            update = packed_covariance.update_coordinates(mean, covariance, z, model.task.measured, R, there)
+            R, there = self.sensor_variances(truth), measurement.available
+            update = self.update_covariance(mean, covariance, measurement, truth)
             count = there.sum(axis=0)
             before = nis[-1] if nis else numpy.ones_like(count)
             nis.append(numpy.where(count > 0.0, update.squared_distance / numpy.maximum(count, 1.0), before))
-            S = covariance[packed_covariance.diagonal(len(mean))[i]] + R[shown]
-            innovation.append(there[shown] * (z[shown] - mean[i]) / numpy.sqrt(S))
+            read = list(self.rows[shown])
+            S = (
+                packed_covariance.unpack(covariance, len(mean))[numpy.ix_(read, read)].sum(axis=(0, 1))
+                + R[shown]
+            )
+            error = measurement.reading[shown] - mean[read].sum(axis=0)
+            innovation.append(there[shown] * error / numpy.sqrt(S))
             return super().update(measurement, truth, memory)
 
     for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, episodes)):
@@ -164,6 +172,54 @@ def test_matched_filter_is_consistent_and_attains_the_bound_where_noise_changes(
     # The paper's filter does not know, and shows it: the test can fail.
     nees = dataset.sel(policy="kalman")["nees"].values.mean(axis=1) / n
     assert nees.mean() - 1.0 > 10.0 * nees.std() / math.sqrt(len(nees))
+
+
+def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
+    """Matrices written out, one episode: levels, dropouts, coloured and constant errors, a slow actuator."""
+    keywords = {"sensor_bias": (0.5, 1.0), "actuator_lag": 1.5, "undisturbed": 0.0, "horizon": 60}
+    keywords |= {"disturbance_times": ((10, 20), (30, 40)), "sensor_times": ((10, 50),), "dropout_period": 30}
+    model: Any = make_model(ID, "gain", "random", command_period=60, **keywords)
+    d, sigmas = model.task.design, numpy.array(model.task.parameters.value("sensor_sigmas"))
+    n, m = len(d.model.F), len(sigmas)
+    seen: list[tuple[Any, Any]] = []
+    found: list[Any] = []
+
+    class Watched(Matched):
+        def update(self, measurement: Any, truth: Any, memory: Any) -> Any:
+            result = super().update(measurement, truth, memory)
+            seen.append((measurement, truth))
+            found.append(result)
+            return result
+
+    for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, 2)):
+        pass
+    lane, truth = 1, seen[0][1]
+    psi, kick = truth.coloured_decay[:, lane], truth.coloured_kick[:, lane]
+    initial = numpy.square(model.task.parameters.value("initial_sigmas"))
+    initial[n - 1] *= truth.levels.values[0, lane] ** 2
+    x, P = numpy.zeros(n + m), numpy.diag([*initial, *(kick**2 / (1.0 - psi**2))])
+    F = numpy.pad(d.true_model.F, (0, m)) + numpy.diag([0.0] * n + [*psi])
+    C = numpy.hstack([d.H, numpy.eye(m)])
+    dropped = 0
+    for (measurement, truth), (mean, covariance, _, likelihood) in zip(seen, found, strict=True):
+        Q = truth.level[lane] ** 2 * d.true_model.scaled_noise + d.true_model.other_noise
+        x = F @ x + numpy.append(d.true_model.B[:, 0], [0.0] * m) * measurement.control[lane]
+        P = F @ P @ F.T + numpy.pad(Q, (0, m)) + numpy.diag([*[0.0] * n, *kick**2])
+        there = measurement.available[:, lane] > 0.0
+        dropped += int((~there).sum())
+        H, R = C[there], numpy.diag((sigmas * truth.sensor_level[:, lane])[there] ** 2)
+        S = H @ P @ H.T + R
+        nu = (measurement.reading[:, lane] - truth.sensor_bias[:, lane])[there] - H @ x
+        K = P @ H.T @ numpy.linalg.inv(S)
+        x, P = x + K @ nu, (numpy.eye(n + m) - K @ H) @ P
+        if there.any():
+            assert likelihood.nis[lane] == pytest.approx(nu @ numpy.linalg.solve(S, nu), rel=1e-8)
+        # Packed against full, sixty steps.
+        numpy.testing.assert_allclose(mean[:, lane], x[:n], rtol=0, atol=1e-10)
+        numpy.testing.assert_allclose(covariance[..., lane], P[:n, :n], rtol=0, atol=1e-10)
+    assert dropped > 0
+    assert (kick > 0.0).all()
+    assert (truth.sensor_bias[:, lane] != 0.0).all()
 
 
 @BOTH
@@ -399,6 +455,35 @@ def test_whiteness_by_hand() -> None:
     assert found["innovation_autocorrelation", "all"] == pytest.approx(0.4, abs=4.0 / math.sqrt(50 * 600))
 
 
+def test_alarms_by_hand() -> None:
+    times = 40
+    nis, degrees = numpy.full((5, times), 3.0), numpy.full((5, times), 3.0)
+    raised = numpy.zeros((5, times), bool)
+    raised[:3, 20:], raised[3] = True, True
+    nis[0, 25:] = nis[1, 5:8] = nis[3, 5:] = 30.0
+    nis[:, 30] = math.nan
+    # Each large one adds 30 / 3 - 3/2 log 3 = 8.35: the limit log(40 / 0.02) = 7.6 is reached at once.
+    found = detect_raised_noise(nis, degrees, raised)
+    numpy.testing.assert_array_equal(
+        found,
+        [
+            [0, 1, 0, 1, 5, 1],  # noise is raised at 20, the alarm comes at 25
+            [1, 1, 1, 1, 0, 0],  # an alarm too early, and none when it matters
+            [0, 1, 1, 1, 0, 0],
+            [0, 0, 0, 0, 0, 0],  # raised from the start: does not count
+            [0, 1, 0, 0, 0, 0],
+        ],
+    )
+
+
+def test_a_nominal_filter_detects_a_gust_front_and_raises_few_false_alarms() -> None:
+    found = {r.metric: r for r in tidy_records(run("U", "gust-front", 200, ("kalman",))) if r.window == "all"}
+    for name in ("missed_faults", "false_alarms"):
+        assert 0.0 <= (found[name].value or 0.0) < 0.1
+    # At least one measurement, and less than half of the shortest time that is left.
+    assert 0.02 <= (found["detection_delay"].value or 0.0) < 2.5
+
+
 def test_node_four_is_white_for_the_paper_filter_alone() -> None:
     r = [x for x in tidy_records(run("U", "paper-noise")) if x.metric == "innovation_autocorrelation"]
     found = {(x.policy, x.window): x.value for x in r}
@@ -491,3 +576,81 @@ def test_who_learns_the_noise_flies_better_where_it_changes():
         for name in names:
             difference = (cost.sel(policy=name) - cost.sel(policy="kalman")).values
             assert difference.mean() < -4.0 * difference.std() / math.sqrt(40), (scenario, name)
+
+
+# ---------------------------------------------------------------- the bank over levels
+
+
+def bank(**changed: Any) -> Any:
+    def make(task: Any) -> LevelBank:
+        return LevelBank(task, **changed)
+
+    make.kind = "estimator"  # type: ignore[attr-defined]
+    return make
+
+
+@BOTH
+def test_a_bank_over_one_level_is_a_kalman_filter(plant: str) -> None:
+    one = {"gusts": (1.0, 1.0), "gust_points": 1, "sensors": (1.0, 1.0), "sensor_points": 1, "slow": ()}
+    error = evaluate(ID, {"kalman": "kalman", "bank": bank(**one)}, "random", 8, plant=plant)["error"]
+    # The same filter twice, merged with itself: the loop carries rounding on, and is stable.
+    numpy.testing.assert_allclose(error.sel(policy="bank"), error.sel(policy="kalman"), rtol=0, atol=1e-9)
+    if plant == "U":
+        slower = bank(**one, kinds=(Kind(lag=2.0),))
+        error = evaluate(ID, {"matched": "matched", "bank": slower}, "actuator-lag", 8)["error"]
+        numpy.testing.assert_allclose(
+            error.sel(policy="bank"), error.sel(policy="matched"), rtol=0, atol=1e-9
+        )
+
+
+def test_a_slow_error_in_the_bank_is_the_one_of_the_told_filter() -> None:
+    """Coloured errors of one deviation and correlation time, all else nominal: both filters are one."""
+    keywords: dict[str, Any] = {"sensor_coloured": (0.5, 0.5), "sensor_correlation_time": (2.0, 2.0)}
+    changed = {"gusts": (1.0, 1.0), "gust_points": 1, "sensors": (1.0, 1.0), "sensor_points": 1}
+    kind = Kind(error=0.5, error_time=2.0, always=True)
+    makers = {
+        "matched": "matched",
+        "bank": bank(**changed, slow=("pitch", "rate", "elevator"), kinds=(kind,)),
+    }
+    error = evaluate(ID, makers, "paper-noise", 8, **keywords)["error"]
+    numpy.testing.assert_allclose(error.sel(policy="bank"), error.sel(policy="matched"), rtol=0, atol=1e-9)
+
+
+def test_the_banks_win_where_they_should_and_the_told_filter_stays_the_limit() -> None:
+    """Paired differences of 60 episodes, four standard errors; the told filter is below all."""
+    better = {"random": ("level-bank", "level-bank-vague"), "gyro-bias": ("level-bank-vague",)}
+    names = ["kalman", "gust-imm", "level-bank", "level-bank-vague", "matched"]
+    for scenario, winners in better.items():
+        cost = evaluate(ID, names, scenario, 60)["cost"].mean("time")
+
+        def errors(one: str, two: str, cost: Any = cost) -> float:
+            difference = (cost.sel(policy=one) - cost.sel(policy=two)).values
+            return float(difference.mean() / (difference.std(ddof=1) / math.sqrt(len(difference))))
+
+        for name in winners:
+            assert errors(name, "kalman") < -4.0, (scenario, name)
+        for name in names[:-1]:
+            assert errors(name, "matched") > -3.0, (scenario, name)
+
+
+def test_who_knows_the_command_and_no_measurement_scores_below_zero() -> None:
+    """Nothing in an episode can be recited: commands and noise are drawn anew."""
+
+    class OpenLoop:
+        kind = "estimator"
+
+        def __init__(self, task: Any) -> None:
+            self.task, d = task, task.design
+            self.F, self.B = d.model.F, d.model.B
+            self.covariance = d.state_covariance[:, :, None]
+
+        def start(self, initial: Any, N: int) -> Any:
+            return initial.mean
+
+        def update(self, measurement: Any, memory: Any) -> Any:
+            mean = self.F @ memory + self.B * measurement.control
+            return mean, self.covariance + 0.0 * measurement.number, mean
+
+    cost = evaluate(ID, {"kalman": "kalman", "open": OpenLoop}, "random", 60)["cost"].mean("time")
+    difference = (cost.sel(policy="open") - cost.sel(policy="kalman")).values
+    assert difference.mean() > 4.0 * difference.std(ddof=1) / math.sqrt(len(difference))

@@ -9,9 +9,11 @@ import numpy
 from ...envs.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.cause_split import held_causes
 from ...evaluation.dataset import keywords_of, slices_of
 from ...evaluation.metrics import Measure
 from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ..alarm import LARGER, scale_ratio
 from .theory import stationary
 
 if TYPE_CHECKING:
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
 
 LOST_SIGMAS = 100.0
 """Tracking error, over the nominal sigma of the output's sensor, beyond which a loop counts as lost."""
+
+FALSE_ALARMS = 0.02
+"""False alarms that an episode of consistent innovations may have on average, which sets the limit of the alarm."""
 
 
 def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
@@ -54,7 +59,47 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     if "innovation" in run and not numpy.isnan(run["innovation"].values).all():
         parts = [_lag_products(run["innovation"].values[:, times]) for times in slices.values()]
         each["innovation"] = numpy.stack(parts, axis=1)
+    if "causes" in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
+        held = dict(held_causes(run))
+        raised = held["disturbance"] | held["sensor noise"]
+        each["detection"] = detect_raised_noise(run["nis"].values, run["nis_degrees"].values, raised)
     return MetricInputs(each, averaged)
+
+
+def detect_raised_noise(nis: numpy.ndarray, degrees: numpy.ndarray, raised: numpy.ndarray) -> numpy.ndarray:
+    """Judge an alarm on a filter's own innovations, ``(episodes, 6)``.
+
+    The alarm is Page's cumulative sum of the log-likelihood ratio of innovations with ``LARGER`` times their variance
+    (E. S. Page, Continuous inspection schemes, Biometrika 41 (1954), 100-115), its limit by G. Lorden, Annals of
+    Mathematical Statistics 42 (1971), 1897-1908, as in :mod:`..alarm`. What counts is the first time that noise is
+    raised in an episode that does not begin with it.
+
+    Args:
+        nis: normalised innovation squared, NaN where nothing was received, ``(episodes, time)``.
+        degrees: its degrees of freedom.
+        raised: whether noise is raised.
+
+    Returns:
+        For each episode whether there is an alarm while noise is not raised yet, whether it begins without raised
+        noise, whether no alarm follows the onset, whether there is an onset, measurements from onset to alarm, and
+        whether one follows; zeros in an episode that begins with raised noise.
+    """
+    episodes, times = nis.shape
+    limit = math.log(times / FALSE_ALARMS)
+    ratio = numpy.nan_to_num(scale_ratio(nis, degrees, LARGER))
+    total, alarm = numpy.zeros(episodes), numpy.zeros((episodes, times), bool)
+    for t in range(times):
+        total = numpy.clip(total + ratio[:, t], 0.0, limit)
+        alarm[:, t] = total >= limit
+    begins = ~raised[:, 0]
+    onset = begins & raised.any(axis=1)
+    first = numpy.where(onset, raised.argmax(axis=1), times)
+    since = numpy.arange(times) - first[:, None]
+    after = alarm & (since >= 0) & onset[:, None]
+    detected = after.any(axis=1)
+    delay = numpy.where(detected, after.argmax(axis=1) - first, 0)
+    false = (alarm & (since < 0)).any(axis=1) & begins
+    return numpy.stack([false, begins, onset & ~detected, onset, delay, detected], axis=1).astype(float)
 
 
 def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
@@ -75,6 +120,11 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     equation. With a step command ``overshoot``, ``rise_time`` (to 90 %), ``settling_time`` (to 5 %) of the
     response averaged over episodes, whose noise falls with the root of their number, and ``mean_output``
     when settled; times that are not reached are cut off at the end of the window "transient".
+
+    Of an alarm on the competitor's own innovations (:func:`detect_raised_noise`): ``false_alarms``, share of episodes
+    with one before noise is raised, of those that begin without; ``missed_faults``, share of the onsets that no alarm
+    follows; ``detection_delay`` of the others. A filter that adapts at once has small innovations again and no
+    alarm: then a miss is not a fault of the filter.
     """
     if not gathered.each:
         return []
@@ -106,6 +156,17 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
             product, power = numpy.moveaxis(bootstrap.means(each["innovation"][:, i]), -1, 0)
             correlation = bootstrap.interval(product / numpy.maximum(power, 1e-300))
             found.append(Measure("innovation_autocorrelation", "lag 1", window, correlation, "1"))
+    if "detection" in each:
+        shares = numpy.moveaxis(bootstrap.means(each["detection"]), -1, 0)
+        T = task.parameters.value("sampling_interval")
+        for metric, i, factor, unit_of in (
+            ("false_alarms", 0, 1.0, "1"),
+            ("missed_faults", 2, 1.0, "1"),
+            ("detection_delay", 4, T, "s"),
+        ):
+            if each["detection"][:, i + 1].any():
+                share = bootstrap.interval(factor * shares[i] / numpy.maximum(shares[i + 1], 1e-300))
+                found.append(Measure(metric, "", "all", share, unit_of))
     found.append(Measure("lost_loops", "", "all", bootstrap.estimate(each["far"].astype(float)), "1"))
     if task.parameters.step_size:
         found += _step_response(task, gathered, windows, unit, bootstrap)

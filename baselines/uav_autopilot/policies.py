@@ -14,6 +14,7 @@ from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, Variant, tunable
 from .alarm import AutopilotAlarm
 from .estimators import ESTIMATORS, GustInteractingMultipleModel
+from .level_bank import VAGUE, LevelBank
 from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 
@@ -149,7 +150,16 @@ BASELINES = Baselines(
         "fixed-best": FixedScale,
         "random": RandomPolicy,
     },
-    estimators=ESTIMATORS,
+    estimators={
+        **ESTIMATORS,
+        "level-bank": LevelBank,
+        "level-bank-vague": Variant(
+            LevelBank,
+            "The level bank with one vague prior for all flights: wider levels, outliers, a biased rate sensor, a slow "
+            "actuator.",
+            prior=VAGUE,
+        ),
+    },
     references={"true-state": TrueState, "matched": Matched},
     bounds={"known-noise-bound": KnownNoiseBound},
     score_paper="kalman",

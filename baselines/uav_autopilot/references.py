@@ -3,9 +3,10 @@
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
+import numpy
+
 from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.uav_autopilot.plant import Model
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
 from ...evaluation.competitors import Likelihood
@@ -33,76 +34,121 @@ class TrueState:
 
 
 class _KnownNoise:
-    """The covariance (12) of a plant with the noise as it is now.
+    """The covariance (12) of the true plant with the noise as it is now, and with the coloured errors of the sensors.
 
-    Args:
-        task: whose noise it is.
-        model: the plant that is believed.
+    A coloured error is a further coordinate of the state, which its sensor reads together with its own; its decay and
+    its noise are told (A. E. Bryson and L. J. Henrikson, "Estimation using sampled data containing sequentially
+    correlated noise", Journal of Spacecraft and Rockets 5 (1968), 662-665, by augmentation).
     """
 
     kind = "reference"
     traceable = True
     knows: str
 
-    def __init__(self, task: UavAutopilot, model: Model) -> None:
+    def __init__(self, task: UavAutopilot) -> None:
         self.task, self.xp = task, task.xp
-        self.F, self.B = task.constant(model.F), task.constant(model.B)
-        self.propagator = task.constant(packed_covariance.propagator(model.F))
-        self.scaled = task.constant(packed_covariance.pack(model.scaled_noise)[:, None])
-        self.other = task.constant(packed_covariance.pack(model.other_noise)[:, None])
-        self.variances = task.constant(task.sensor_variances)[:, None]
+        model, n, m = task.design.true_model, len(task.components), len(task.sensors)
+        errors = m if task.world.sensors_are_coloured else 0
+        pack, size = packed_covariance.pack, n + errors
+        self.rows = [(i, n + k) if errors else (i,) for k, i in enumerate(task.measured)]
+        """Coordinates that each sensor reads the sum of."""
 
-    def start_covariance(self, initial: Start, truth: Truth) -> Array:
+        def enlarge(matrix: numpy.ndarray) -> numpy.ndarray:
+            return numpy.pad(matrix, (0, errors))
+
+        rest = enlarge(numpy.zeros((n, n))) + numpy.diag([0.0] * n + [1.0] * errors)
+        self.F = task.constant(enlarge(model.F) + rest)
+        self.B = task.constant(numpy.concatenate([model.B, numpy.zeros((errors, 1))]))
+        self.propagator = task.constant(packed_covariance.propagator(enlarge(model.F) + rest))
+        self.scaled = task.constant(pack(enlarge(model.scaled_noise))[:, None])
+        self.other = task.constant(pack(enlarge(model.other_noise))[:, None])
+        self.variances = task.constant(task.sensor_variances)[:, None]
+        self.diagonal = packed_covariance.diagonal(size)
+        placed = numpy.zeros((size * (size + 1) // 2, errors))
+        placed[self.diagonal[n:], range(errors)] = 1.0
+        self.placed = task.constant(placed)
+        """Where the variances of the errors stand in the packed triangle."""
+        self.initial_covariance = task.constant(
+            pack(enlarge(numpy.diag(numpy.square(task.parameters.value("initial_sigmas")))))[:, None]
+        )
+        gust = numpy.zeros((len(placed), 1))
+        gust[self.diagonal[n - 1]] = float(task.parameters.plant == "U")
+        self.gust = task.constant(gust)
+        self.n, self.size = n, size
+
+    def start_covariance(self, truth: Truth) -> Array:
         """Packed covariance of the start: the gust starts at the level of the first part."""
-        covariance = packed_covariance.pack(initial.covariance)
-        if self.task.parameters.plant != "U":
+        covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
+        if self.size == self.n:
             return covariance
-        return self.xp.concat([covariance[:-1], covariance[-1:] * truth.level**2])
+        stationary = truth.coloured_kick**2 / (1.0 - truth.coloured_decay**2)
+        return covariance + self.xp.matmul(self.placed, stationary)
+
+    def decays(self, truth: Truth) -> Array:
+        """What is left of each coordinate's deviation beside what F says, ``(size, N)``."""
+        return self.xp.concat([self.xp.ones_like(truth.state), truth.coloured_decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
         """Packed covariance predicted with the disturbance of the interval before this measurement."""
-        return self.xp.matmul(self.propagator, covariance) + (truth.level**2 * self.scaled + self.other)
+        predicted = self.xp.matmul(self.propagator, covariance)
+        noise = truth.level**2 * self.scaled + self.other
+        if self.size > self.n:
+            decays = self.decays(truth)
+            predicted = packed_covariance.pack(decays[:, None] * decays[None]) * predicted
+            noise = noise + self.xp.matmul(self.placed, truth.coloured_kick**2)
+        return predicted + noise
+
+    def update_covariance(
+        self, mean: Array, covariance: Array, measurement: Measurement, truth: Truth
+    ) -> packed_covariance.Update:
+        """Take in the readings without their constant errors, with the noise of this measurement."""
+        return packed_covariance.update_coordinates(
+            mean,
+            covariance,
+            measurement.reading - truth.sensor_bias,
+            self.rows,
+            self.sensor_variances(truth),
+            measurement.available,
+        )
 
     def sensor_variances(self, truth: Truth) -> Array:
-        """Variance of each sensor at this measurement, ``(m, N)``."""
+        """Variance of each sensor's white noise at this measurement, ``(m, N)``."""
         return self.variances * truth.sensor_level**2
 
 
 class Matched(_KnownNoise):
-    """The Kalman filter with the noise as it is now: its Q and R follow every change at once.
+    """The Kalman filter of the true plant and noise: the posterior mean of whoever is told the draw of the episode.
 
-    It is not told of a slower actuator.
+    The regulator behind it is that of everybody: it goes on believing the nominal actuator.
     """
 
     kind = "reference"
-    knows = "the present level of the disturbance and of each sensor's noise"
-
-    def __init__(self, task: UavAutopilot) -> None:
-        super().__init__(task, task.design.model)
+    knows = (
+        "the level of the disturbance and of each sensor's noise, the sensors' constant and coloured errors, "
+        "and the true actuator"
+    )
 
     def start(self, initial: Start, truth: Truth) -> Initial:
         """Start where everyone starts, with the true covariance, packed."""
-        return Initial(initial.mean, self.start_covariance(initial, truth))
+        mean = self.xp.concat([initial.mean, 0.0 * truth.sensor_bias])[: self.size]
+        return Initial(mean, self.start_covariance(truth))
 
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
         """Equations (10), (12) with the disturbance as it is; the covariance is packed."""
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
+        if self.size > self.n:
+            mean = self.decays(truth) * mean
         return Initial(mean, self.predict_covariance(memory.covariance, truth))
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: Initial
     ) -> tuple[Array, Array, Initial, Likelihood]:
         """Equations (12), (11) with the noise of this measurement."""
-        updated = packed_covariance.update_coordinates(
-            *self.predict(measurement, truth, memory),
-            measurement.reading,
-            self.task.measured,
-            self.sensor_variances(truth),
-            measurement.available,
-        )
-        covariance = packed_covariance.unpack(updated.covariance, len(self.task.components))
+        n = self.n
+        updated = self.update_covariance(*self.predict(measurement, truth, memory), measurement, truth)
+        covariance = packed_covariance.unpack(updated.covariance, self.size)[:n, :n]
         likelihood = likelihood_of(measurement, updated.log_likelihood, updated.squared_distance, self.xp)
-        return updated.mean, covariance, Initial(updated.mean, updated.covariance), likelihood
+        return updated.mean[:n], covariance, Initial(updated.mean, updated.covariance), likelihood
 
 
 class KnownNoiseBound(_KnownNoise):
@@ -113,23 +159,15 @@ class KnownNoiseBound(_KnownNoise):
     """
 
     kind = "bound"
-    knows = "the level of every noise and the true actuator"
-
-    def __init__(self, task: UavAutopilot) -> None:
-        super().__init__(task, task.design.true_model)
+    knows = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
         """Covariance of the state's own distribution at the start, packed."""
-        return self.start_covariance(initial, truth)
+        return self.start_covariance(truth)
 
     def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array]:
         """Bound after this measurement."""
-        after = packed_covariance.update_coordinates(
-            self.xp.zeros_like(truth.state),
-            self.predict_covariance(memory, truth),
-            measurement.reading,
-            self.task.measured,
-            self.sensor_variances(truth),
-            measurement.available,
-        ).covariance
-        return after[packed_covariance.diagonal(len(self.task.components))], after
+        zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.sensor_bias])[: self.size])
+        predicted = self.predict_covariance(memory, truth)
+        after = self.update_covariance(zero, predicted, measurement, truth).covariance
+        return after[self.diagonal[: self.n]], after

@@ -22,16 +22,18 @@ def stationary(task: UavAutopilot, name: str) -> Stationary | None:
 
     Returns:
         None where the loop is not linear with constant coefficients (levels that change, dropouts, actions
-        that depend on the data), where the true actuator differs from the believed one, or where the loop is
-        unstable.
+        that depend on the data), where sensors have coloured or constant errors, where the true actuator differs
+        from the believed one, or where the loop is unstable.
     """
     p, d = task.parameters, task.design
     nominal = ((1.0, 1.0),)
-    if (p.disturbance_levels, p.sensor_levels, p.dropout_period, p.actuator_lag) != (
+    slow = max(p.sensor_coloured[1], p.sensor_bias[1])
+    if (p.disturbance_levels, p.sensor_levels, p.dropout_period, p.actuator_lag, slow) != (
         nominal,
         nominal,
         0,
         1.0,
+        0.0,
     ):
         return None
     F, B, H, L, R = d.model.F, d.model.B, d.H, d.feedback, d.R

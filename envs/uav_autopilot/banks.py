@@ -10,7 +10,18 @@ import numpy
 from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
 from ..filter import Bank
-from ..observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, Compression, Quantity
+from ..observation import (
+    ACTION,
+    KEPT_AS_LOG,
+    LARGEST_LOG,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+    Compression,
+    Quantity,
+    within,
+)
 from .parameters import UavAutopilotParameters
 from .world import Measurement, Start
 
@@ -18,7 +29,9 @@ if TYPE_CHECKING:
     from .task import UavAutopilot
 
 MODES = ("nominal", "wide-band", "raw-sensors", "over-smoothed")
-FLOORED_LOG = Compression("log of ", lambda value, xp: xp.log(xp.clip(value, 0.01, None)), numpy.exp)
+FLOORED_LOG = Compression(
+    "log of ", lambda value, xp: xp.log(xp.clip(value, 0.01, None)), numpy.exp, (math.log(0.01), LARGEST_LOG)
+)
 """The logarithm of squares, which may be zero; less than a hundredth of their expectation says no more."""
 
 
@@ -140,12 +153,14 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
                 lambda _, measurement: measurement.available,
                 "1 where the sensor answered, 0 in a dropout",
                 sensors,
+                SHARE,
                 over_interval="mean",
             ),
             Block(
                 "time",
                 lambda _, measurement: measurement.number / horizon,
                 "measurements so far over the horizon",
+                shown=within(0.0, (horizon + 1) / horizon),
             ),
             self.action_block,
         )
@@ -283,7 +298,7 @@ class GainBank(_AutopilotFilter):
     """Control ``gain``: the action scales the process noise."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
-    action_block = Block("action", lambda f, _: f.action, "last action")
+    action_block = Block("action", lambda f, _: f.action, "last action", shown=ACTION)
     no_action = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
@@ -318,7 +333,7 @@ class NoiseBank(_AutopilotFilter):
     @property
     def action_block(self) -> Block:
         """Last action."""
-        return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors))
+        return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors), ACTION)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale the process noise by ``10 ** (noise_reach process_decades a)``."""
@@ -337,7 +352,7 @@ class ModeBank(_AutopilotFilter):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
     action_space = gymnasium.spaces.Discrete(len(MODES))
-    action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
+    action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
     no_action = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(self, task: "UavAutopilot", control: str) -> None:

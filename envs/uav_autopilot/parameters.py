@@ -135,6 +135,17 @@ class UavAutopilotParameters(TaskParameters):
     """Range of the first measurement of the second and further parts."""
     changing_sensors: tuple[str, ...] | None = None
     """Sensors that these factors apply to; None: all, drawn independently."""
+    sensor_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Interval of the stationary standard deviation of the coloured error of each sensor (first-order Gauss-Markov),
+    beside the white one, over its nominal standard deviation, drawn uniformly; nobody reports it."""
+    sensor_correlation_time: tuple[float, float] = parameter((0.2, 5.0), above=0.0, ascending=True)
+    """Interval of the correlation time of this error, s, drawn log-uniformly. Ours: from ten samples to half an
+    episode of plant U."""
+    sensor_bias: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Interval of the size of a constant error of a sensor, over its nominal standard deviation, drawn uniformly, of
+    either sign; nobody reports it."""
+    biased_sensors: tuple[str, ...] | None = None
+    """Sensors that have such an error; None: all, drawn independently."""
     dropout_period: int = parameter(0, at_least=0)
     """Each sensor drops out once in every so many measurements; zero: never."""
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
@@ -197,8 +208,9 @@ class UavAutopilotParameters(TaskParameters):
             )
         self._check_parts("disturbance", self.disturbance_levels, self.disturbance_times)
         self._check_parts("sensor", self.sensor_levels, self.sensor_times)
-        for sensor in self.changing_sensors or ():
-            check("each of changing_sensors", sensor, str, Limits(choices=sensors))
+        for name in ("changing_sensors", "biased_sensors"):
+            for sensor in getattr(self, name) or ():
+                check(f"each of {name}", sensor, str, Limits(choices=sensors))
         if 0 < self.dropout_period <= self.dropout_length[1]:
             raise ValueError(
                 f"dropout_period must be longer than the longest dropout, {self.dropout_length[1]}, "

@@ -1,4 +1,4 @@
-"""Scenarios of UavAutopilot: the paper's two inputs, the training distribution, and three held-out tests.
+"""Scenarios of UavAutopilot: the paper's two inputs, the training distribution, and four held-out tests.
 
 Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16
 (plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of
@@ -16,6 +16,7 @@ _RANDOM = {
     "disturbance_times": ((100, 250), (350, 500)),
     "sensor_levels": ((0.5, 6.0), (0.5, 6.0)),
     "sensor_times": ((150, 450),),
+    "sensor_coloured": (0.0, 0.3),
     "dropout_period": 300,
     "undisturbed": 1.0 / 6.0,
 }
@@ -39,7 +40,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: steps and doublets of the command; gust level and sensor noise drawn for each "
-            "episode and changing inside it; short dropouts of single sensors; in one of six nothing of these.",
+            "episode and changing inside it, coloured errors of the sensors beside the white ones; short dropouts of "
+            "single sensors; in one of six nothing of these.",
             _RANDOM,
             {"steady": (50, 600)},
             training=True,
@@ -70,6 +72,13 @@ SCENARIOS: Mapping[str, Scenario] = {
             "The actuator is twice as slow as the filter and the autopilot believe (plant U); no training episode "
             "holds the like.",
             {**_NOMINAL_WITH_COMMANDS, "actuator_lag": 2.0},
+            {"steady": (100, 600)},
+        ),
+        Scenario(
+            "gyro-bias",
+            "The rate sensor has a constant error of one to two nominal standard deviations, unreported; no training "
+            "episode holds the like.",
+            {**_NOMINAL_WITH_COMMANDS, "sensor_bias": (1.0, 2.0), "biased_sensors": ("rate",)},
             {"steady": (100, 600)},
         ),
     )

@@ -90,7 +90,7 @@ class UavAutopilot(Task):
     ## Arguments
 
     ``plant``, ``control``, ``scenario`` (``random``, ``paper-noise``, ``paper-step``; held out:
-    ``gust-front``, ``sensor-degradation``, ``actuator-lag``), and every field of
+    ``gust-front``, ``sensor-degradation``, ``actuator-lag``, ``gyro-bias``), and every field of
     :class:`UavAutopilotParameters`. Refused, with the reason: an L that does not stabilise the plant, noise
     that is not positive, sensors that do not determine the state.
 

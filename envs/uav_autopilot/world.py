@@ -8,6 +8,7 @@ import numpy
 
 from ...filters import linear_systems
 from ..draws import Draws
+from ..faults import GaussMarkov
 from ..observation import Array
 from ..schedules import Steps, within
 from ..world import World
@@ -42,6 +43,14 @@ class Truth(NamedTuple):
     """Values ``(J + 1, N)``."""
     sensor_levels: Steps
     """Values ``(J + 1, m, N)``."""
+    sensor_bias: Array
+    """Constant error of each sensor, in its unit, ``(m, N)``."""
+    sensor_coloured: Array
+    """Coloured error of each sensor at this measurement, in its unit, ``(m, N)``."""
+    coloured_decay: Array
+    """What is left of it at the next measurement, ``(m, N)``."""
+    coloured_kick: Array
+    """Standard deviation of what it gains, ``(m, N)``; zero: there is no such error."""
     dropout_starts: Array
     """First measurement without a reading, ``(D, m, N)``."""
     dropout_stops: Array
@@ -96,15 +105,18 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         """Normal numbers that the level of the disturbance multiplies; they come first."""
         self.drives = scaled.shape[1] + other.shape[1]
         """Normal numbers that drive the plant; those of the sensors follow."""
-        self.initial_normals = len(task.components)
-        self.normals = self.drives + len(task.sensors)
+        m = len(task.sensors)
+        self.sensors_are_coloured = p.sensor_coloured[1] > 0.0
+        self.initial_normals = len(task.components) + self.sensors_are_coloured * m
+        self.normals = self.drives + (1 + self.sensors_are_coloured) * m
         self.noise_factor = constant(numpy.hstack([scaled, other]))
         self.F, self.B = constant(plant.F), constant(plant.B)
         self.sensor_sigmas = constant(p.value("sensor_sigmas"))[:, None]
         self.initial_sigmas = constant(p.value("initial_sigmas"))[:, None]
         self.initial_covariance = constant(numpy.diag(numpy.square(p.value("initial_sigmas"))))[:, :, None]
-        self.changing = constant(
-            [[float(p.changing_sensors is None or s in p.changing_sensors)] for s in task.sensors]
+        self.changing, self.biased = (
+            constant([[float(named is None or s in named)] for s in task.sensors])
+            for named in (p.changing_sensors, p.biased_sensors)
         )
         self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
@@ -115,7 +127,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
         """Draw what the episode will be like, and the state at its start."""
         xp, p, m = self.xp, self.parameters, len(self.task.sensors)
-        state = self.initial_sigmas * normals
+        state = self.initial_sigmas * normals[: len(self.task.components)]
         zero = xp.zeros_like(state[0])
         commands = self._commands(draws, zero)
         levels = self._parts(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
@@ -128,11 +140,21 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             room = draws.unit(f"dropout_{i}", m) * (p.dropout_period - length)
             starts.append(i * p.dropout_period + 1.0 + xp.floor(room))
             stops.append(starts[-1] + length)
+        bias, deviation = no_dropout, no_dropout
+        if p.sensor_bias[1]:
+            side = xp.where(draws.event("bias_side", 0.5, m), 1.0, -1.0)
+            bias = self.sensor_sigmas * self.biased * side * draws.uniform("bias", p.sensor_bias, m)
+        lasting = 1.0 + no_dropout
+        if self.sensors_are_coloured:
+            deviation = self.sensor_sigmas * draws.uniform("coloured", p.sensor_coloured, m)
+            lasting = draws.log_uniform("correlation_time", p.sensor_correlation_time, m)
         if p.undisturbed:
             calm = draws.event("undisturbed", p.undisturbed)
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
             sensor_levels = sensor_levels._replace(values=xp.where(calm, 1.0, sensor_levels.values))
             stops = [xp.where(calm, start, stop) for start, stop in zip(starts, stops, strict=True)]
+            bias, deviation = (xp.where(calm, 0.0, values) for values in (bias, deviation))
+        coloured = GaussMarkov.sampled(deviation, lasting, p.value("sampling_interval"), xp)
         if p.plant == "U":
             state = xp.concat([state[:-1], state[-1:] * levels.values[0]])
         truth = Truth(
@@ -145,6 +167,12 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             commands=commands,
             levels=levels,
             sensor_levels=sensor_levels,
+            sensor_bias=bias,
+            sensor_coloured=deviation * normals[len(self.task.components) :]
+            if self.sensors_are_coloured
+            else no_dropout,
+            coloured_decay=coloured.decay,
+            coloured_kick=coloured.kick,
             dropout_starts=xp.stack(starts)[1:],
             dropout_stops=xp.stack(stops)[1:],
         )
@@ -202,12 +230,20 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         xp = self.xp
         number = truth.number + 1.0
         level, sensor_level = truth.levels.at(number, xp), truth.sensor_levels.at(number, xp)
-        drive, readout = noise[: self.drives], noise[self.drives :]
+        m = len(self.task.sensors)
+        drive, readout = noise[: self.drives], noise[self.drives : self.drives + m]
         drive = xp.concat([drive[: self.scaled_drives] * level, drive[self.scaled_drives :]])
         disturbance = xp.matmul(self.noise_factor, drive)
         state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
         state = xp.clip(state, -FARTHEST, FARTHEST)
         reading = self.task.readings_of(state) + self.sensor_sigmas * sensor_level * readout
+        coloured = truth.sensor_coloured
+        if self.sensors_are_coloured:
+            process = GaussMarkov(truth.coloured_decay, truth.coloured_kick)
+            coloured = process.advance(coloured, noise[self.drives + m :])
+            reading = reading + coloured
+        if self.parameters.sensor_bias[1]:
+            reading = reading + truth.sensor_bias
         available = xp.ones_like(reading)
         for i in range(truth.dropout_starts.shape[0]):
             out = within(number, (truth.dropout_starts[i], truth.dropout_stops[i]))
@@ -221,6 +257,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             command=command,
             level=level,
             sensor_level=sensor_level,
+            sensor_coloured=coloured,
         )
         return truth, Measurement(number, reading, available, command, feedback)
 
@@ -267,7 +304,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
-        measurements at which they step, and the levels now.
+        measurements at which they step, the levels now, and what the sensors' errors have beside white noise.
         """
         return {
             "levels": truth.levels.values,
@@ -280,4 +317,6 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             "dropout_stops": truth.dropout_stops,
             "level": truth.level,
             "sensor_level": truth.sensor_level,
+            "sensor_bias": truth.sensor_bias,
+            "sensor_coloured": truth.sensor_coloured,
         }
