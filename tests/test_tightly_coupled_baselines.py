@@ -4,9 +4,12 @@ import math
 
 import numpy
 import pytest
+import scipy.linalg
+import scipy.stats
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
+from filtergym.baselines.tightly_coupled_navigation.fault_hypotheses import VAGUE, FaultHypotheses
 from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
@@ -68,6 +71,7 @@ def test_bound_is_the_dense_recursion():
         "rates_outage_duration": (0.05, 0.1), "satellites_outage_probability": 1.0,
         "satellites_outage_duration": (0.1, 0.1), "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
         "manoeuvre_throughout": 0.0, "undisturbed": 0.0, "urban": False, "aperture": False,
+        "pseudorange_coloured": (0.5, 3.0), "pseudorange_correlation_time": (0.05, 1.0),
     }  # fmt: skip
     model = make_model(ID, **keywords)
     seen = []
@@ -95,24 +99,27 @@ def test_bound_is_the_dense_recursion():
     for i in (8, 9, 10):
         Q[LINE][i, i] = 0.0  # the acceleration of straight flight is zero, not nearly
     for lane in range(8):
-        P = numpy.diag(model.task.world.initial_sigma[:, 0] ** 2)
+        coloured, decay = seen[0][1].coloured_deviation[lane], seen[0][1].coloured_decay[lane]
+        P = numpy.diag([*model.task.world.initial_sigma[:, 0] ** 2, *[coloured**2] * S])
         mode = int(seen[0][1].mode[lane])
         for (said, truth), mean_square in zip(seen, bounds, strict=True):
             jumped = truth.jumped[lane] > 0.0
             i = mode if jumped else int(truth.mode[lane])
-            P = F[i] @ P @ F[i].T + Q[i]
+            moving = scipy.linalg.block_diag(F[i], decay * numpy.eye(S))
+            gained = scipy.linalg.block_diag(Q[i], coloured**2 * (1.0 - decay**2) * numpy.eye(S))
+            P = moving @ P @ moving.T + gained
             if jumped:
                 P[8:11] = P[:, 8:11] = 0.0
             position, velocity = model.task.satellites_at(truth.step)
             _, rows = gnss_ins.observe(truth.state, position, velocity, said.ins_angles, p.gravity)
-            H = dense(rows, truth.state)[..., lane]
+            H = numpy.hstack([dense(rows, truth.state)[..., lane], numpy.eye(len(rows), S)])
             R = numpy.array(model.task.sensor_variance) * truth.noise_factor[:, lane] ** 2
             there = said.available[:, lane] > 0.0
             there[2 * S : 2 * S + 3] &= truth.stuck[lane] == 0.0
             H, R = H[there], numpy.diag(R[there])
             P = P - P @ H.T @ numpy.linalg.solve(H @ P @ H.T + R, H @ P)
             # Subtraction of the dense form: 100 m^2 and 1e-6 (rad/s)^2 stand in one matrix.
-            numpy.testing.assert_allclose(mean_square[:, lane], numpy.diag(P), rtol=1e-6, atol=1e-12)
+            numpy.testing.assert_allclose(mean_square[:, lane], numpy.diag(P)[:17], rtol=1e-6, atol=1e-12)
             mode = int(truth.mode[lane])
 
 
@@ -143,6 +150,100 @@ def test_bound_is_below_the_reference(on_random):
     squares = (on_random["error"].sel(policy="known-mode").values ** 2).mean(axis=1)
     difference = squares - bound
     assert (difference.mean(axis=0) > -4 * difference.std(axis=0) / math.sqrt(len(squares))).all()
+
+
+# --- nothing can be recited
+
+
+class Recited:
+    """An estimator that knows the clock and the distribution of the courses, and looks at no measurement.
+
+    The mean of the motion given where it starts: accelerations to come have a mean of zero.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, task):
+        self.task = task
+
+    def start(self, initial, N):
+        return initial
+
+    def update(self, measurement, memory):
+        common, mean = self.task.common, memory.mean
+        # What is felt at the start is a manoeuvre; Singer's decay is its mean.
+        mean = gnss_ins.advance(mean, self.task.axis[:, :, SINGER], common.T, common.decay)
+        return mean, memory.covariance, memory._replace(mean=mean)
+
+
+@pytest.mark.parametrize("scenario", ["random", "urban"])
+def test_a_recited_truth_scores_below_zero(scenario):
+    names = {"recited": Recited, "multi-hypothesis": "multi-hypothesis"}
+    cost = evaluate(ID, names, scenario, episodes=48, seed=3)["cost"].mean(["time", "episode"])
+    assert cost.sel(policy="recited") > cost.sel(policy="multi-hypothesis")
+
+
+# --- the bank over faults
+
+
+def test_the_bank_over_faults_is_honest_and_no_better_than_its_reference():
+    names = ["stuck-check", "fault-hypotheses", "known-mode"]
+    data = evaluate(ID, names, episodes=64, seed=4, split="validation")
+    cost, nees = data["cost"].mean("time"), data["nees"].sel(policy="fault-hypotheses").mean("time") / 17
+    paired = (cost.sel(policy="fault-hypotheses") - cost.sel(policy="known-mode")).values
+    assert paired.mean() > -3.0 * paired.std() / math.sqrt(len(paired))
+    assert cost.sel(policy="fault-hypotheses").median() < cost.sel(policy="stuck-check").median()
+    # Within a factor of two: moments of mixtures, and rest that is known better than it is said to be.
+    assert 0.5 < float(nees.mean()) < 2.0
+
+
+def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
+    keywords = {"ramp_start": (1.0, 1.0), "ramp_jump": (50.0, 50.0), "horizon": 200}
+    model = make_model(ID, scenario="satellite-bias", **keywords)
+    found = []
+
+    class Watched(FaultHypotheses):
+        def update(self, measurement, memory):
+            answer = super().update(measurement, memory)
+            found.append((answer[2].means[17:], answer[2].probabilities))
+            return answer
+
+    estimator = Watched(model.task, VAGUE)
+    for _episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
+        truth = _episode.truth
+    errors = (found[-1][0] * found[-1][1]).sum(axis=1)
+    place = truth.faults.ramp_satellite.astype(int)
+    lanes = numpy.arange(8)
+    before = (found[90][0] * found[90][1]).sum(axis=1)
+    # What was there before, 2 m of the prior, is left in.
+    assert errors[place, lanes] - before[place, lanes] == pytest.approx([50.0] * 8, abs=3.0)
+    others = numpy.ones((4, 8), dtype=bool)
+    others[place, lanes] = False
+    assert abs(errors - before)[others].max() < 3.0
+
+
+def test_levels_of_a_rate_find_the_noisy_one():
+    keywords = {
+        "rate_fault_probability": 1.0, "rate_fault_factor": (8.0, 8.0), "rate_fault_duration": (1.0, 1.0),
+        "stick_probability": 0.0, "horizon": 150, "undisturbed": 0.0, "urban": False, "aperture": False,
+        "rates_outage_probability": 0.0, "satellites_outage_probability": 0.0,
+    }  # fmt: skip
+    model = make_model(ID, **keywords)
+    levels, noisy = [], []
+
+    class Watched(FaultHypotheses):
+        def update(self, measurement, memory):
+            answer = super().update(measurement, memory)
+            levels.append(answer[2].levels[0])
+            return answer
+
+    for episode, _ in rollout(model, Watched(model.task), episode_seeds("test", 9, 8), kind="estimator"):
+        noisy.append(episode.truth.noise_factor[4:8] > 1.0)
+    quiet, noisy = numpy.array(levels), numpy.array(noisy[: len(levels)])
+    assert noisy.any()
+    lasting = noisy[20:] & noisy[:-20]
+    assert quiet[20:][lasting].mean() < 0.1
+    assert quiet[~noisy].mean() > 0.9
 
 
 # --- policies
@@ -511,3 +612,28 @@ def test_verdicts_follow_the_data():
     assert claims.adaptation_verdict([quick], quick) == "not reproduced"
     assert claims.stability_verdict([kept]) == "reproduced"
     assert claims.stability_verdict([kept, lost]) == "not reproduced"
+
+
+def test_the_innovation_test_sums_the_last_steps():
+    nis = numpy.full((2, 60), 4.0)
+    nis[1, 30:] = 40.0
+    alarm = metrics.innovation_alarm(nis, numpy.full((2, 60), 4.0))
+    assert not alarm[0].any()
+    for k in range(60):
+        window = nis[1, max(0, k - metrics.TESTED + 1) : k + 1]
+        limit = scipy.stats.chi2.ppf(1.0 - metrics.RISK, 4.0 * len(window))
+        assert alarm[1, k] == (window.sum() > limit)
+
+
+def test_detection_counts_the_first_fault():
+    alarm = numpy.zeros((3, 50), dtype=bool)
+    fails = numpy.zeros((3, 50), dtype=bool)
+    fails[:2, 20:30] = True
+    alarm[0, [5, 24, 40]] = True  # a false one, the fault, a trace of it
+    alarm[1, 35] = True
+    alarm[2, [1, 2]] = True
+    found = metrics._detection(alarm, fails, 0.01)
+    assert found["found"].tolist() == [True, False, False]
+    assert found["found_after"] == pytest.approx([0.05, 0.0, 0.0])
+    assert found["false_alarms"].tolist() == [1, 0, 2]
+    assert found["faultless"].tolist() == [20, 20, 50]

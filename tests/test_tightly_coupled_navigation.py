@@ -334,8 +334,9 @@ def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre()
 
 def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_reflections():
     model = make(
-        "random", aperture_probability=0.5, urban_probability=0.5, undisturbed=0.0, rate_aperture=0.1
-    )
+        "random", aperture_probability=0.5, urban_probability=0.5, undisturbed=0.0, rate_aperture=0.1,
+        pseudorange_coloured=(0.0, 0.0),
+    )  # fmt: skip
     lost, off = numpy.zeros(16), numpy.zeros(16)
     for _, state, _, _ in drive(model, 16, 22, 60):
         faults, step = state.truth.faults, state.truth.step
@@ -371,6 +372,54 @@ def test_a_pseudorange_drifts_off_as_stated():
         assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-3)
     assert ((first >= 101) & (first <= 301)).all()
     assert (error > 0.0).sum(axis=0).all()
+
+
+def test_a_bias_is_as_large_as_drawn():
+    model, biased = make("satellite-bias"), numpy.zeros((4, 16))
+    for k, state, _, _ in drive(model, 16, 24, 350):
+        faults, error = state.truth.faults, state.truth.range_error
+        place = faults.ramp_satellite.astype(int)
+        biased[...] = 0.0
+        biased[place, numpy.arange(16)] = numpy.where(k >= faults.ramp[0], faults.ramp_jump, 0.0)
+        assert (error == biased).all()
+    assert ((faults.ramp_jump >= 10.0) & (faults.ramp_jump <= 50.0)).all()
+    assert (biased.max(axis=0) == faults.ramp_jump).all()
+
+
+def test_coloured_errors_have_the_deviation_and_the_correlation_that_are_drawn():
+    model = make("coloured-ranges", pseudorange_correlation_time=(0.1, 0.5))
+    errors = []
+    for _, state, _, _ in drive(model, 200, 25, 60):
+        errors.append(state.truth.coloured)
+    truth, errors = state.truth, numpy.array(errors) / state.truth.coloured_deviation
+    assert (truth.range_error == truth.coloured).all()
+    assert ((truth.coloured_deviation >= 3.0) & (truth.coloured_deviation <= 8.0)).all()
+    assert (truth.coloured_decay >= math.exp(-0.1)).all()
+    # 800 errors at a time: standard error of a variance 0.05; stationary from the start.
+    assert abs((errors[[0, -1]] ** 2).mean(axis=(1, 2)) - 1.0).max() < 4 * 0.05
+    kicks = errors[1:] - truth.coloured_decay * errors[:-1]
+    scaled = kicks / numpy.sqrt(1.0 - truth.coloured_decay**2)
+    assert abs((scaled**2).mean() - 1.0) < 4 * math.sqrt(2.0 / scaled.size)
+    assert abs((scaled * errors[:-1]).mean()) < 4 / math.sqrt(scaled.size)
+
+
+def test_undisturbed_episodes_have_no_coloured_errors():
+    model = make("random", undisturbed=0.5)
+    *_, (_, state, _, _) = drive(model, 32, 26, 3)
+    truth = state.truth
+    assert 0 < truth.faults.calm.sum() < 32
+    assert (((truth.coloured != 0.0).all(axis=0)) == (truth.faults.calm == 0.0)).all()
+
+
+def test_heading_is_drawn_but_on_the_courses_of_the_paper():
+    *_, (_, state, _, _) = drive(make("random"), 200, 27, 1)
+    heading = numpy.degrees(state.truth.heading)
+    assert ((heading >= 0.0) & (heading < 360.0)).all()
+    assert numpy.ptp(heading) > 300.0
+    shown = state.measurement.ins_angles[0] - state.truth.state[11]
+    assert shown == pytest.approx(state.truth.heading, abs=1e-12)
+    *_, (_, state, _, _) = drive(make("kinematic"), 3, 27, 1)
+    assert numpy.degrees(state.truth.heading) == pytest.approx([45.0] * 3, abs=1e-12)
 
 
 def test_faults_and_outages_happen_when_and_where_they_are_drawn():
@@ -507,9 +556,9 @@ def test_gradient_from_cost_to_action(torch):
     (gradient,) = torch.autograd.grad(loss(action), action)
     for place in ((0, 0), (1, 3), (2, 5)):
         step = torch.zeros((4, 8), dtype=torch.float64)
-        step[place] = 1e-4
-        numeric = (loss(action.detach() + step) - loss(action.detach() - step)) / 2e-4
-        # Ranges of 2e7 m carry a rounding of 4e-9 m into the difference.
+        step[place] = 1e-3
+        numeric = (loss(action.detach() + step) - loss(action.detach() - step)) / 2e-3
+        # Ranges of 2e7 m carry a rounding of 4e-9 m into the difference: 1e-6 of a cost of hundreds.
         assert float(gradient[place]) == pytest.approx(float(numeric), rel=1e-4, abs=1e-6)
 
 

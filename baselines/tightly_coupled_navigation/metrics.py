@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import xarray
 
 UNITS = {"position": "m", "velocity": "m/s"}
+RISK = 1e-3
+"""Of the integrity of an estimate, and of a false alarm of the innovation test at one step."""
+TESTED = 20
+"""Steps over which the innovation test sums."""
 LASTING = 10
 """Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
 
@@ -89,6 +93,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         "share": numpy.stack([of_mode.mean(axis=1) for of_mode in there], axis=1),
         "cost": run["cost"].values.mean(axis=1),
     }
+    each |= _integrity(run)
     if "mode_probability" not in run or numpy.isnan(run["mode_probability"].values).all():
         return MetricInputs(each)
     step = float(run["seconds"].values[0, 0])
@@ -102,6 +107,64 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         "lost_after": (outside.argmax(axis=1) - begin + 1.0) * step,
     }
     return MetricInputs(each)
+
+
+def _integrity(run: "xarray.Dataset") -> Arrays:
+    """Errors that the covariance does not cover, innovations, and what a test of them finds, of each episode."""
+    from scipy.stats import chi2  # it takes a second to import
+
+    limit = chi2.ppf(1.0 - RISK, run.sizes["component"])
+    found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
+    if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
+        return found
+    nis: numpy.ndarray = numpy.nan_to_num(run["nis"].values)
+    degrees: numpy.ndarray = numpy.nan_to_num(run["nis_degrees"].values)
+    # The root tames the innovations of a fault, which would be all that is seen.
+    surprise = numpy.sqrt(nis / numpy.maximum(degrees, 1.0))
+    apart = surprise - surprise.mean(axis=1, keepdims=True)
+    found["innovation_products"] = (apart[:, 1:] * apart[:, :-1]).mean(axis=1)
+    found["innovation_squares"] = (apart * apart).mean(axis=1)
+    alarm = innovation_alarm(nis, degrees)
+    return {
+        **found,
+        **_detection(alarm, run["sensor_fails"].values > 0.0, float(run["seconds"].values[0, 0])),
+    }
+
+
+def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarray:
+    """Where the normalised innovation squared, summed over the last steps, is larger than chance allows.
+
+    Args:
+        nis: ``(episodes, time)``.
+        degrees: its degrees of freedom, likewise.
+    """
+    from scipy.stats import chi2
+
+    def summed(values: numpy.ndarray) -> numpy.ndarray:
+        sums = numpy.cumsum(numpy.pad(values, ((0, 0), (TESTED, 0))), axis=1)
+        return sums[:, TESTED:] - sums[:, :-TESTED]
+
+    alarm: numpy.ndarray = summed(nis) > chi2.ppf(1.0 - RISK, numpy.maximum(summed(degrees), 1.0))
+    return alarm
+
+
+def _detection(alarm: numpy.ndarray, fails: numpy.ndarray, step: float) -> Arrays:
+    """False alarms, and of the first fault of each episode whether it is found while it lasts, and when."""
+    fault, first = numpy.logical_or.reduce(fails, axis=1), fails.argmax(axis=1)
+    steps, length = numpy.arange(alarm.shape[1]), alarm.shape[1]
+    # What has gone wrong leaves its traces: only what comes before the first fault is a false alarm.
+    before = numpy.where(fault, first, length)
+    ended = ~fails & (steps > first[:, None])
+    last = numpy.where(ended.any(axis=1), ended.argmax(axis=1), length)
+    during = alarm & (steps >= first[:, None]) & (steps < last[:, None]) & fault[:, None]
+    found = during.any(axis=1)
+    return {
+        "fault": fault,
+        "found": found,
+        "found_after": (during.argmax(axis=1) - first + 1.0) * step * found,
+        "false_alarms": (alarm & (steps < before[:, None])).sum(axis=1),
+        "faultless": before,
+    }
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
@@ -127,10 +190,17 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     ``track_loss_time`` (median of the tracks lost) of ten steps in a row with a pseudorange rate further than
     the aperture from the combined prediction, from the first change of motion on. Those from ``adaptation_time``
     on need the records of a bank: references have none.
+
+    ``misleading_information`` is the share of steps whose error lies outside the region of the reported covariance that
+    an honest one leaves once in a thousand steps. ``innovation_correlation``, of the root of the normalised innovation
+    squared from one step to the next, is zero where innovations are white. A test of the sum of that square over 20
+    steps, at the risk of one in a thousand, gives ``fault_detection_time`` of the first fault of a sensor,
+    ``fault_missed``, the share of those that it does not find while they last, and ``false_alarm_rate``, the share of
+    steps before any fault. Who models a fault is not surprised by it: its filter gives no alarm where it needs none.
     """
     if not gathered.each:
         return []
-    found = list(_errors(gathered.each, bootstrap))
+    found = [*_errors(gathered.each, bootstrap), *_measure_integrity(gathered.each, bootstrap)]
     return [*found, *_of_bank(gathered.each, bootstrap)] if "switches" in gathered.each else found
 
 
@@ -145,6 +215,22 @@ def _errors(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
     yield Measure(
         "cost_95_quantile", "", "all", bootstrap.interval(bootstrap.quantiles(each["cost"], 0.95)), "1"
     )
+
+
+def _measure_integrity(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
+    yield Measure("misleading_information", "", "all", bootstrap.estimate(each["misleading"]), "1")
+    if "fault" not in each:
+        return
+    correlation = _ratio(bootstrap, each["innovation_products"], each["innovation_squares"])
+    yield Measure("innovation_correlation", "", "all", correlation, "1")
+    fault, found = each["fault"].astype(float), each["found"].astype(float)
+    if each["faultless"].any():
+        rate = _ratio(bootstrap, each["false_alarms"].astype(float), each["faultless"].astype(float))
+        yield Measure("false_alarm_rate", "", "all", rate, "1")
+    if fault.any():
+        yield Measure("fault_missed", "", "all", _ratio(bootstrap, fault - found, fault), "1")
+    if found.any():
+        yield Measure("fault_detection_time", "", "all", _ratio(bootstrap, each["found_after"], found), "s")
 
 
 def _of_bank(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:

@@ -16,6 +16,7 @@ from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
+from .fault_hypotheses import VAGUE, FaultHypotheses
 from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 
@@ -220,7 +221,18 @@ BASELINES = Baselines(
         "rest": Variant(ConstantMode, "Hypothesis 1 alone.", mode=REST),
         "random": RandomPolicy,
     },
-    estimators={"huber": Huber, "huber-stuck-check": HuberStuckCheck},
+    estimators={
+        "huber": Huber,
+        "huber-stuck-check": HuberStuckCheck,
+        "fault-hypotheses": Variant(
+            FaultHypotheses,
+            "Bank over motion and faults: legs, errors of pseudoranges that last and jump, noise levels of rates; the "
+            "prior of the training distribution.",
+        ),
+        "fault-hypotheses-vague": Variant(
+            FaultHypotheses, "The same with one vague prior for everything that may come.", prior=VAGUE
+        ),
+    },
     references={"known-mode": KnownMode},
     bounds={"known-mode-bound": KnownModeBound},
     score_paper="multi-hypothesis",

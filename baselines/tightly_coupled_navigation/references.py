@@ -1,107 +1,135 @@
 """Reference estimator and bound of TightlyCoupledNavigation."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy
 
 from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from ...envs.tightly_coupled_navigation.parameters import LINE, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement, Truth
 from ...evaluation.competitors import Likelihood
-from ...filters import extended_kalman, gnss_ins
+from ...filters import extended_kalman, gnss_ins, range_errors
 from ...filters.ordered_sums import ordered_sum
 from ...filters.packed_covariance import diagonal, pack, unpack
 
+TOLD_ACCELERATION_SIGMA = 0.01
+"""m/s^2, by which the reference doubts an acceleration that it is told: its covariance stays invertible."""
+TOLD_INCREMENT_SIGMA = 1e-3
+"""m/s, likewise of steady increments of the velocity on the fixed courses."""
+
 
 class Track(NamedTuple):
-    """Memory of both."""
+    """Memory of both; n = 17 + S states (``filters/range_errors.py``)."""
 
     mean: Array
-    """``(17, N)``."""
+    """``(n, N)``."""
     covariance: Array
-    """Packed (:mod:`~filtergym.filters.packed_covariance`), ``(153, N)``."""
+    """Packed (:mod:`~filtergym.filters.packed_covariance`), ``(n (n + 1) / 2, N)``."""
     mode: Array
     """True hypothesis at the last measurement, ``(N,)``."""
-
-
-def _replace_acceleration(
-    matrix: Array, variance: float, task: TightlyCoupledNavigation, lanes: Array
-) -> Array:
-    """Packed covariance with an acceleration that has nothing to do with the past in some lanes."""
-    new = numpy.zeros(gnss_ins.SIZE)
-    new[gnss_ins.ACCELERATION] = 1.0
-    keep = task.constant(pack(numpy.outer(1.0 - new, 1.0 - new)))
-    fresh = matrix * keep[:, None] + task.constant(pack(variance * numpy.diag(new)))[:, None]
-    return task.xp.where(lanes, fresh, matrix)
 
 
 class _KnownMode:
     """Models that the true hypothesis chooses step by step, and sensors whose state is known.
 
-    From the step on which a manoeuvre begins, the acceleration has nothing to do with the past. A manoeuvre
+    From the step on which a manoeuvre begins, the acceleration has nothing to do with the past; it is told. A manoeuvre
     that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
-    step; on the course "kinematic" the first one is there from the beginning of its step.
+    step; on the course "kinematic" the first one is there from the beginning of its step. Of coloured errors of the
+    pseudoranges standard deviation and correlation time are told; they are states.
     """
 
     traceable = True
+    knows_acceleration = 0.0
+    """Standard deviation of what it is told of it, m/s^2."""
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         self.task = task
         self.axis = task.axis[..., 0]
+        self.size = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> Track:
         """Start where everyone starts."""
-        return Track(initial.mean, pack(initial.covariance), truth.mode)
-
-    def reset_acceleration(self, track: Track, lanes: Array, variance: float) -> Track:
-        """Track with an unknown acceleration of some variance in some lanes."""
-        xp = self.task.xp
-        moved = xp.concat(
-            [track.mean[:8], xp.where(lanes, 0.0 * track.mean[8:11], track.mean[8:11]), track.mean[11:]]
+        mean, covariance = range_errors.start(
+            initial.mean, initial.covariance, self.task.satellites, truth.coloured_deviation**2
         )
+        return Track(mean, pack(covariance), truth.mode)
+
+    def reset_acceleration(self, track: Track, lanes: Array, acceleration: Array) -> Track:
+        """Track with an acceleration that is told, in some lanes."""
+        xp, a = self.task.xp, gnss_ins.ACCELERATION
+        new = numpy.zeros(self.size)
+        new[a] = 1.0
+        keep = self.task.constant(pack(numpy.outer(1.0 - new, 1.0 - new)))[:, None]
+        told = self.task.constant(pack(self.knows_acceleration**2 * numpy.diag(new)))[:, None]
         return track._replace(
-            mean=moved, covariance=_replace_acceleration(track.covariance, variance, self.task, lanes)
+            mean=xp.concat(
+                [
+                    track.mean[: a.start],
+                    xp.where(lanes, acceleration, track.mean[a]),
+                    track.mean[a.stop :],
+                ]
+            ),
+            covariance=xp.where(lanes, track.covariance * keep + told, track.covariance),
         )
 
-    def predict_track(self, truth: Truth, track: Track, noises: Array, variance: float) -> Track:
+    def predict_track(self, truth: Truth, track: Track, noises: Array) -> Track:
         """Prediction to the present measurement.
 
         Args:
             truth: at that measurement.
             track: after the one before.
-            noises: covariance of the process noise of every hypothesis, ``(17, 17, M)``.
-            variance: of the acceleration with which a manoeuvre begins, (m/s^2)^2 per axis.
+            noises: covariance of the process noise of every hypothesis, ``(n, n, M)``.
         """
-        xp, task = self.task.xp, self.task
+        xp, task, T = self.task.xp, self.task, self.task.common.T
         jumped = truth.jumped > 0.0
         at_once = (truth.mode == SINGER) & (track.mode != SINGER) & ~jumped
-        track = self.reset_acceleration(track, at_once, variance)
+        # What begins with a jump at the end of this step is the next leg.
+        _, push = task.world.course.leg_at(truth.legs, truth.step + truth.jumped)
+        track = self.reset_acceleration(track, at_once, push)
         # A jump ends a step that was moved by the hypothesis before it.
         moved_by = xp.where(jumped, track.mode, truth.mode)
         axis = xp.take(self.axis, moved_by, axis=-1)[:, :, None]
         noise = xp.take(noises, moved_by, axis=-1)[:, :, None]
-        mean, covariance = gnss_ins.predict(
+        kept = truth.coloured_decay
+        gained = truth.coloured_deviation**2 * (1.0 - kept * kept)
+        mean, covariance = range_errors.predict(
             track.mean[:, None],
-            unpack(track.covariance, gnss_ins.SIZE)[:, :, None],
+            unpack(track.covariance, self.size)[:, :, None],
             axis,
-            task.common.T,
+            T,
             task.common.decay,
             noise,
+            kept,
+            gained,
         )
-        track = Track(mean[:, 0], pack(covariance[:, :, 0]), truth.mode)
-        return self.reset_acceleration(track, jumped, variance)
+        mean = mean[:, 0]
+        if task.parameters.course != "random":
+            _, along = task.world.course.leg_at(truth.legs, truth.step)
+            increment = xp.where(moved_by == LINE, T * along, 0.0)
+            x, v = mean[gnss_ins.POSITION] + (0.5 * T) * increment, mean[gnss_ins.VELOCITY] + increment
+            mean = xp.concat([x, mean[3:4], v, mean[7:]])
+        track = Track(mean, pack(covariance[:, :, 0]), truth.mode)
+        return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
         """Readings of a state and the rows of their Jacobian there."""
-        return gnss_ins.observe(
+        return range_errors.observe(
             state,
             measurement.satellite_position,
             measurement.satellite_velocity,
             measurement.ins_angles,
             self.task.parameters.gravity,
         )
+
+    def process_noises(self, models: Sequence[gnss_ins.AxisModel]) -> Array:
+        """Covariances of the process noise, ``(n, n, M)``."""
+        noises, known = numpy.zeros((self.size, self.size, len(models))), gnss_ins.SIZE
+        for i, model in enumerate(models):
+            noises[:known, :known, i] = gnss_ins.process_noise(model, self.task.common)
+        return self.task.constant(noises)
 
     def sensors(self, measurement: Measurement, truth: Truth) -> tuple[list[Array], list[Array]]:
         """True variance of every reading, and one where it says something."""
@@ -115,49 +143,48 @@ class _KnownMode:
 
 
 class KnownMode(_KnownMode):
-    """One extended Kalman filter whose model follows the true hypothesis and whose noise is the true one.
+    """One extended Kalman filter that is told the draw of the episode: legs, faults, and how noisy everything is.
 
-    Rest keeps the bank's small regularising noise, so that the reported covariance stays invertible. On the
-    fixed courses, where straight flight has steady increments and no noise, the increment's size is taken as
-    its standard deviation.
+    Rest keeps the bank's small regularising noise, so that the reported covariance stays invertible; so does straight
+    flight on the fixed courses, where it has steady increments and no noise.
     """
 
     kind = "reference"
+    knows_acceleration = TOLD_ACCELERATION_SIGMA
     knows = (
-        "the true hypothesis at every step, when a manoeuvre begins, the true noise of every sensor, when the "
-        "accelerometers stick, and what pseudoranges are off by"
+        "the true hypothesis at every step, when and with which acceleration a manoeuvre begins, the true noise of "
+        "every sensor, when the accelerometers stick, by how much pseudoranges are off for reflections and drifts, and "
+        "deviation and correlation time of their coloured errors"
     )
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         super().__init__(task)
         p = task.parameters
-        T = p.sampling_interval
-        increment = p.true_increment_sigma if p.course == "random" else p.leg_acceleration * T
-        line = gnss_ins.constant_velocity_model(T, increment, p.reset_acceleration_sigma)
-        true_line = task.constant(gnss_ins.process_noise(line, task.common))
-        noises = [task.process_noise[:, :, i, 0] for i in range(len(HYPOTHESES))]
-        noises[LINE] = true_line
-        self.noises = task.xp.stack(noises, axis=-1)
+        increment = p.true_increment_sigma if p.course == "random" else TOLD_INCREMENT_SIGMA
+        rest, _, singer = task.models
+        line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, p.reset_acceleration_sigma)
+        self.noises = self.process_noises((rest, line, singer))
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: Track
     ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the true hypothesis and update with the sensors that work."""
-        xp, task = self.task.xp, self.task
-        track = self.predict_track(truth, memory, self.noises, task.parameters.singer_sigma**2)
+        xp, task, known = self.task.xp, self.task, gnss_ins.SIZE
+        track = self.predict_track(truth, memory, self.noises)
         expected, rows = self.readings_and_jacobian(measurement, track.mean)
         residual = measurement.readings - expected
         ranges = task.sensors[0].readings
-        residual = xp.concat([residual[ranges] - truth.range_error, residual[ranges.stop :]])
+        off = truth.range_error - truth.coloured
+        residual = xp.concat([residual[ranges] - off, residual[ranges.stop :]])
         variance, available = self.sensors(measurement, truth)
         update = extended_kalman.update_one_by_one(
-            track.mean, unpack(track.covariance, gnss_ins.SIZE), residual, rows, variance, available
+            track.mean, unpack(track.covariance, self.size), residual, rows, variance, available
         )
         likelihood = Likelihood(
             update.log_likelihood, ordered_sum(update.squared_residuals), ordered_sum(available)
         )
         after = Track(update.mean, pack(update.covariance), truth.mode)
-        return update.mean, update.covariance, after, likelihood
+        return update.mean[:known], update.covariance[:known, :known], after, likelihood
 
 
 class KnownModeBound(_KnownMode):
@@ -171,32 +198,30 @@ class KnownModeBound(_KnownMode):
     kind = "bound"
     knows = (
         "the true hypothesis at every step, the acceleration with which a manoeuvre begins, the true noise of "
-        "every sensor, when the accelerometers stick, and what pseudoranges are off by"
+        "every sensor, when the accelerometers stick, by how much pseudoranges are off for reflections and drifts, "
+        "and deviation and correlation time of their coloured errors"
     )
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         super().__init__(task)
         p = task.parameters
         increment = p.true_increment_sigma if p.course == "random" else 0.0
-        axes = {
-            REST: gnss_ins.rest_model(p.sampling_interval, 0.0, 0.0),
-            LINE: gnss_ins.constant_velocity_model(p.sampling_interval, increment, 0.0),
-            SINGER: task.models[SINGER],
-        }
-        noises = [gnss_ins.process_noise(axes[i], task.common) for i in range(len(HYPOTHESES))]
-        self.noises = task.constant(numpy.stack(noises, axis=-1))
+        rest = gnss_ins.rest_model(p.sampling_interval, 0.0, 0.0)
+        line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, 0.0)
+        self.noises = self.process_noises((rest, line, task.models[SINGER]))
 
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
         """Bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
-        track = self.predict_track(truth, memory, self.noises, 0.0)
-        expected, rows = self.readings_and_jacobian(measurement, truth.state)
+        track = self.predict_track(truth, memory, self.noises)
+        state = xp.concat([truth.state, truth.coloured])
+        expected, rows = self.readings_and_jacobian(measurement, state)
         update = extended_kalman.update_one_by_one(
             track.mean,
-            unpack(track.covariance, gnss_ins.SIZE),
+            unpack(track.covariance, self.size),
             xp.zeros_like(expected),
             rows,
             *self.sensors(measurement, truth),
         )
         P = pack(update.covariance)
-        return P[diagonal(gnss_ins.SIZE)], track._replace(covariance=P)
+        return P[diagonal(self.size)[: gnss_ins.SIZE]], track._replace(covariance=P)

@@ -21,7 +21,7 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank, Initial
-from ..observation import BOUNDED_LOG, SIGNED_LOG, Array, Block, Quantity
+from ..observation import ACTION, BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity, within
 from ..task import Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
@@ -119,7 +119,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         def available(name: str, sensor: SensorGroup) -> Block:
             return Block(
                 f"{name}_available", lambda f, y: y.available[sensor.readings],
-                f"1 where the {name} reached the filter", slots, over_interval="mean",
+                f"1 where the {name} reached the filter", slots, SHARE, over_interval="mean",
             )  # fmt: skip
 
         return (
@@ -147,7 +147,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             ),
             Block(
                 "accelerometers_repeat", lambda f, y: f.repeated,
-                "1 where the accelerometers repeat their last readings exactly, as noise never does",
+                "1 where the accelerometers repeat their last readings exactly, as noise never does", shown=SHARE,
                 over_interval="mean",
             ),
             innovation("pseudorange", ranges),
@@ -156,9 +156,9 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             available("rate", rates),
             Block(
                 "time", lambda f, y: xp.astype(y.number, f.mean.dtype) / p.horizon,
-                "measurements so far over the horizon", unit="horizon",
+                "measurements so far over the horizon", shown=within(0.0, (p.horizon + 1) / p.horizon), unit="horizon",
             ),
-            Block("last", lambda f, y: f.last_action, "last action", self.actions),
+            Block("last", lambda f, y: f.last_action, "last action", self.actions, ACTION),
         )  # fmt: skip
 
     @property

@@ -121,8 +121,8 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     initial_attitude_sigma: float = parameter(1.0, above=0.0, at_most=180.0)
     """Degrees. Ours."""
 
-    heading: float = 45.0
-    """Of the level aircraft, degrees; legs of the fixed courses follow it. Ours."""
+    heading: tuple[float, float] = parameter((0.0, 360.0), ascending=True)
+    """Limits of the heading of the level aircraft, degrees; legs of the fixed courses follow it. Ours."""
     leg_steps: tuple[int, int] = parameter((1000, 2000), at_least=1, ascending=True)
     """Last step of leg 1 and of leg 2 of the fixed courses. Paper."""
     leg_acceleration: float = parameter(30.0, at_least=0.0)
@@ -170,8 +170,16 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Limits of that time, s. Ours."""
     ramp_rate: float = 10.0
     """m/s; the rate channel does not show it. Ours."""
+    ramp_jump: tuple[float, float] = parameter((0.0, 0.0), ascending=True)
+    """Limits of the bias with which the drift begins, m. Ours."""
+    pseudorange_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Limits of the stationary standard deviation of a coloured error (first-order Gauss-Markov) that every pseudorange
+    has beside the white one, each its own: diffuse multipath, atmosphere, ephemerides; m. Nobody states it. Ours."""
+    pseudorange_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
+    """Limits of its correlation time, s. Ours."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode in which no sensor fails, with neither reception between houses nor apertures. Ours."""
+    """Probability of an episode in which no sensor fails, with neither reception between houses nor apertures nor
+    coloured errors. Ours."""
     urban: bool = False
     """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""

@@ -18,9 +18,10 @@ EXPERIMENT: Mapping[str, Any] = MappingProxyType(
         "rate_fault_probability": 0.0,
         "stick_probability": 0.0,
         "aperture": True,
+        "heading": (45.0, 45.0),
     }
 )
-"""The paper's experiment: no faults, tracking loops steered by the filter."""
+"""The paper's experiment: no faults, tracking loops steered by the filter; one course, the same in every episode."""
 
 HEALTHY: Mapping[str, Any] = MappingProxyType({"rate_fault_probability": 0.0, "stick_probability": 0.0})
 
@@ -53,7 +54,7 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 "Training distribution: legs of rest, constant velocity and manoeuvre at random, or one manoeuvre "
                 "throughout, gentle to hard; a noisy rate channel, stuck accelerometers, lost rates or hidden "
                 "satellites for a while, reception between houses, tracking loops steered by the filter, each in some "
-                "episodes; in one of six nothing of these.",
+                "episodes, and coloured errors of pseudoranges; in one of six nothing of these.",
                 {
                     "strength": (0.5, 40.0),
                     "manoeuvre_throughout": 0.15,
@@ -72,6 +73,8 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                     "aperture": True,
                     "aperture_probability": 0.2,
                     "undisturbed": 1.0 / 6.0,
+                    "pseudorange_coloured": (0.0, 2.0),
+                    "pseudorange_correlation_time": (1.0, 20.0),
                 },
                 RANDOM_WINDOWS,
                 training=True,
@@ -106,6 +109,24 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 "Legs as in random, without faults; one satellite's pseudorange drifts off at 10 m/s, from a time "
                 "between 1 and 3 s to the end. No training episode holds any.",
                 {**HEALTHY, "ramp_probability": 1.0},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "satellite-bias",
+                "Legs as in random, without faults; one satellite's pseudorange is off by 10 to 50 m, from a time "
+                "between 1 and 3 s to the end. No training episode holds any.",
+                {**HEALTHY, "ramp_probability": 1.0, "ramp_rate": 0.0, "ramp_jump": (10.0, 50.0)},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "coloured-ranges",
+                "Legs as in random, without faults; every pseudorange has a coloured error of 3 to 8 m that lasts for "
+                "1 to 20 s, larger than any in training.",
+                {
+                    **HEALTHY,
+                    "pseudorange_coloured": (3.0, 8.0),
+                    "pseudorange_correlation_time": (1.0, 20.0),
+                },
                 RANDOM_WINDOWS,
             ),
         )

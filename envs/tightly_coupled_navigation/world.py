@@ -1,9 +1,5 @@
-"""The flight of TightlyCoupledNavigation and the sensors on board; equations in ``filters/gnss_ins.py``.
-
-Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so nothing
-is left to jump at step 2000. The truth was probably a sequence of states with V incremented and A = 0:
-``course="increment"``. Physically that is an accelerometer stuck at zero through leg 2. The consistent
-alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="kinematic"``.
+"""The flight of TightlyCoupledNavigation and the sensors on board; equations in ``filters/gnss_ins.py``. Its course
+is a part of its own (:mod:`.course`).
 """
 
 import math
@@ -14,11 +10,13 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, draw_between
+from ..faults import GaussMarkov
 from ..filter import Initial
 from ..observation import Array
 from ..task import Task
 from ..world import World
-from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
+from .course import Course, Legs
+from .parameters import DEGREE, SINGER, TightlyCoupledNavigationParameters
 
 if TYPE_CHECKING:
     from .task import TightlyCoupledNavigation
@@ -30,19 +28,10 @@ QUANTILE_95 = 1.6448536269514722
 """Of the standard normal distribution."""
 CLEAR_ERROR = 19.0
 """95 % quantile of the multipath error, the positive part of a normal one, at 44 dB-Hz and more, m."""
+OFF = 5.0
+"""Standard deviations from which an error of a pseudorange is a fault."""
 MULTIPATH = ((44.0, 7.0, 49.0), (38.0, 25.0, 79.0), (30.0, 50.0, 152.0))
 """Below a C/N0, dB-Hz, the error is lognormal: its median and 95 % quantile, m."""
-
-
-class Legs(NamedTuple):
-    """The course, L legs."""
-
-    start: Array
-    """Last step before each leg, ``(L, N)``."""
-    kind: Array
-    """REST, LINE or SINGER, ``(L, N)``."""
-    acceleration: Array
-    """With which each leg begins, ``(3, L, N)``, m/s^2."""
 
 
 class Faults(NamedTuple):
@@ -66,10 +55,14 @@ class Faults(NamedTuple):
     """First step at which a pseudorange is off, and the last step of all."""
     ramp_satellite: Array
     """Place of that satellite, ``(N,)``."""
+    ramp_jump: Array
+    """Bias with which the drift begins, ``(N,)``, m."""
     urban: Array
     """One between houses, else zero, ``(N,)``."""
     aperture: Array
     """One where the tracking loops lose what they do not expect, else zero, ``(N,)``."""
+    calm: Array
+    """One where nothing goes wrong, else zero, ``(N,)``."""
 
 
 FAULT_WINDOWS = ("noisy", "stuck", "no_rates", "hidden", "ramp")
@@ -102,7 +95,15 @@ class Truth(NamedTuple):
     hold: Array
     """Steps for which it still holds, ``(S, N)``."""
     range_error: Array
-    """What every pseudorange is off by beside its noise: multipath and ramp, ``(S, N)``, m."""
+    """What every pseudorange is off by beside its noise: multipath, ramp and coloured error, ``(S, N)``, m."""
+    heading: Array
+    """Of the level aircraft, ``(N,)``, rad."""
+    coloured_deviation: Array
+    """Stationary standard deviation of the coloured error of every pseudorange, ``(N,)``, m."""
+    coloured_decay: Array
+    """What is left of it from one measurement to the next, ``(N,)``."""
+    coloured: Array
+    """That error, ``(S, N)``, m."""
 
 
 class Measurement(NamedTuple):
@@ -139,10 +140,12 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         super().__init__(task)
         p, task, constant, S = self.parameters, self.task, self.task.constant, self.task.satellites
         self.normals = gnss_ins.SIZE + len(task.sensor_variance) + (2 * S if p.urban else 0)
+        self.coloured = p.pseudorange_coloured[1] > 0.0
+        if self.coloured:
+            self.normals, self.initial_normals = self.normals + S, self.initial_normals + S
         self.row_uniforms = S if p.urban else 0
-        self.singer_root = constant(numpy.linalg.cholesky(task.models[SINGER].noise))
+        self.course = Course(task)
         self.clock_root = constant(numpy.linalg.cholesky(task.common.clock_noise))
-        self.true_angles = constant([p.heading * DEGREE, 0.0, 0.0])[:, None]
         sigmas = [p.initial_position_sigma] * 3 + [p.initial_clock_sigma]
         sigmas += [p.initial_velocity_sigma] * 3 + [p.initial_drift_sigma]
         sigmas += [p.initial_acceleration_sigma] * 3
@@ -157,9 +160,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """Draw legs and faults; what is known of the start has errors."""
         xp, p, S = self.xp, self.parameters, self.task.satellites
         zeros = xp.zeros_like(normals[0])
-        legs, velocity = (
-            self._random_legs(draws) if p.course == "random" else self._deterministic_legs(draws, zeros)
-        )
+        legs, velocity, heading = self.course.begin(draws, zeros)
         faults = self._faults(draws)
         # Drawn in open country too: every scenario takes the same numbers.
         cn0 = draws.uniform("cn0", p.cn0_limits, S)
@@ -171,7 +172,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         legs = legs._replace(acceleration=slower)
         none = zeros[None]
         moving = xp.concat([none] * 4 + [velocity, none, legs.acceleration[:, 0]] + [none] * 6)
-        spread = self.initial_sigma * normals
+        deviation, lasting = self._coloured_error(draws, zeros, faults)
+        coloured = GaussMarkov.sampled(deviation, lasting, p.sampling_interval, xp)
+        spread = self.initial_sigma * normals[: gnss_ins.SIZE]
         state = moving + (1.0 - self.known) * spread
         identity = xp.eye(gnss_ins.SIZE, dtype=normals.dtype, device=self.task.device)
         truth = Truth(
@@ -188,71 +191,13 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             multipath=xp.stack([zeros] * S),
             hold=xp.stack([zeros] * S),
             range_error=xp.stack([zeros] * S),
+            heading=heading,
+            coloured_deviation=deviation,
+            coloured_decay=coloured.decay,
+            coloured=deviation * normals[gnss_ins.SIZE :] if self.coloured else xp.stack([zeros] * S),
         )
         covariance = (identity * self.initial_sigma**2)[:, :, None] + zeros
         return truth, Initial(moving + self.known * spread, covariance)
-
-    def _deterministic_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array]:
-        """Legs of the paper's experiment, or one that is matched to hypothesis 3, and the velocity."""
-        xp, p, constant = self.xp, self.parameters, self.task.constant
-        # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
-        draws.unit("legs", 15)
-        heading = p.heading * DEGREE
-        along = (math.sin(heading), math.cos(heading), 0.0)
-        right = (math.cos(heading), -math.sin(heading), 0.0)
-        if p.course == "matched":
-            # One leg: the others begin after the end.
-            starts: tuple[int, ...] = (0, p.horizon + 2, p.horizon + 2)
-            kinds, directions, speed = (SINGER,) * 3, (along,) * 3, p.matched_speed
-        else:
-            starts, kinds, speed = (0, *p.leg_steps), (REST, LINE, SINGER), 0.0
-            directions = ((0.0, 0.0, 0.0), along, right)
-        acceleration = constant(directions).T[:, :, None] * p.leg_acceleration + zeros
-        legs = Legs(
-            xp.stack([zeros + start for start in starts]),
-            xp.stack([zeros + kind for kind in kinds]),
-            acceleration,
-        )
-        return legs, constant(along)[:, None] * speed + zeros
-
-    def _random_legs(self, draws: Draws) -> tuple[Legs, Array]:
-        """Legs of rest, straight flight and manoeuvre at random, and the velocity at the start."""
-        xp, p = self.xp, self.parameters
-        columns: list[tuple[Array, ...]] = []
-        start: Array = None
-        kind = velocity = start
-        for leg in range(p.legs):
-            chosen = draws.unit(f"kind_{leg}")
-            seconds = draws.uniform(f"duration_{leg}", p.leg_duration)
-            turn = draws.uniform(f"azimuth_{leg}", (0.0, 2.0 * math.pi))
-            sine = draws.uniform(f"height_{leg}", (-1.0, 1.0))
-            if leg == 0:
-                start = 0.0 * chosen
-                kind = xp.where(chosen < p.rest_probability, float(REST), float(LINE))
-                speed, size = draws.uniform("speed", p.initial_speed), start
-                level = xp.stack([xp.sin(turn), xp.cos(turn), start])
-                velocity = xp.where(kind == REST, 0.0, speed) * level
-            else:
-                # A manoeuvre follows rest and straight flight; after it, straight flight or another one.
-                straight = xp.where(chosen < 0.5, float(LINE), float(SINGER))
-                kind = xp.where(kind == SINGER, straight, float(SINGER))
-                size = xp.where(kind == SINGER, draws.uniform(f"strength_{leg}", p.strength), 0.0)
-            cosine = xp.sqrt(xp.clip(1.0 - sine * sine, 0.0, None))
-            direction = xp.stack([xp.sin(turn) * cosine, xp.cos(turn) * cosine, sine])
-            columns.append((start, kind, size * direction))
-            start = start + xp.clip(xp.round(seconds / p.sampling_interval), 1.0, None)
-        legs = Legs(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True)))
-        if p.manoeuvre_throughout and p.legs > 1:
-            # The second leg is a manoeuvre: it begins at once and the others never.
-            throughout = draws.event("manoeuvre_throughout", p.manoeuvre_throughout)
-            later = [0.0 * start] + [0.0 * start + (p.horizon + 2.0)] * (p.legs - 1)
-            second = xp.stack([legs.acceleration[:, 1]] * p.legs, axis=1)
-            legs = Legs(
-                xp.where(throughout, xp.stack(later), legs.start),
-                xp.where(throughout, float(SINGER), legs.kind),
-                xp.where(throughout, second, legs.acceleration),
-            )
-        return legs, velocity
 
     def _faults(self, draws: Draws) -> Faults:
         """Draw what goes wrong, and when."""
@@ -285,8 +230,10 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             rate_factor=zero + p.rate_fault_factor[0],
             ramp=xp.stack([zero, zero]) - 1.0,
             ramp_satellite=zero,
+            ramp_jump=zero,
             urban=zero + float(p.urban),
             aperture=zero + float(p.aperture),
+            calm=zero,
         )
 
     def _further_faults(self, draws: Draws, faults: Faults) -> Faults:
@@ -300,7 +247,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             first = 1.0 + xp.round(draws.uniform("ramp_start", p.ramp_start) / T)
             ramp = xp.where(happens, xp.stack([first, zero + p.horizon + 1.0]), -1.0)
             satellite = draws.integer("ramp_satellite", (0, self.task.satellites - 1))
-            faults = faults._replace(ramp=ramp, ramp_satellite=satellite)
+            jump = zero + draw_between(draws.uniform, "ramp_jump", p.ramp_jump)
+            faults = faults._replace(ramp=ramp, ramp_satellite=satellite, ramp_jump=jump)
         for name in ("urban", "aperture"):
             share = getattr(p, f"{name}_probability")
             if getattr(p, name) and share < 1.0:
@@ -310,8 +258,19 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             calm = draws.event("undisturbed", p.undisturbed)
             windows = {name: xp.where(calm, -1.0, getattr(faults, name)) for name in FAULT_WINDOWS}
             places = {name: xp.where(calm, 0.0, getattr(faults, name)) for name in ("urban", "aperture")}
-            faults = faults._replace(**windows, **places)
+            faults = faults._replace(**windows, **places, calm=xp.astype(calm, zero.dtype))
         return faults
+
+    def _coloured_error(self, draws: Draws, zeros: Array, faults: Faults) -> tuple[Array, Array]:
+        """Draw standard deviation, m, and correlation time, s, of the coloured error, ``(N,)`` each."""
+        p = self.parameters
+        if not self.coloured:
+            return zeros, zeros + p.pseudorange_correlation_time[0]
+        deviation = zeros + draw_between(draws.uniform, "pseudorange_coloured", p.pseudorange_coloured)
+        lasting = draw_between(
+            draws.log_uniform, "pseudorange_correlation_time", p.pseudorange_correlation_time
+        )
+        return (1.0 - faults.calm) * deviation, zeros + lasting
 
     # --- one measurement
 
@@ -328,7 +287,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         k = xp.astype(step, noise.dtype)
         state, mode, jumped = self._move(truth, k, noise[: gnss_ins.SIZE])
         noise = noise[gnss_ins.SIZE :]
-        ins_angles = self.true_angles + state[gnss_ins.ATTITUDE_ERROR]
+        level = 0.0 * truth.heading
+        ins_angles = xp.stack([truth.heading, level, level]) + state[gnss_ins.ATTITUDE_ERROR]
         position, velocity = task.satellites_at(step)
         exact, _ = gnss_ins.observe(state, position, velocity, ins_angles, p.gravity)
 
@@ -341,17 +301,22 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         available = self._each(
             ones, pseudoranges=seen, rates=xp.where(self._during(faults.no_rates, k), 0.0, seen)
         )
+        if self.coloured:
+            kick = truth.coloured_deviation * xp.sqrt(1.0 - truth.coloured_decay * truth.coloured_decay)
+            process = GaussMarkov(truth.coloured_decay, kick)
+            error = process.advance(truth.coloured, noise[m : m + task.satellites])
+            truth = truth._replace(coloured=error)
         if p.urban:
-            truth = self._reflect(truth, noise[m:])
+            truth = self._reflect(truth, noise[noise.shape[0] - 3 * task.satellites :])
         # A stick at the first measurement has no last reading to hold.
         stuck = self._during(faults.stuck, k) & (k > 1.0)
         measured = exact + task.sensor_sigma * factor * noise[:m]
         ranges, rates, forces, attitude = (measured[sensor.readings] for sensor in task.sensors)
         forces = xp.where(stuck, truth.accelerometers, forces)
-        error = truth.multipath
+        error = truth.multipath + truth.coloured
         if p.ramp_probability:
             off = self._during(faults.ramp, k) & (self.places == faults.ramp_satellite)
-            run = (p.ramp_rate * p.sampling_interval) * (k - faults.ramp[0] + 1.0)
+            run = faults.ramp_jump + (p.ramp_rate * p.sampling_interval) * (k - faults.ramp[0] + 1.0)
             error = error + xp.where(off, run, 0.0)
         readings = xp.concat([ranges + error, rates, forces, attitude])
         if feedback is not None:
@@ -382,49 +347,16 @@ class NavigationWorld(World[Task, Truth, Measurement]):
 
     def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
         """State at step k, the hypothesis it follows, and whether its acceleration has jumped."""
-        xp, p, task, legs = self.xp, self.parameters, self.task, truth.legs
-        T, count = p.sampling_interval, legs.start.shape[0]
-        kind, push = legs.kind[0], legs.acceleration[:, 0]
-        for i in range(1, count):
-            begun = k > legs.start[i]
-            kind = xp.where(begun, legs.kind[i], kind)
-            push = xp.where(begun, legs.acceleration[:, i], push)
-
-        moved = gnss_ins.advance(truth.state, task.axis[:, :, SINGER], T, task.common.decay)
+        xp, common, c = self.xp, self.task.common, self.clock_root
+        moved = gnss_ins.advance(truth.state, self.task.axis[:, :, SINGER], common.T, common.decay)
         w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))
-        q = self.singer_root
-        singer = (
-            moved[0:3] + q[0, 0] * w[0],
-            moved[4:7] + (q[1, 0] * w[0] + q[1, 1] * w[1]),
-            moved[8:11] + (q[2, 0] * w[0] + q[2, 1] * w[1] + q[2, 2] * w[2]),
-        )
-        x, v = truth.state[0:3], truth.state[4:7]
-        spread = p.true_increment_sigma if p.course == "random" else 0.0
-        increment = T * push + spread * w[1]
-        felt = push if p.course == "kinematic" else 0.0 * push
-        line = (x + T * v + (0.5 * T) * increment, v + increment, felt)
-        still = (x, 0.0 * v, 0.0 * v)
-        x, v, a = (
-            xp.where(kind == REST, r, xp.where(kind == LINE, s, m))
-            for r, s, m in zip(still, line, singer, strict=True)
-        )
-        jumped = k < 0.0
-        for i in range(1, count):
-            here = (k == legs.start[i]) & (legs.kind[i] == SINGER)
-            a = xp.where(here, legs.acceleration[:, i], a)
-            jumped = jumped | here
-        # From the jump on the user manoeuvres; so he does all along a line whose acceleration is felt.
-        mode = xp.where(jumped, float(SINGER), kind)
-        if p.course == "kinematic":
-            mode = xp.where(kind == LINE, float(SINGER), mode)
-
-        c, common = self.clock_root, task.common
+        (x, v, a), mode, jumped = self.course.move(truth.legs, k, truth.state, moved, w)
         bias = moved[3] + c[0, 0] * normals[9]
         drift = moved[7] + (c[1, 0] * normals[9] + c[1, 1] * normals[10])
         attitude = moved[11:14] + math.sqrt(common.attitude_variance) * normals[11:14]
         rate = moved[14:17] + math.sqrt(common.attitude_rate_variance) * normals[14:17]
         state = xp.concat([x, bias[None], v, drift[None], a, attitude, rate])
-        return state, xp.astype(mode, xp.int64), xp.astype(jumped, normals.dtype)
+        return state, mode, jumped
 
     def _reflect(self, truth: Truth, noise: Array) -> Truth:
         """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now.
@@ -461,9 +393,18 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:
-        """Time and true hypothesis."""
-        seconds = self.parameters.sampling_interval * self.xp.astype(truth.step, truth.state.dtype)
-        return {"seconds": seconds, "true_mode": truth.mode}
+        """Time, true hypothesis, and one where a sensor fails: a rate that is noisier than stated, stuck
+        accelerometers, a pseudorange that is off by more than five standard deviations.
+        """
+        xp, p = self.xp, self.parameters
+        seconds = p.sampling_interval * xp.astype(truth.step, truth.state.dtype)
+        off = xp.any(xp.abs(truth.range_error) > OFF * p.pseudorange_sigma, axis=0)
+        failing = xp.any(truth.noise_factor > 1.0, axis=0) | (truth.stuck > 0.0) | off
+        return {
+            "seconds": seconds,
+            "true_mode": truth.mode,
+            "sensor_fails": xp.astype(failing, truth.state.dtype),
+        }
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Legs and faults with the steps of each (first and last, -1 where there is none), and what holds now: the true
@@ -487,6 +428,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             "hidden_satellites": faults.hidden_satellites,
             "ramp": window(faults.ramp),
             "ramp_satellite": faults.ramp_satellite,
+            "ramp_jump": faults.ramp_jump,
+            "coloured_deviation": truth.coloured_deviation,
+            "coloured_decay": truth.coloured_decay,
             "urban": faults.urban,
             "aperture": faults.aperture,
             "mode": truth.mode,

@@ -1,0 +1,252 @@
+r"""Errors of pseudoranges that last, as states beside those of :mod:`.gnss_ins`.
+
+A pseudorange is off by e_j beside its white noise, one such error for each of S satellites. The state is
+``[lambda (17), e_1 ... e_S]``. An error is a first-order Gauss-Markov process (multipath, atmosphere, ephemerides),
+
+    e_k = psi e_{k-1} + w,        rho_j = |s_j - X| + D' + e_j + white noise,                                  (1)
+
+and it may be drawn anew before any measurement, as where another reflection replaces the last one: with probability p
+it is N(m, v), whatever it was. Of the two predictions "held" (0) and "renewed" (1), the innovation nu_i of the
+pseudorange has the variance S_i, and the posterior probability of the second one is
+
+    pi = p N(nu_1; 0, S_1) / [(1 - p) N(nu_0; 0, S_0) + p N(nu_1; 0, S_1)].                                    (2)
+
+Both predictions differ in e_j alone. They are merged with these weights before the update: the mean of e_j is
+``(1 - pi) e_j + pi m``, its covariances with other states are multiplied by ``1 - pi``, and its variance is
+
+    (1 - pi) P_jj + pi v + pi (1 - pi) (e_j - m)^2.                                                            (3)
+
+Reading: the moments of the mixture of both *updates* would take two updates of the whole covariance; where pi is zero
+or one, which one innovation of a few standard deviations makes it, both are the same.
+
+:func:`take_reading` is the update by one scalar observation whose noise is a Gaussian sum over L variances, with the
+score and its derivative of :func:`.receiver_faults.weigh_levels` (Masreliez 1975): ``x += P h^T g nu``,
+``P -= (g - c nu^2) P h^T h P``. With one variance it is Kalman's.
+
+Sources: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with applications to tracking and navigation, Wiley 2001,
+sections 8.2 (coloured measurement noise) and 11.6 (merging); P. D. Groves, Principles of GNSS, inertial, and
+multisensor integrated navigation systems, 2013, section 14.2.
+
+Shapes: states ``(17 + S, ...)``, covariances ``(17 + S, 17 + S, ...)``, batch last.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from . import gnss_ins
+from .array_namespace import Array, namespace
+from .extended_kalman import JacobianRow
+from .receiver_faults import weigh_levels
+
+LARGEST_PROBABILITY = 1.0 - 1e-12
+"""Of a renewal: its odds stay finite."""
+
+
+def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> tuple[Array, Array]:
+    """State with the range errors, which are zero but for a variance.
+
+    Args:
+        mean: of the first 17 states, ``(17, N)``.
+        covariance: likewise, ``(17, 17, N)``.
+        satellites: S.
+        variance: of each error, m^2, ``(N,)``.
+    """
+    xp, none = namespace(mean), 0.0 * mean[0]
+    size = gnss_ins.SIZE + satellites
+    empty = xp.stack([none] * size)
+    rows = [xp.concat([covariance[i], empty[:satellites]]) for i in range(gnss_ins.SIZE)]
+    for j in range(gnss_ins.SIZE, size):
+        rows.append(xp.concat([empty[:j], (none + variance)[None], empty[j + 1 :]]))
+    return xp.concat([mean, empty[:satellites]]), xp.stack(rows)
+
+
+def advance(state: Array, axis: Array, T: float, decay: float, kept: Array) -> Array:
+    """Multiply by the transition matrix from the left, as :func:`.gnss_ins.advance`.
+
+    Args:
+        state: ``(17 + S, ...)``.
+        axis: transition of (x, v, a), ``(3, 3, ...)``.
+        T: step, s.
+        decay: factor of the attitude rates.
+        kept: psi, what is left of each range error, broadcasts against ``(...)``.
+    """
+    errors = kept * state[gnss_ins.SIZE :]
+    return namespace(state).concat([gnss_ins.advance(state, axis, T, decay), errors], axis=0)
+
+
+def predict(
+    mean: Array, covariance: Array, axis: Array, T: float, decay: float, Q: Array, kept: Array, gained: Array
+) -> tuple[Array, Array]:
+    """Time update, ``F x`` and ``F P F^T + Q``.
+
+    Args:
+        mean: ``(17 + S, M, N)``.
+        covariance: ``(17 + S, 17 + S, M, N)``.
+        axis: ``(3, 3, M, 1)``.
+        T: step, s.
+        decay: factor of the attitude rates.
+        Q: covariance of the process noise of the first 17 states, with zeros beyond, ``(17 + S, 17 + S, M, 1)``.
+        kept: psi, ``(N,)`` or a number.
+        gained: variance of w, m^2, likewise.
+    """
+    xp = namespace(mean)
+    moved = advance(covariance, axis, T, decay, kept)
+    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, kept) + Q
+    for j in range(gnss_ins.SIZE, mean.shape[0]):
+        both = _replace(both, j, both[j], both[j, j] + gained)
+    return advance(mean, axis, T, decay, kept), both
+
+
+def observe(
+    state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
+) -> tuple[Array, list[JacobianRow]]:
+    """Observations of a state and the rows of their Jacobian; pseudoranges with their errors."""
+    expected, rows = gnss_ins.observe(state, satellite_position, satellite_velocity, ins_angles, gravity)
+    errors = state[gnss_ins.SIZE :]
+    S = errors.shape[0]
+    ranges = [
+        JacobianRow((*row.columns, gnss_ins.SIZE + j), (*row.values, 1.0)) for j, row in enumerate(rows[:S])
+    ]
+    return namespace(state).concat([expected[:S] + errors, expected[S:]]), [*ranges, *rows[S:]]
+
+
+class Posterior(NamedTuple):
+    """State while the observations of one measurement are taken in, one after the other."""
+
+    shift: Array
+    """Mean minus predicted mean, ``(n, ...)``."""
+    covariance: Array
+    """``(n, n, ...)``."""
+    log_likelihood: Array
+    """Log-density of what was taken in, given the prediction, ``(...)``."""
+    squared_distance: Array
+    """Normalised innovation squared of the same, ``(...)``."""
+
+
+def begin(mean: Array, covariance: Array) -> Posterior:
+    """Before the first observation."""
+    none = 0.0 * mean[0]
+    return Posterior(0.0 * mean, covariance, none, none)
+
+
+def innovation_of(state: Posterior, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
+    """Innovation given what was taken in, its covariance with the state ``P h^T``, ``(n, ...)``, and ``h P h^T``.
+
+    Args:
+        state: before the observation.
+        residual: at the predicted mean, ``(...)``.
+        row: of the Jacobian there.
+    """
+    cross: Array = 0.0
+    for column, value in zip(*row, strict=True):
+        cross = cross + state.covariance[column] * value
+    variance: Array = 0.0
+    for column, value in zip(*row, strict=True):
+        variance = variance + cross[column] * value
+        residual = residual - state.shift[column] * value
+    return residual, cross, variance
+
+
+def take_reading(
+    state: Posterior, residual: Array, row: JacobianRow, levels: Array, probabilities: Array, available: Array
+) -> tuple[Posterior, Array]:
+    """Take in a scalar observation whose noise is a Gaussian sum.
+
+    Args:
+        state: before it.
+        residual: at the predicted mean, ``(...)``; any finite number where it is not available.
+        row: of the Jacobian there.
+        levels: variances in ascending order, ``(L, ...)`` that broadcast.
+        probabilities: of the levels, likewise; that of the highest one above zero.
+        available: one where there is the observation, zero where there is none.
+
+    Returns:
+        The state after it, and the responsibilities of the levels, ``(L, ...)``; those of an observation that is not
+        available mean nothing.
+    """
+    error, cross, variance = innovation_of(state, residual, row)
+    square = error * error
+    noise = weigh_levels(square, 1, variance, levels, probabilities)
+    weight = available * (noise.score - noise.spread * square)
+    after = Posterior(
+        state.shift + cross * (available * noise.score * error),
+        state.covariance - weight * (cross[:, None] * cross[None]),
+        state.log_likelihood + available * noise.log_density,
+        state.squared_distance + available * noise.score * square,
+    )
+    return after, noise.responsibilities
+
+
+class Renewal(NamedTuple):
+    """How a range error may have been drawn anew; arrays that broadcast against ``(...)``."""
+
+    probability: Array
+    """p."""
+    mean: Array
+    """m, m."""
+    variance: Array
+    """v, m^2."""
+
+
+def take_pseudorange(
+    state: Posterior,
+    predicted: Array,
+    place: int,
+    residual: Array,
+    row: JacobianRow,
+    variance: float,
+    renewal: Renewal,
+    available: Array,
+) -> Posterior:
+    """Take in a pseudorange whose error may have been drawn anew, equations (2) and (3).
+
+    Args:
+        state: before it.
+        predicted: mean of its error in the prediction, ``(...)``.
+        place: of its error among the states.
+        residual: at the predicted mean, ``(...)``.
+        row: of the Jacobian there; the derivative by the error is one.
+        variance: of the white noise, m^2.
+        renewal: of the error.
+        available: one where there is the pseudorange, zero where there is none.
+    """
+    xp = namespace(predicted)
+    error, cross, known = innovation_of(state, residual, row)
+    own, P = predicted + state.shift[place], state.covariance[place, place]
+    p = xp.clip(renewal.probability, None, LARGEST_PROBABILITY)
+    held = known + variance
+    renewed = held - 2.0 * cross[place] + P + renewal.variance
+    other = error + own - renewal.mean
+    difference = 0.5 * (error * error / held - other * other / renewed + xp.log(held / renewed))
+    odds = p / (1.0 - p) * xp.exp(available * xp.clip(difference, -600.0, 600.0))
+    pi = odds / (1.0 + odds)
+    stay, apart = 1.0 - pi, own - renewal.mean
+    merged = _replace(
+        state.covariance,
+        place,
+        stay * state.covariance[place],
+        stay * P + pi * renewal.variance + pi * stay * apart * apart,
+    )
+    shift = xp.concat(
+        [state.shift[:place], (state.shift[place] - pi * apart)[None], state.shift[place + 1 :]]
+    )
+    log_density = xp.log((1.0 - p) * (1.0 + odds)) - 0.5 * (
+        error * error / held + xp.log(2.0 * math.pi * held)
+    )
+    error, cross, known = innovation_of(state._replace(shift=shift, covariance=merged), residual, row)
+    total = available / (known + variance)
+    return Posterior(
+        shift + cross * (total * error),
+        merged - total * (cross[:, None] * cross[None]),
+        state.log_likelihood + available * log_density,
+        state.squared_distance + total * error * error,
+    )
+
+
+def _replace(covariance: Array, place: int, values: Sequence[Array], own: Array) -> Array:
+    """Covariance with another row and column of one state, and another variance of it."""
+    xp = namespace(covariance)
+    row = xp.concat([values[:place], own[None], values[place + 1 :]])
+    covariance = xp.concat([covariance[:place], row[None], covariance[place + 1 :]])
+    return xp.concat([covariance[:, :place], row[:, None], covariance[:, place + 1 :]], axis=1)
