@@ -3,12 +3,13 @@
     python benchmarks/particle_bank.py [--episodes 40] [--particles 2000] [--seed 0]
 
 **What it is.** Every particle draws what the scenario ``random`` draws for an episode, levels of the INS, changes of
-the receiver's noise, jamming, and onset and end of the spoofing, from the same distributions; the rate of the pull
-and the INS errors it leaves to a Kalman filter (Doucet, de Freitas, Murphy and Russell, "Rao-Blackwellised particle
-filtering for dynamic Bayesian networks", UAI 2000). What is drawn never changes in an episode, so this is importance
-sampling: nothing is resampled, no particle is an approximation, and the posterior mean is exact but for the number of
-particles (and for what a change of the report says by itself, which neither filter weighs). How many of them carry
-the weight (the effective number) stands beside the costs: where it is small, the filter is worse than exact Bayes.
+the receiver's noise, its coloured error's level and correlation time, jamming, and onset and end of the spoofing, from
+the same distributions; the rate of the pull and the errors of INS and receiver it leaves to a Kalman filter (Doucet, de
+Freitas, Murphy and Russell, "Rao-Blackwellised particle filtering for dynamic Bayesian networks", UAI 2000). What is
+drawn never changes in an episode, so this is importance sampling: nothing is resampled, no particle is an
+approximation, and the posterior mean is exact but for the number of particles (and for what a change of the report says
+by itself, which neither filter weighs). How many of them carry the weight (the effective number) stands beside the
+costs: where it is small, the filter is worse than exact Bayes.
 
 **What is compared.** Mean cost of the episodes, and the paired difference with its standard error.
 """
@@ -60,12 +61,13 @@ class Particles:
         ins = AugmentedCovariance(zero, zero, zero, truth.drift_deviation**2, zero, coloured**2)
         low, high = self.task.parameters.spoofing_rate
         variance = zero + (high - low) ** 2 / 12.0
-        mean = numpy.zeros((4, len(zero)))
-        return mean, receiver_faults.FaultCovariance(ins, zero, zero, zero, variance), zero, truth
+        wandering = truth.receiver_kick**2 / (1.0 - truth.receiver_decay**2)
+        P = receiver_faults.FaultCovariance(ins, numpy.zeros((3, 1, len(zero))), wandering[None, None])
+        return numpy.zeros((5, len(zero))), receiver_faults.add_fault(P, variance), zero, truth
 
     def update(self, measurement: Any, memory: Any) -> Any:
         """Predict and update every particle, weigh it, and mix."""
-        (delta, drift, eta, rate), P, log_weights, truth = memory
+        (delta, drift, eta, error, rate), P, log_weights, truth = memory
         s, N = self.task.parameters.sampling, len(measurement.number)
         number, available, ins, fix = (
             numpy.tile(values, self.count)
@@ -73,22 +75,30 @@ class Particles:
         )
         delta = delta + s.step * drift + s.drive * eta
         eta = s.decay * eta
-        P = receiver_faults.predict_fault(P, s, truth.coloured_step**2, truth.white_step**2)
+        error = truth.receiver_decay * error
+        decay = numpy.stack([truth.receiver_decay, numpy.ones(len(number))])
+        gained = numpy.stack([truth.receiver_kick**2, numpy.zeros(len(number))])
+        P = receiver_faults.predict_fault(P, s, truth.coloured_step**2, truth.white_step**2, decay, gained)
         deviation, reported = (
             Steps(level, truth.change).at(number, numpy)
             for level in (truth.receiver_levels, truth.reported_levels)
         )
         deviation = numpy.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
         h = numpy.where(within(number, truth.spoofing), s.step * (number - truth.spoofing[0] + 1.0), 0.0)
-        along = receiver_faults.measured_direction(P, h)
+        along = receiver_faults.measured_direction(P, numpy.stack([numpy.ones(len(h)), h]))
         # Reading: levels are taken over what is reported; that a report changes, or does not, weighs no particle.
         deviation = deviation * numpy.tile(measurement.reported_deviation, self.count) / reported
         S = along.variance + deviation**2
-        nu = numpy.where(available > 0, ins - numpy.nan_to_num(fix) - (delta - h * rate), 0.0)
+        nu = numpy.where(available > 0, ins - numpy.nan_to_num(fix) - (delta - error - h * rate), 0.0)
         log_weights = log_weights - 0.5 * available * (nu**2 / S + numpy.log(2.0 * math.pi * S))
         step = available * nu / S
         mean = numpy.stack(
-            [value + part * step for value, part in zip((delta, drift, eta, rate), along[:4], strict=True)]
+            [
+                value + part * step
+                for value, part in zip(
+                    (delta, drift, eta, error, rate), (*along[:3], *along.faults), strict=True
+                )
+            ]
         )
         P = receiver_faults.update_fault(P, along, available / S)
         each = log_weights.reshape(self.count, N)

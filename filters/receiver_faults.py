@@ -1,10 +1,10 @@
 r"""Faults of a satellite receiver beside an INS: an error that the receiver adds, and noise whose level nobody knows.
 
-The INS error (delta, beta, eta) of :mod:`.loosely_coupled` gets a fourth state, the receiver's own error e,
+The INS error (delta, beta, eta) of :mod:`.loosely_coupled` is followed by the receiver's own errors e,
 
     e_k = psi e_{k-1} + w,        Z = Xr + h e + zeta,        X - Z = delta - h e - zeta,
 
-which is one of two things:
+each of which is one of two things:
 
 * a coloured error (first-order Gauss-Markov): ``psi = exp(-T / tau_e)``, ``h = 1``;
 * the rate of a ramp by which spoofing pulls the fixes off: ``psi = 1``, ``w = 0``, h the time since it began.
@@ -35,19 +35,18 @@ from .ordered_sums import ordered_sum
 
 
 class FaultCovariance(NamedTuple):
-    """Covariance of (delta, beta, eta, e): that of the INS error, and four arrays of the same shape."""
+    """Covariance of (delta, beta, eta) and of E errors of the receiver."""
 
     ins: AugmentedCovariance
-    position_fault: Array
-    """Of delta and e, m times the unit of e."""
-    drift_fault: Array
-    coloured_fault: Array
-    fault: Array
-    """Variance of e."""
+    """Of the INS error, ``(...)`` each."""
+    cross: Array
+    """Of delta, beta and eta with each error of the receiver, ``(3, E, ...)``."""
+    faults: Array
+    """Of the errors of the receiver, ``(E, E, ...)``."""
 
 
 def predict_fault(
-    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array = 1.0, gained: Array = 0.0
+    P: FaultCovariance, s: Sampling, coloured: Array, white: Array, decay: Array, gained: Array
 ) -> FaultCovariance:
     """Covariance after one step without a measurement, ``F P F^T + Qd``.
 
@@ -56,17 +55,56 @@ def predict_fault(
         s: sampling of the INS error.
         coloured: variance that the coloured rate error gains in a step, m^2/s^2.
         white: variance of the displacement in a step that this gain does not explain, m^2.
-        decay: psi, what is left of the receiver's error after a step.
-        gained: variance that the receiver's error gains in a step.
+        decay: psi, what is left of each error of the receiver after a step, ``(E, ...)``.
+        gained: variance that each of them gains in a step, ``(E, ...)``.
     """
-    along = P.position_fault + s.step * P.drift_fault + s.drive * P.coloured_fault
+    xp = namespace(P.cross)
+    position, drift, rate = P.cross
+    along = position + s.step * drift + s.drive * rate
+    E = P.faults.shape[0]
+    faults = [[decay[i] * decay[k] * P.faults[i, k] for k in range(E)] for i in range(E)]
+    for i in range(E):
+        faults[i][i] = faults[i][i] + gained[i]
     return FaultCovariance(
         predict_augmented(P.ins, s, coloured, white),
-        decay * along,
-        decay * P.drift_fault,
-        decay * s.decay * P.coloured_fault,
-        decay * decay * P.fault + gained,
+        xp.stack([decay * along, decay * drift, decay * s.decay * rate]),
+        xp.stack([xp.stack(row) for row in faults]),
     )
+
+
+def add_fault(P: FaultCovariance, variance: Array) -> FaultCovariance:
+    """Covariance with one more error of the receiver, independent of all others.
+
+    Args:
+        P: without it.
+        variance: of it, ``(...)``.
+    """
+    xp, none = namespace(variance), 0.0 * variance
+    E = P.faults.shape[0]
+    row = xp.stack([none] * E + [variance])[None]
+    return FaultCovariance(
+        P.ins,
+        xp.concat([P.cross, xp.stack([none[None]] * 3)], axis=1),
+        xp.concat([xp.concat([P.faults, xp.moveaxis(row[:, :-1], 0, 1)], axis=1), row]),
+    )
+
+
+def matrix(P: FaultCovariance) -> Array:
+    """Covariance of (delta, beta, eta, e), ``(3 + E, 3 + E, ...)``."""
+    xp, ins = namespace(P.faults), P.ins
+    first = [
+        [ins.position, ins.position_drift, ins.position_coloured],
+        [ins.position_drift, ins.drift, ins.drift_coloured],
+        [ins.position_coloured, ins.drift_coloured, ins.coloured],
+    ]
+    rows = [xp.concat([xp.stack(row), P.cross[i]]) for i, row in enumerate(first)]
+    return xp.stack([*rows, *(xp.concat([P.cross[:, k], P.faults[k]]) for k in range(P.faults.shape[0]))])
+
+
+def from_matrix(P: Array) -> FaultCovariance:
+    """Undo :func:`matrix`."""
+    ins = (P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
+    return FaultCovariance(AugmentedCovariance(*ins), P[:3, 3:], P[3:, 3:])
 
 
 class Direction(NamedTuple):
@@ -75,7 +113,8 @@ class Direction(NamedTuple):
     position: Array
     drift: Array
     coloured: Array
-    fault: Array
+    faults: Array
+    """``(E, ...)``."""
     variance: Array
     """m^2."""
 
@@ -85,16 +124,21 @@ def measured_direction(P: FaultCovariance, h: Array) -> Direction:
 
     Args:
         P: of the prediction.
-        h: share of the receiver's error in the measurement.
+        h: share of each error of the receiver in the measurement, ``(E, ...)``.
     """
-    position = P.ins.position - h * P.position_fault
-    fault = P.position_fault - h * P.fault
+    ins, E = P.ins, range(P.faults.shape[0])
+
+    def less(value: Array, row: Array) -> Array:
+        return value - ordered_sum(h[k] * row[k] for k in E)
+
+    position = less(ins.position, P.cross[0])
+    faults = [less(P.cross[0, i], P.faults[i]) for i in E]
     return Direction(
         position,
-        P.ins.position_drift - h * P.drift_fault,
-        P.ins.position_coloured - h * P.coloured_fault,
-        fault,
-        position - h * fault,
+        less(ins.position_drift, P.cross[1]),
+        less(ins.position_coloured, P.cross[2]),
+        namespace(position).stack(faults),
+        less(position, faults),
     )
 
 
@@ -106,21 +150,20 @@ def update_fault(P: FaultCovariance, along: Direction, weight: Array) -> FaultCo
         along: of :func:`measured_direction`.
         weight: ``1 / S`` of a Kalman filter, ``g - c nu^2`` of a Gaussian sum, zero without a measurement, 1/m^2.
     """
-    position, drift, coloured, fault = (weight * part for part in along[:4])
-    ins = AugmentedCovariance(
-        P.ins.position - position * along.position,
-        P.ins.position_drift - position * along.drift,
-        P.ins.position_coloured - position * along.coloured,
-        P.ins.drift - drift * along.drift,
-        P.ins.drift_coloured - drift * along.coloured,
-        P.ins.coloured - coloured * along.coloured,
-    )
+    xp = namespace(weight)
+    ins = along[:3]
+    position, drift, coloured = (weight * part for part in ins)
     return FaultCovariance(
-        ins,
-        P.position_fault - position * along.fault,
-        P.drift_fault - drift * along.fault,
-        P.coloured_fault - coloured * along.fault,
-        P.fault - fault * along.fault,
+        AugmentedCovariance(
+            P.ins.position - position * along.position,
+            P.ins.position_drift - position * along.drift,
+            P.ins.position_coloured - position * along.coloured,
+            P.ins.drift - drift * along.drift,
+            P.ins.drift_coloured - drift * along.coloured,
+            P.ins.coloured - coloured * along.coloured,
+        ),
+        P.cross - xp.stack([(weight * part) * along.faults for part in ins]),
+        P.faults - weight * (along.faults[:, None] * along.faults[None]),
     )
 
 

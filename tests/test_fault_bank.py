@@ -54,17 +54,20 @@ def enumerated(bank, task, seen):
         ends = [None] if onset is None else [None, *range(onset + 1, steps + 1)]
         histories += [(onset, end) for end in ends]
     total, parts = [], []
-    drift, coloured = np.ravel(bank.drift), np.ravel(bank.coloured)
-    white = np.ravel(bank.white_growth) - p.sampling.residual * coloured**2
+    drift, coloured, _, growth, wandering, decay = (np.ravel(noise) for noise in bank.noises)
+    white = growth - p.sampling.residual * coloured**2
     for j, (onset, end) in itertools.product(range(len(drift)), histories):
         A, W, P0 = error_model(drift[j], coloured[j], p.correlation_time, white[j] / T)
-        F, Q = np.eye(4), np.zeros((4, 4))
+        F, Q = np.diag([0.0, 0.0, 0.0, decay[j], 1.0]), np.zeros((5, 5))
+        Q[3, 3] = wandering[j] ** 2 * (1.0 - decay[j] ** 2)
         F[:3, :3], Q[:3, :3] = van_loan(A, W, T)
-        weight = math.log(float(np.ravel(bank.ins_weights)[j]))
+        weight = math.log(float(np.ravel(bank.noise_weights)[j]))
+        if j == 0 and onset is not None:
+            continue  # what is as modelled is never pulled off
         for k in range(1, steps + 1):
             pulled = onset is not None and onset <= k and (end is None or k < end)
             if onset is None or k < onset:
-                weight += math.log(1.0 - begins) if k % bank.spacing == 0 else 0.0
+                weight += math.log(1.0 - begins) if j and k % bank.spacing == 0 else 0.0
             elif k == onset:
                 weight += math.log(begins)
             elif end is None or k <= end:
@@ -77,17 +80,17 @@ def enumerated(bank, task, seen):
             continue
         first = (1.0 - prior.distrust) * np.isclose(levels, 1.0) + prior.distrust / L
         for sequence in itertools.product(range(L), repeat=steps):
-            log, x, P = weight, np.zeros(4), np.zeros((4, 4))
-            P[:3, :3] = P0
+            log, x, P = weight, np.zeros(5), np.zeros((5, 5))
+            P[:3, :3], P[3, 3] = P0, wandering[j] ** 2
             for k, said in enumerate(seen, 1):
                 log += math.log(first[sequence[0]] if k == 1 else change[sequence[k - 2], sequence[k - 1]])
                 if k == onset:
-                    P[3, 3] = prior.rate**2
+                    P[4, 4] = prior.rate**2
                 x, P = F @ x, F @ P @ F.T + Q
                 pulled = onset is not None and onset <= k and (end is None or k < end)
                 h = T * (k - onset + 0.5 * (bank.spacing + 1)) if pulled else 0.0
                 if said.available[0]:
-                    H = np.array([1.0, 0.0, 0.0, -h])
+                    H = np.array([1.0, 0.0, 0.0, -1.0, -h])
                     S = H @ P @ H + levels[sequence[k - 1]] * said.reported_deviation[0] ** 2
                     nu = said.ins[0, 0] - said.fix[0, 0] - H @ x
                     log += -0.5 * (nu**2 / S + math.log(2.0 * math.pi * S))
@@ -156,15 +159,15 @@ def test_the_first_fix_gives_the_exact_mixture():
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
     mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
-    for weight, drift, coloured, white in zip(
-        *(np.ravel(x) for x in (bank.ins_weights, bank.drift, bank.coloured, bank.white_growth)), strict=True
-    ):
+    for weight, *noises in zip(*(np.ravel(x) for x in (bank.noise_weights, *bank.noises)), strict=True):
+        drift, coloured, _, white, wandering, _ = noises
         s = p.sampling
         V = (
             (s.step * drift) ** 2
             + (s.drive * coloured) ** 2
             + (s.coupling * s.coloured * coloured) ** 2
             + white
+            + wandering**2
         )
         for q, level in zip(mixed, (1.0, 6.0), strict=True):
             S = V + level * 1.44
@@ -189,10 +192,12 @@ def test_probabilities_stay_probabilities_and_covariances_positive():
     for _ in rollout(model, Watched(), episode_seeds("test", 4, 30)):
         pass
     for mean, covariance, memory, likelihood in found[::25]:
-        np.testing.assert_allclose(memory.weights.sum(axis=(0, 1)), 1.0, rtol=1e-12)
+        total = sum(part.weights.sum(axis=(0, 1)) for part in (memory.free, memory.pulled))
+        np.testing.assert_allclose(total, 1.0, rtol=1e-12)
         np.testing.assert_allclose(memory.levels.sum(axis=0), 1.0, rtol=1e-12)
         assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
-        assert (memory.covariance.ins.position > 0.0).all()
+        assert (memory.free.covariance.ins.position > 0.0).all()
+        assert (memory.pulled.covariance.ins.position > 0.0).all()
         assert np.isfinite(mean).all()
         assert (np.isnan(likelihood.log_likelihood) == np.isnan(likelihood.nis)).all()
 

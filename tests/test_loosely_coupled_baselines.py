@@ -8,7 +8,14 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedEstimator
 from filtergym.baselines.loosely_coupled_navigation.fault_bank import VAGUE, FaultBank
-from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
+from filtergym.baselines.loosely_coupled_navigation.metrics import (
+    FALSE_ALARM,
+    RISK,
+    WINDOW,
+    alarms,
+    detection,
+    recovery_times,
+)
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
@@ -128,7 +135,7 @@ def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
             growth = truth.coloured_step**2, truth.white_step**2
             kick = truth.receiver_decay, truth.receiver_kick**2
             P = receiver_faults.predict_fault(memory.covariance, s, *growth, *kick)
-            P = receiver_faults.measured_direction(P, 1.0).variance
+            P = receiver_faults.measured_direction(P, np.ones((1, 1))).variance
             since = 0.01 * (truth.number - truth.spoofing[0] + 1.0)
             pull = np.where(within(truth.number, truth.spoofing), truth.spoofing_rate * since, 0.0)
             predicted = delta[0] - truth.receiver_decay * memory.receiver[0]
@@ -350,6 +357,47 @@ def test_recovery_is_reported_for_outages_only(on_paper):
     nis = {(r.policy, r.window): r.value for r in records if r.metric == "anis"}
     assert nis["time-varying", "during"] is None
     assert nis["time-varying", "after"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_alarms_follow_the_last_fixes_and_are_as_rare_as_stated():
+    nis = np.full((2, 4 * WINDOW), 1.0)
+    nis[0, 40:43] = 30.0
+    nis[1, :60] = math.nan
+    found = alarms(nis, 1)
+    assert not found[0, :40].any()
+    assert found[0, 42 : 40 + WINDOW].all()
+    assert not found[0, 43 + WINDOW :].any()
+    assert not found[1].any()
+    for degrees in (1, 3):
+        drawn = np.random.default_rng(0).chisquare(degrees, (4000, 4 * WINDOW))
+        # Of windows apart from each other, so that the counts are binomial.
+        share = alarms(drawn, degrees)[:, WINDOW - 1 :: WINDOW].mean()
+        assert abs(share - FALSE_ALARM) < 4 * math.sqrt(FALSE_ALARM / 16000)
+
+
+def test_detection_of_made_up_faults():
+    alarm, fault, others = np.zeros((3, 4, 30), bool)
+    fault[:3, 10:20] = True
+    alarm[0, [3, 14, 15]] = True  # one false alarm, then four measurements late
+    alarm[1, 25] = True  # too late
+    others[2, 5] = True
+    alarm[2, [4, 6, 10]] = True
+    found = detection(alarm, fault, others)
+    np.testing.assert_array_equal(found["delay"][:, 0], [4, np.nan, 0, np.nan])
+    np.testing.assert_array_equal(found["missed"][:, 0], [0, 1, 0, np.nan])
+    np.testing.assert_array_equal(np.nansum(found["false"], axis=1), [1, 0, 1, 0])
+    np.testing.assert_array_equal((~np.isnan(found["false"])).sum(axis=1), [10, 10, 5, 30])
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_the_limit_holds_its_integrity_risk_and_detects_nothing_that_is_not_there(axes):
+    records = tidy_records(evaluate(ID, ["matched", "plain-reduced"], "spoof-ramp", episodes=60, axes=axes))
+    found = {(r.policy, r.metric): r.value for r in records if r.window == "all"}
+    assert found["matched", "beyond_protection_level"] < 5 * RISK
+    assert found["plain-reduced", "beyond_protection_level"] > 5 * RISK
+    assert found["matched", "lost_tracks"] == 0.0
+    assert found["matched", "missed_spoofing"] > 0.9  # told of the pull, it is surprised by nothing
+    assert found["plain-reduced", "false_alarms"] < 20 * FALSE_ALARM
 
 
 @pytest.mark.parametrize("axes", [1, 2])

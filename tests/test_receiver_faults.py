@@ -6,49 +6,53 @@ import numpy as np
 import pytest
 from filtergym.filters import loosely_coupled, receiver_faults
 from filtergym.filters.linear_systems import van_loan
-from filtergym.filters.loosely_coupled import AugmentedCovariance
-from filtergym.filters.receiver_faults import FaultCovariance
+from filtergym.filters.receiver_faults import matrix
 
 SAMPLING = loosely_coupled.sampling(1.5, 0.1)
 
 
-def matrix(P):
-    """Covariance as a matrix."""
-    (p, pd, pc, d, dc, c), pf, df, cf, f = P
-    return np.array([[p, pd, pc, pf], [pd, d, dc, df], [pc, dc, c, cf], [pf, df, cf, f]])
-
-
-def drawn(rng):
+def drawn(rng, errors=1):
     """A covariance as a matrix and in parts."""
-    root = rng.normal(size=(4, 4))
+    root = rng.normal(size=(3 + errors, 3 + errors))
     P = root @ root.T
-    ins = AugmentedCovariance(P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
-    return P, FaultCovariance(ins, P[0, 3], P[1, 3], P[2, 3], P[3, 3])
+    return P, receiver_faults.from_matrix(P)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_prediction_and_update_are_those_of_matrices(seed):
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("errors", [1, 2])
+def test_prediction_and_update_are_those_of_matrices(seed, errors):
     rng = np.random.default_rng(seed)
-    P, parts = drawn(rng)
-    coloured, white, decay, gained, h, R = *rng.uniform(0.1, 1.0, 5), rng.uniform(0.5, 3.0)
+    P, parts = drawn(rng, errors)
+    coloured, white, R = *rng.uniform(0.1, 1.0, 2), rng.uniform(0.5, 3.0)
+    decay, gained, h = rng.uniform(0.1, 1.0, (3, errors))
+    np.testing.assert_array_equal(matrix(parts), P)
     A, _, _ = loosely_coupled.error_model(0.0, 1.0, 1.5, 0.0)
-    F, Q = np.diag([0.0, 0.0, 0.0, decay]), np.zeros((4, 4))
+    F, Q = np.diag([0.0, 0.0, 0.0, *decay]), np.diag([0.0, 0.0, 0.0, *gained])
     F[:3, :3] = van_loan(A, np.zeros((3, 3)), 0.1)[0]
     s = SAMPLING
     Q[:3, :3] = coloured * np.outer([s.coupling, 0.0, 1.0], [s.coupling, 0.0, 1.0])
     Q[0, 0] += white
-    Q[3, 3] = gained
     predicted = receiver_faults.predict_fault(parts, s, coloured, white, decay, gained)
     expected = F @ P @ F.T + Q
     np.testing.assert_allclose(matrix(predicted), expected, rtol=1e-13, atol=1e-13)
-    H = np.array([1.0, 0.0, 0.0, -h])
+    H = np.array([1.0, 0.0, 0.0, *-h])
     along = receiver_faults.measured_direction(predicted, h)
-    np.testing.assert_allclose(along[:4], expected @ H, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose([*along[:3], *along.faults], expected @ H, rtol=1e-12, atol=1e-12)
     assert along.variance == pytest.approx(H @ expected @ H, rel=1e-12)
     K = expected @ H / (H @ expected @ H + R)
-    joseph = (np.eye(4) - np.outer(K, H)) @ expected @ (np.eye(4) - np.outer(K, H)).T + R * np.outer(K, K)
+    I_KH = np.eye(3 + errors) - np.outer(K, H)
     updated = receiver_faults.update_fault(predicted, along, 1.0 / (along.variance + R))
-    np.testing.assert_allclose(matrix(updated), joseph, rtol=1e-11, atol=1e-11)
+    # Joseph's form is a sum of squares, the other one a difference.
+    np.testing.assert_allclose(
+        matrix(updated), I_KH @ expected @ I_KH.T + R * np.outer(K, K), rtol=1e-11, atol=1e-11
+    )
+
+
+def test_an_error_that_is_added_is_independent_of_all_others():
+    P, parts = drawn(np.random.default_rng(1))
+    expected = np.zeros((5, 5))
+    expected[:4, :4], expected[4, 4] = P, 7.0
+    np.testing.assert_array_equal(matrix(receiver_faults.add_fault(parts, np.array(7.0))), expected)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -57,7 +61,7 @@ def test_the_score_gives_the_moments_of_the_mixture_of_kalman_updates(seed, inno
     rng = np.random.default_rng(seed)
     P, parts = drawn(rng)
     levels, q = np.sort(rng.uniform(0.1, 50.0, 4)), rng.dirichlet(np.ones(4))
-    along = receiver_faults.measured_direction(parts, 0.7)
+    along = receiver_faults.measured_direction(parts, np.array([0.7]))
     noise = receiver_faults.weigh_levels(np.array(innovation**2), 1, along.variance, levels, q)
     S = along.variance + levels
     densities = q * np.exp(-0.5 * innovation**2 / S) / np.sqrt(2.0 * math.pi * S)
@@ -69,7 +73,9 @@ def test_the_score_gives_the_moments_of_the_mixture_of_kalman_updates(seed, inno
     mean = weights @ means
     spread = sum(w * (P - np.outer(PH, PH) / s + np.outer(m - mean, m - mean))
                  for w, s, m in zip(weights, S, means, strict=True))  # fmt: skip
-    np.testing.assert_allclose(np.array(along[:4]) * noise.score * innovation, mean, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(
+        np.array([*along[:3], *along.faults]) * noise.score * innovation, mean, rtol=1e-11, atol=1e-13
+    )
     weight = noise.score - noise.spread * innovation**2
     # Differences of numbers of the size of P and of the squared correction.
     np.testing.assert_allclose(

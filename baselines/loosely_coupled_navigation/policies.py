@@ -5,18 +5,13 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.catalogue import task_class
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
 from ...envs.model import Model
-from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ...evaluation.dataset import keywords_of
-from ...evaluation.metrics import Measure, sums_of_present
-from ...evaluation.own_metrics import MetricInputs, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import select_nested
 from ..measurement_noise import MeasurementNoise
@@ -25,10 +20,8 @@ from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
 from .estimators import AugmentedEstimator
 from .fault_bank import TRAINING, VAGUE, FaultBank
+from .metrics import METRICS
 from .references import Matched, MatchedCovariance
-
-if TYPE_CHECKING:
-    import xarray
 
 
 def gain_bank(model: Model) -> GainBank:
@@ -228,76 +221,6 @@ class AugmentedGain(TimeVarying):
         return gain_bank(self.model).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
 
 
-# --- metrics of one's own
-
-RECOVERY_ERROR = 0.25
-"""Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
-HOLD_TIME = 0.1
-"""Time for which it must stay below, s: shorter than the memory of any sensible gain, long for noise."""
-LONGEST = 1.0
-"""Time after the outage that is looked at, s; a run that has not recovered by then counts with it."""
-
-
-def recovery_times(
-    error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
-) -> numpy.ndarray:
-    """Samples from the end of an outage until the error stays small, for each episode.
-
-    Args:
-        error: size of the error, ``(episodes, time)``.
-        available: one where there is a measurement, same shape.
-        limit: what counts as small.
-        held: samples for which it must stay small.
-        longest: samples looked at; the answer for a run that does not recover in them.
-
-    Returns:
-        ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
-        for episodes without an outage, or with less than ``longest + held`` samples after it.
-    """
-    episodes, steps = error.shape
-    ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
-    first = numpy.where(ends.any(axis=1), ends.argmax(axis=1) + 1, steps)
-    counted = first + longest + held <= steps
-    window = numpy.arange(longest + held)
-    index = numpy.minimum(first[:, None] + window, steps - 1)
-    small = numpy.take_along_axis(error, index, axis=1) < limit
-    runs = numpy.cumsum(numpy.concatenate([numpy.zeros((episodes, 1), int), small], axis=1), axis=1)
-    held_from = runs[:, held:] - runs[:, :-held] == held
-    found = held_from[:, :longest]
-    time = numpy.where(found.any(axis=1), found.argmax(axis=1), longest)
-    return numpy.where(counted, time.astype(float), math.nan)
-
-
-def _recoveries(run: "xarray.Dataset") -> MetricInputs:
-    """Seconds to recover of each episode, and whether it does not within a second; NaN without an outage."""
-    if "available" not in run or numpy.isnan(run["available"].values).all():
-        return MetricInputs()
-    cls = task_class(run.attrs["environment"])
-    scenario = cls.scenarios.get(run.attrs["scenario"])
-    parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **keywords_of(run)})
-    size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
-    limit = RECOVERY_ERROR * math.sqrt(parameters.receiver_variance * parameters.axes)
-    held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HOLD_TIME, LONGEST))
-    times = recovery_times(size, run["available"].values, limit, held, longest)
-    lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
-    found = {"time": times * parameters.sampling_interval, "lost": lost}
-    return MetricInputs({}, {name: sums_of_present(values[:, None]) for name, values in found.items()})
-
-
-def _outage_measures(
-    gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset"
-) -> list[Measure]:
-    """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
-    means = gathered.averaged
-    if not means or not means["time"][0, 1]:
-        return []
-    time, lost = (bootstrap.interval(ratio(means[name])) for name in ("time", "lost"))
-    return [
-        Measure("recovery_time", "position", "all", time, "s"),
-        Measure("not_recovered", "position", "all", lost, "1"),
-    ]
-
-
 # --- what can be tuned
 
 
@@ -310,8 +233,9 @@ ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
 ESTIMATORS |= {
     "fault-bank": Variant(
         FaultBank,
-        "Kalman filters over how good the INS is and since when the receiver is pulled off, each with a Gaussian sum "
-        "over the receiver's noise, by the prior of the training distribution.",
+        "Kalman filters over the noises of INS and receiver, its coloured error among them, and since when the "
+        "receiver is pulled off, each with a Gaussian sum over the receiver's noise, by the prior of the training "
+        "distribution.",
         prior=TRAINING,
     ),
     "fault-bank-vague": Variant(
@@ -390,6 +314,6 @@ BASELINES = Baselines(
         "matched",
         "matched-covariance",
     ),
-    metrics=OwnMetrics(_recoveries, _outage_measures),
+    metrics=METRICS,
 )
 """What the environment is compared with."""

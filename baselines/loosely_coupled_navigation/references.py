@@ -69,7 +69,9 @@ class Matched:
         decay, kick = truth.receiver_decay, truth.receiver_kick
         lost = 1.0 - decay * decay
         wandering = xp.where(lost > 0.0, kick * kick / xp.where(lost > 0.0, lost, 1.0), 0.0)
-        covariance = receiver_faults.FaultCovariance(P, zero, zero, zero, wandering)
+        covariance = receiver_faults.FaultCovariance(
+            P, xp.stack([zero[None]] * 3), (zero + wandering)[None, None]
+        )
         return ErrorState(still, still, still, still, covariance)
 
     def predict_and_update(
@@ -82,13 +84,18 @@ class Matched:
         decay, kick = truth.receiver_decay, truth.receiver_kick
         receiver = decay * memory.receiver
         P = receiver_faults.predict_fault(
-            memory.covariance, s, truth.coloured_step**2, truth.white_step**2, decay, kick * kick
+            memory.covariance,
+            s,
+            truth.coloured_step**2,
+            truth.white_step**2,
+            decay[None],
+            (kick * kick)[None],
         )
         since = s.step * (truth.number - truth.spoofing[0] + 1.0)
         pull = xp.where(within(truth.number, truth.spoofing), truth.spoofing_rate * since, 0.0)
         available = measurement.available
         innovation = available * ((measurement.ins - (measurement.fix - pull)) - (delta - receiver))
-        along = receiver_faults.measured_direction(P, 1.0)
+        along = receiver_faults.measured_direction(P, xp.ones((1, 1)))
         R = truth.deviation**2
         likelihood = likelihood_of_fix(innovation, along.variance + R, available, xp)
         weight = available / (along.variance + R)
@@ -97,7 +104,7 @@ class Matched:
             delta + along.position * step,
             memory.drift + along.drift * step,
             coloured + along.coloured * step,
-            receiver + along.fault * step,
+            receiver + along.faults[0] * step,
             receiver_faults.update_fault(P, along, weight),
         )
         return state, likelihood

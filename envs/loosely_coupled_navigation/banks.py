@@ -16,14 +16,26 @@ from ...filters import loosely_coupled as ins_gnss
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank, Initial
-from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Compression, Quantity
+from ..observation import (
+    ACTION,
+    KEPT_AS_LOG,
+    KEPT_AS_LOG1P,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+    Compression,
+    Quantity,
+)
 from ..task import Task
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .world import Measurement
 
 SCHEMES = ("plain-white", "plain-reduced", "augmented")
 """The bank under ``mode`` and ``weights``."""
-KEPT_AS_DEVIATION_LOG = Compression("half the log of ", None, lambda shown: numpy.exp(2.0 * shown))
+KEPT_AS_DEVIATION_LOG = Compression(
+    "half the log of ", None, lambda shown: numpy.exp(2.0 * shown), KEPT_AS_LOG.limits
+)
 """The block's function returns the logarithm of a standard deviation; reading gives the variance."""
 
 
@@ -169,10 +181,11 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
                 "available",
                 lambda _, measurement: measurement.available,
                 "1 with a measurement, 0 without",
+                shown=SHARE,
                 over_interval="mean",
             ),
             self.last_action(),
-            Block("time", time, "t / (t + tau), t since the start, tau the correlation time"),
+            Block("time", time, "t / (t + tau), t since the start, tau the correlation time", shown=SHARE),
         )
 
     @property
@@ -275,7 +288,7 @@ class NoiseBank(_KalmanBucyBank):
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block("last_action", lambda f, _: f.action, "action applied before", NOISES)
+        return Block("last_action", lambda f, _: f.action, "action applied before", NOISES, ACTION)
 
     def start(self, initial: Initial) -> Augmented:
         """Start where INS and reference agree, with the modelled prior of the rate errors."""
@@ -366,7 +379,7 @@ class GainBank(_KalmanBucyBank):
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block("last_action", lambda f, _: f.action, "action applied before", self.axes)
+        return Block("last_action", lambda f, _: f.action, "action applied before", self.axes, ACTION)
 
     def start(self, initial: Initial) -> Steered:
         """Start where INS and reference agree."""
@@ -446,7 +459,7 @@ class SchemeBank(_KalmanBucyBank):
     def last_action(self) -> Block:
         """Block of the weights in force before."""
         names = [name.replace("-", "_") for name in SCHEMES]
-        return Block("last_weight", lambda f, _: f.weights, "weight put in force before", names)
+        return Block("last_weight", lambda f, _: f.weights, "weight put in force before", names, SHARE)
 
     def start(self, initial: Initial) -> Schemes:
         """Start all filters where INS and reference agree, with the modelled prior of the rate errors."""

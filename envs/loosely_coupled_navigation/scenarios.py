@@ -34,8 +34,8 @@ SCENARIOS: Mapping[str, Scenario] = {
             "random",
             "Training distribution: a motion of the episode's own; "
             "drift, coloured and white noise from far less than modelled to three times it; "
-            "receiver noise over a decade, with up to two changes, unreported half of the time; outages, jamming and "
-            "spoofing in some episodes each; in one of six nothing fails.",
+            "receiver noise over a decade, with up to two changes, unreported half of the time, and a coloured error "
+            "beside it; outages, jamming and spoofing in some episodes each; in one of six nothing fails.",
             {
                 **_DRAWN,
                 "drift_factor": DOWN_TO_QUIET,
@@ -55,6 +55,8 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "spoofing_start": (0.5, 3.5),
                 "spoofing_duration": (0.5, 2.0),
                 "spoofing_rate": (-3.0, 3.0),
+                "receiver_coloured": (0.0, 0.5),
+                "receiver_correlation_time": (0.5, 5.0),
                 "undisturbed": 1.0 / 6.0,
             },
             _LATE,
@@ -113,15 +115,14 @@ SCENARIOS: Mapping[str, Scenario] = {
             {**_DRAWN, "outlier_probability": 0.05},
             _LATE,
         ),
-        # Held out: no filter of the field has a parameter for it, and a bank that had one would need a fourth state.
         Scenario(
             "coloured-receiver",
-            "Fixes with a coloured error of 0.2 to 0.8 m that lasts for 1 to 10 s beside the white one, unreported; no "
-            "training episode holds any.",
+            "Fixes with a coloured error of 0.6 to 1.2 m that lasts for 5 to 20 s beside the white one, unreported: "
+            "more, and longer, than in any training episode, and in 5 s hardly to be told from a bias.",
             {
                 **_DRAWN,
-                "receiver_coloured": (0.2, 0.8),
-                "receiver_correlation_time": (1.0, 10.0),
+                "receiver_coloured": (0.6, 1.2),
+                "receiver_correlation_time": (5.0, 20.0),
             },
             _LATE,
         ),

@@ -1,0 +1,185 @@
+"""What is measured of LooselyCoupledNavigation beside the metrics of every environment: recovery, detection, integrity.
+
+All follows from what every competitor reports: its error, NEES and NIS. So whether it is a policy or an estimator, a
+fault is detected by the same test of its innovations: the sum of the NIS of the last ``WINDOW`` fixes beyond the
+quantile of its chi-square distribution (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
+navigation", 2001, 5.4). The protection level bounds the error with the integrity risk ``RISK`` if the reported
+covariance is right: ``k sigma``, sigma the reported deviation in the direction of the error, ``k^2`` the quantile of
+the chi-square distribution of as many degrees as axes. NEES is ``(error / sigma)^2``, so that nothing else is needed.
+"""
+
+import functools
+import math
+from typing import TYPE_CHECKING
+
+import numpy
+
+from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.scenario_choice import make_task
+from ...evaluation.bootstrap import Bootstrap, ratio
+from ...evaluation.cause_split import VARIABLE, held_causes
+from ...evaluation.dataset import keywords_of
+from ...evaluation.metrics import Measure, sums_of_present
+from ...evaluation.own_metrics import MetricInputs, OwnMetrics
+
+if TYPE_CHECKING:
+    import xarray
+
+RECOVERY_ERROR = 0.25
+"""Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
+HOLD_TIME = 0.1
+"""Time for which it must stay below, s: shorter than the memory of any sensible gain, long for noise."""
+LONGEST = 1.0
+"""Time after the outage that is looked at, s; a run that has not recovered by then counts with it."""
+WINDOW = 25
+"""Fixes whose innovations are tested together: 0.25 s, as the averages that are shown."""
+FALSE_ALARM = 1e-4
+"""Probability of an alarm at a measurement of a filter whose covariance is right."""
+RISK = 1e-3
+"""Integrity risk: how often the error may be beyond the protection level."""
+LOST = 10.0
+"""Error over the nominal standard deviation of a measurement, for each axis, beyond which the track is lost."""
+UNITS = {
+    "recovery_time": "s",
+    "not_recovered": "1",
+    "detection_time": "s",
+    "missed_spoofing": "1",
+    "false_alarms": "1",
+    "protection_level": "m",
+    "beyond_protection_level": "1",
+    "lost_tracks": "1",
+}
+"""Of the metrics."""
+
+
+@functools.cache
+def chi_square_quantile(probability: float, degrees: int) -> float:
+    """Quantile of the chi-square distribution."""
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(probability, degrees))
+
+
+def recovery_times(
+    error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
+) -> numpy.ndarray:
+    """Samples from the end of an outage until the error stays small, for each episode.
+
+    Args:
+        error: size of the error, ``(episodes, time)``.
+        available: one where there is a measurement, same shape.
+        limit: what counts as small.
+        held: samples for which it must stay small.
+        longest: samples looked at; the answer for a run that does not recover in them.
+
+    Returns:
+        ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
+        for episodes without an outage, or with less than ``longest + held`` samples after it.
+    """
+    episodes, steps = error.shape
+    ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
+    first = numpy.where(ends.any(axis=1), ends.argmax(axis=1) + 1, steps)
+    counted = first + longest + held <= steps
+    window = numpy.arange(longest + held)
+    index = numpy.minimum(first[:, None] + window, steps - 1)
+    small = numpy.take_along_axis(error, index, axis=1) < limit
+    runs = numpy.cumsum(numpy.concatenate([numpy.zeros((episodes, 1), int), small], axis=1), axis=1)
+    held_from = runs[:, held:] - runs[:, :-held] == held
+    found = held_from[:, :longest]
+    time = numpy.where(found.any(axis=1), found.argmax(axis=1), longest)
+    return numpy.where(counted, time.astype(float), math.nan)
+
+
+def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
+    """Whether the innovations of the last ``WINDOW`` fixes are too large, booleans ``(episodes, time)``.
+
+    Args:
+        nis: normalised innovation squared, NaN without a fix, same shape.
+        degrees: of the NIS of a fix.
+    """
+    sums, fixes = (
+        numpy.cumsum(numpy.pad(values, ((0, 0), (WINDOW, 0))), axis=1)
+        for values in (numpy.nan_to_num(nis), ~numpy.isnan(nis))
+    )
+    sums, fixes = (values[:, WINDOW:] - values[:, :-WINDOW] for values in (sums, fixes))
+    limits = numpy.array(
+        [math.inf, *(chi_square_quantile(1.0 - FALSE_ALARM, degrees * n) for n in range(1, WINDOW + 1))]
+    )
+    return numpy.asarray(sums > limits[fixes])
+
+
+def detection(alarm: numpy.ndarray, fault: numpy.ndarray, others: numpy.ndarray) -> dict[str, numpy.ndarray]:
+    """Measurements until a fault is detected, whether it is missed, and alarms before anything is wrong.
+
+    Args:
+        alarm: ``(episodes, time)`` booleans.
+        fault: whether the fault is there, same shape.
+        others: whether anything else is wrong, same shape.
+
+    Returns:
+        ``delay`` and ``missed`` ``(episodes, 1)``, NaN without a fault, the delay also where it is missed; ``false``
+        ``(episodes, time)``, NaN from the first measurement on at which anything is wrong.
+    """
+    found = alarm & fault
+    there, hit = fault.any(axis=1), found.any(axis=1)
+    delay = numpy.where(hit, found.argmax(axis=1) - fault.argmax(axis=1), math.nan)
+    missed = numpy.where(there, ~hit, math.nan)
+    calm = ~numpy.logical_or.accumulate(fault | others, axis=1)
+    return {
+        "delay": delay[:, None],
+        "missed": missed[:, None],
+        "false": numpy.where(calm, alarm, math.nan),
+    }
+
+
+def gather(run: "xarray.Dataset") -> MetricInputs:
+    """Return what the metrics need of each episode: sums, and how many terms they have; nothing of a bound."""
+    if "available" not in run or numpy.isnan(run["available"].values).all():
+        return MetricInputs()
+    task = make_task(LooselyCoupledNavigation, run.attrs["scenario"], **keywords_of(run))
+    p = task.parameters
+    T, nominal = p.sampling_interval, math.sqrt(p.receiver_variance * p.axes)
+    size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
+    held, longest = (max(round(t / T), 1) for t in (HOLD_TIME, LONGEST))
+    times = recovery_times(size, run["available"].values, RECOVERY_ERROR * nominal, held, longest)
+    found = {
+        "recovery_time": times[:, None] * T,
+        "not_recovered": numpy.where(numpy.isnan(times), math.nan, times == longest)[:, None],
+        "lost_tracks": (size > LOST * nominal).any(axis=1)[:, None].astype(float),
+    }
+    nees = run["nees"].values
+    quantile = chi_square_quantile(1.0 - RISK, p.axes)
+    usable = nees > 0.0
+    deviation = numpy.where(usable, size / numpy.sqrt(numpy.where(usable, nees, 1.0)), math.nan)
+    found["protection_level"] = math.sqrt(quantile) * deviation
+    found["beyond_protection_level"] = numpy.where(numpy.isnan(nees), math.nan, nees > quantile)
+    if VARIABLE in run and not numpy.isnan(run["nis"].values).all():
+        causes = dict(held_causes(run))
+        wrong = [causes[name] for name in run["cause"].values.tolist() if name not in ("spoofing", "outlier")]
+        spoofed = detection(
+            alarms(run["nis"].values, p.axes), causes["spoofing"], numpy.logical_or.reduce(wrong)
+        )
+        found["detection_time"] = T * spoofed["delay"]
+        found["missed_spoofing"] = spoofed["missed"]
+        found["false_alarms"] = spoofed["false"]
+    return MetricInputs({}, {name: sums_of_present(values) for name, values in found.items()})
+
+
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
+    """Measures of recovery, detection and integrity; those of what never happens are left out.
+
+    ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
+    ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and
+    the share of measurements with an alarm before anything is wrong (``false_alarms``). Mean ``protection_level`` and
+    the share of measurements with an error beyond it; the share of episodes in which the track is ever lost.
+    """
+    present = {name: sums for name, sums in gathered.averaged.items() if sums[0, 1]}
+    return [
+        Measure(name, "position", "all", bootstrap.interval(ratio(present[name])), unit)
+        for name, unit in UNITS.items()
+        if name in present
+    ]
+
+
+METRICS = OwnMetrics(gather, measures)
+"""Of the environment."""
