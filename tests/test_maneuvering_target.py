@@ -18,7 +18,7 @@ from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
 T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)
-REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
+REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
 """Every scan sees the target on time, as in the paper; where it does not, see test_missed_scans.py."""
 
 
@@ -539,7 +539,8 @@ class TestNoTruth:
         """The other target flies apart, and its noise is what gives the same measurements."""
         model = make_model(ID, control, scenario)
         rng = np.random.default_rng(1)
-        state = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+        noise = model.task.noise
+        state = model.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
         offset = np.array([[2500.0], [-1800.0]])
         truth = state.truth._replace(position=state.truth.position + offset)
         if truth.scans is not None:
@@ -547,12 +548,15 @@ class TestNoTruth:
         other, missed = state._replace(truth=truth), 0
         for _ in range(40):
             # Whether a scan sees the target, and how early it comes, is the same for both.
-            row, scan = rng.normal(size=(2, 8)), rng.random((model.task.noise.row_uniforms, 8))
+            row, scan = rng.normal(size=(2, 8)), rng.random((noise.row_uniforms, 8))
+            scan = np.concatenate([rng.normal(size=(noise.normals - 2, 8)), scan])
             state = model.measure(state, np.concatenate([row, scan]))
             probe, _ = model.task.world.advance(other.truth, np.concatenate([0.0 * row, scan]), None)
             place = probe.position
             sigma = np.sqrt(np.stack([variances(x, y) for x, y in place.T], axis=1))
             row = (state.measurement.position - place) / sigma
+            if probe.coloured is not None:  # that part of the error is the same for both
+                row = row - probe.coloured.level
             other = model.measure(other, np.concatenate([row, scan]))
             missed += (state.measurement.available == 0.0).sum()
             assert (abs(other.truth.position - state.truth.position) > 1000.0).any(

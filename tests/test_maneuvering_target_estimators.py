@@ -314,11 +314,14 @@ def test_tuned_estimators_come_in_their_order_on_fresh_flights():
 def test_a_deviation_is_carried_as_the_turns_carry_it(scenario, keywords):
     model = make_model(ID, "evidence", scenario, maneuver_count=(3, 3), **keywords)
     world, rng = model.task.world, np.random.default_rng(0)
-    episode = model.begin(rng.random((model.task.noise.uniforms, LANES)), rng.normal(size=(4, LANES)))
+    numbers = model.task.noise
+    episode = model.begin(
+        rng.random((numbers.uniforms, LANES)), rng.normal(size=(numbers.initial_normals, LANES))
+    )
     velocity, turned = rng.normal(size=(2, LANES)), 0
     for k in range(1, 61):
         before = episode.truth
-        noise = [rng.normal(size=(2, LANES)), rng.random((world.row_uniforms, LANES))]
+        noise = [rng.normal(size=(numbers.normals, LANES)), rng.random((numbers.row_uniforms, LANES))]
         episode = model.act(model.measure(episode, np.concatenate(noise)), np.zeros((2, LANES)))
         truth = episode.truth
         early = None if truth.scans is None else (before.scans.early, truth.scans.early)
@@ -358,13 +361,19 @@ def naive_rate(p, flight, time, b):
     return math.atan2(sine, 1.0 + cosine) / p.sampling_interval
 
 
-SCENARIOS = ("random", "paper", "atc", "cruise", "descent", "missed-detections", "irregular-scans", "glint")
+SCENARIOS = tuple(problem_of(ID).task.scenarios)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_nobody_is_significantly_better_than_the_reference(scenario):
     # The command for all competitors and 2000 episodes: python benchmarks/limits.py filtergym/ManeuveringTarget-v0
-    names = ["semi-markov-tuned", "semi-markov-vague", "kalman-imm-turn-tuned", "known-turn"]
+    names = [
+        "semi-markov-tuned",
+        "semi-markov-vague",
+        "semi-markov-pda",
+        "kalman-imm-turn-tuned",
+        "known-turn",
+    ]
     data = evaluate(ID, names, scenario, episodes=64, seed=5)
     cost = data["cost"].mean("time")
     difference = (cost.sel(policy=names[:-1]) - cost.sel(policy="known-turn")).values

@@ -21,7 +21,7 @@ ID = "filtergym/ManeuveringTarget-v0"
 CONTROLS = ("evidence", "gains", "gain", "mode", "weights")
 T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)
 IRREGULAR = {"detection_probability": (0.5, 0.9), "scan_jitter": (0.3, 0.9), "undisturbed": 0.0}
-REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
+REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
 SEEN, MISSED = 0.0, 0.999
 """Uniform numbers of a scan that sees the target, and of one that does not."""
 
@@ -203,7 +203,12 @@ def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
 
 def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="random", seed=0, **keywords):
     """Episodes after each scan, before and after random actions; ``detections`` says which see the target."""
-    scans = {"detection_probability": (0.5, 0.5), "scan_jitter": (jitter, jitter), "undisturbed": 0.0}
+    scans = {
+        "detection_probability": (0.5, 0.5),
+        "scan_jitter": (jitter, jitter),
+        "undisturbed": 0.0,
+        "coloured_sigma": (0.0, 0.0),
+    }
     model = make_model(ID, control, scenario, **scans, **keywords)
     rng = np.random.default_rng(seed)
     noise = model.task.noise
@@ -302,7 +307,7 @@ def test_what_is_said_of_a_missed_target_does_not_count(control):
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_bank_that_could_miss_the_target_is_the_same_where_it_does_not(control):
     """Bit for bit: so a recording of regular scans is replayed by either."""
-    regular, other = (make_model(ID, control, **scans) for scans in (REGULAR, IRREGULAR))
+    regular, other = (make_model(ID, control, **{**REGULAR, **scans}) for scans in ({}, IRREGULAR))
     rng = np.random.default_rng(2)
     noise = regular.task.noise
     assert noise.row_uniforms == 0
@@ -386,7 +391,7 @@ def test_legs_are_flown_by_time():
 
 def test_scans_see_the_target_as_often_and_come_as_early_as_they_should():
     scans = {"detection_probability": (0.2, 0.9), "scan_jitter": (0.1, 0.8), "undisturbed": 0.0}
-    model = make_model(ID, None, "random", **scans)
+    model = make_model(ID, None, "random", coloured_sigma=(0.0, 0.0), **scans)
     rng = np.random.default_rng(1)
     count, scans = 400, 90
     episode = model.begin(rng.random((model.task.noise.uniforms, count)), rng.standard_normal((4, count)))

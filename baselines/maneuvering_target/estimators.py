@@ -51,11 +51,14 @@ class KalmanModel:
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
-    def update_estimate(self, predicted: tuple[Array, Array], measurement: Measurement) -> kalman.Update:
+    def update_estimate(
+        self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
+    ) -> kalman.Update:
         """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
-        nothing of how likely they are.
+        nothing of how likely they are; H is that of the position unless another one is given.
         """
-        result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
+        H = self.H if H is None else H
+        result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)
         return self.where_detected(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:

@@ -16,6 +16,7 @@ from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm
 from .log_families import log_families
+from .metrics import METRICS
 from .references import KnownInputBound, KnownTurn
 from .smoothers import SMOOTHERS
 from .tunable_estimators import ESTIMATORS
@@ -196,6 +197,7 @@ BASELINES = Baselines(
     log_families=log_families,
     tunable=TUNABLE,
     alarm=RadarAlarm,
+    metrics=METRICS,
     best_constant="fixed-best",
     benchmark=(
         "imm",

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from ...envs.faults import GaussMarkov
 from ...envs.filter import Initial
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...envs.observation import Array
@@ -27,7 +28,9 @@ class KnownTurn(KalmanModel):
     disturbs the flight. With x the state, z what is told of the target and F the transition that turns a deviation of
     the velocity as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
     prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero in a turn.
-    Of the measurements it is told the variances at the true position, and in which scans there is glint.
+    Of the measurements it is told the variances at the true position, in which scans there is glint, a constant bias,
+    and in clutter which plot is the target's. Of a coloured error it is told deviation and correlation time, and has
+    its level as two more states.
 
     Of flights that are tables, such as those of aircraft, nobody knows turn rates: there it is told the acceleration
     from scan to scan, which is thrust.
@@ -35,12 +38,28 @@ class KnownTurn(KalmanModel):
 
     kind = "reference"
     knows = (
-        "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every scan"
+        "when every manoeuvre begins and ends, its acceleration or turn rate, the variance and bias of every scan, the "
+        "deviation and correlation time of coloured errors, and which plot is the target's"
     )
 
     def start(self, initial: Initial, truth: Truth) -> TurnMemory:
-        """Start where everyone starts."""
-        return TurnMemory(*initial, truth)
+        """Start where everyone starts; a coloured error is stationary from the start."""
+        mean, covariance = initial
+        if truth.coloured is not None:
+            none, variance = 0.0 * mean[:2], truth.coloured.deviation**2
+            mean = self.xp.concat([mean, none])
+            covariance = self.block_diagonal(covariance, self.identity * variance)
+        return TurnMemory(mean, covariance, truth)
+
+    def block_diagonal(self, first: Array, second: Array) -> Array:
+        """Matrix of two blocks, ``(n + m, n + m, N)``."""
+        corner = 0.0 * first[:, :1] + 0.0 * second[:1]
+        return self.xp.concat(
+            [
+                self.xp.concat([first, corner], axis=1),
+                self.xp.concat([self.xp.moveaxis(corner, 0, 1), second], axis=1),
+            ]
+        )
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: TurnMemory
@@ -57,15 +76,30 @@ class KnownTurn(KalmanModel):
         by_velocity = xp.stack([xp.concat(column) for column in columns], axis=1)
         F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
         before, now = (xp.concat([state.position, state.velocity]) for state in (memory.truth, truth))
-        predicted = kalman.predict(memory.mean, memory.covariance, F, 0.0 * F, now - apply(F, before))
+        offset, Q, H = now - apply(F, before), 0.0 * F, self.H[:, :, None]
         variance = polar.cartesian_variances(
             truth.position, self.task.parameters.range_sigma, world.bearing_sigma
         )
+        sigma = xp.sqrt(variance)
+        if truth.clutter is not None:
+            measurement = measurement._replace(**truth.clutter.echo._asdict())
+        if truth.bias is not None:
+            measurement = measurement._replace(position=measurement.position - sigma * truth.bias)
+        if truth.coloured is not None:
+            process = GaussMarkov.sampled(
+                truth.coloured.deviation, truth.coloured.correlation_time, measurement.interval, xp
+            )
+            F = self.block_diagonal(F, self.identity * process.decay)
+            Q = self.block_diagonal(Q, self.identity * process.kick**2)
+            offset = xp.concat([offset, 0.0 * sigma])
+            H = xp.concat([H + 0.0 * sigma[0], self.identity * sigma], axis=1)
         if truth.error_factor is not None:
             variance = truth.error_factor**2 * variance
-        result = self.update_estimate(predicted, measurement._replace(variance=variance))
+        predicted = kalman.predict(memory.mean, memory.covariance, F, Q, offset)
+        result = self.update_estimate(predicted, measurement._replace(variance=variance), H)
+        mean, covariance = result.mean[:4], result.covariance[:4, :4]
         memory = TurnMemory(result.mean, result.covariance, truth)
-        return result.mean, result.covariance, memory, self.likelihood(measurement, *result[2:])
+        return mean, covariance, memory, self.likelihood(measurement, *result[2:])
 
 
 class KnownInputBound(KalmanModel):
@@ -87,5 +121,6 @@ class KnownInputBound(KalmanModel):
         predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])
         variance = polar.cartesian_variances(truth.position, p.range_sigma, world.bearing_sigma)
         P = bounds.posterior_cramer_rao_bound(predicted, self.H, self.identity * variance)
-        P = self.xp.where(measurement.available > 0.0, P, predicted)
+        available = measurement.available if truth.clutter is None else truth.clutter.echo.available
+        P = self.xp.where(available > 0.0, P, predicted)
         return self.xp.stack([P[i, i] for i in range(4)]), P

@@ -10,6 +10,11 @@ from typing import Any
 
 from ..table import Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
+from .data_association import (
+    InteractingMultipleModelDataAssociation,
+    ProbabilisticDataAssociation,
+    SemiMarkovDataAssociation,
+)
 from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
 from .semi_markov import TRAINING_PRIOR, VAGUE_PRIOR, SemiMarkov
 
@@ -27,6 +32,9 @@ ESTIMATORS = {
     "kalman-imm-turn": KalmanTurnInteractingMultipleModel,
     "semi-markov": SemiMarkov,
     "semi-markov-vague": SEMI_MARKOV_VAGUE,
+    "kalman-pda": ProbabilisticDataAssociation,
+    "kalman-imm-pda": InteractingMultipleModelDataAssociation,
+    "semi-markov-pda": SemiMarkovDataAssociation,
     "unscented-turn": UnscentedTurn,
     "sage-husa": SageHusa,
     "variational-bayes": VariationalBayes,
@@ -34,10 +42,13 @@ ESTIMATORS = {
 }
 
 
-def _imm(values: Mapping[str, float]) -> Settings:
-    accelerations = values["acceleration_quiet"], values["acceleration_noisy"]
-    stay = values["stay_quiet"], values["stay_noisy"]
-    return {}, lambda task: KalmanInteractingMultipleModel(task, accelerations, stay)
+def _imm(make: Callable[..., Any]) -> Callable[[Mapping[str, float]], Settings]:
+    def apply(values: Mapping[str, float]) -> Settings:
+        accelerations = values["acceleration_quiet"], values["acceleration_noisy"]
+        stay = values["stay_quiet"], values["stay_noisy"]
+        return {}, lambda task: make(task, accelerations, stay)
+
+    return apply
 
 
 def _imm_turn(values: Mapping[str, float]) -> Settings:
@@ -78,19 +89,22 @@ def _semi_markov_limits(prior: Mapping[str, Any]) -> dict[str, tuple[float, floa
     }
 
 
+_IMM = {
+    "acceleration_quiet": (0.0, 0.0, 0.5),
+    "acceleration_noisy": (0.5, 2.775, 10.0),
+    "stay_quiet": (0.8, 0.9, 0.999),
+    "stay_noisy": (0.5, 0.9, 0.999),
+}
 _TURN_RATES = {
     "log10_turn_rate_start": (-1.0, log10(2.0), 0.7),
     "log10_turn_rate_change": (-1.5, log10(0.3), 0.3),
 }
 
 TUNABLE = {
-    "kalman-imm": tunable(
-        KalmanInteractingMultipleModel,
-        _imm,
-        acceleration_quiet=(0.0, 0.0, 0.5),
-        acceleration_noisy=(0.5, 2.775, 10.0),
-        stay_quiet=(0.8, 0.9, 0.999),
-        stay_noisy=(0.5, 0.9, 0.999),
+    "kalman-imm": tunable(KalmanInteractingMultipleModel, _imm(KalmanInteractingMultipleModel), **_IMM),
+    "kalman-pda": tunable(ProbabilisticDataAssociation, log10_acceleration=(-1.5, log10(3.0), 1.0)),
+    "kalman-imm-pda": tunable(
+        InteractingMultipleModelDataAssociation, _imm(InteractingMultipleModelDataAssociation), **_IMM
     ),
     "kalman-imm-turn": tunable(
         KalmanTurnInteractingMultipleModel,
@@ -106,6 +120,11 @@ TUNABLE = {
     "semi-markov": tunable(
         SemiMarkov,
         _semi_markov(SemiMarkov, TRAINING_PRIOR["hazards"]),
+        **_semi_markov_limits(TRAINING_PRIOR),
+    ),
+    "semi-markov-pda": tunable(
+        SemiMarkovDataAssociation,
+        _semi_markov(SemiMarkovDataAssociation, TRAINING_PRIOR["hazards"]),
         **_semi_markov_limits(TRAINING_PRIOR),
     ),
     "semi-markov-vague": tunable(

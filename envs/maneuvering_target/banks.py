@@ -17,7 +17,16 @@ from ...filters.gaussian import log_density
 from ...filters.ordered_sums import weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank, Initial
-from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Quantity
+from ..observation import (
+    AVERAGE_OF_LOG1P,
+    KEPT_AS_LOG,
+    KEPT_AS_LOG1P,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+    Quantity,
+)
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
@@ -143,11 +152,13 @@ class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
                 "scan",
                 lambda state, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
                 f"scans since the start over {SCANS_SHOWN}, saturating at 1",
+                shown=SHARE,
             ),
             Block(
                 "available",
                 lambda state, measurement: measurement.available,
                 "1 if the scan saw the target, 0 if not: no action has an effect then",
+                shown=SHARE,
             ),
             Block(
                 "elapsed",
@@ -194,14 +205,16 @@ class GainBank(_RadarBank):
                 "average_log_squared_innovation",
                 lambda f, _: f.average_log_squared,
                 f"{self.average} of log_squared_innovation",
+                shown=AVERAGE_OF_LOG1P,
             ),
             Block(
                 "prior_share",
                 lambda f, measurement: 1.0 - measurement.variance / f.innovation_variance,
                 "1 - R/S: the filter's share of the innovation",
                 "xy",
+                SHARE,
             ),
-            Block("last_alpha", lambda f, _: f.alpha, "position gain used last"),
+            Block("last_alpha", lambda f, _: f.alpha, "position gain used last", shown=SHARE),
             *self.surroundings(),
         )
 
@@ -382,6 +395,7 @@ class FilterBank(_RadarBank):
                 lambda f, _: f.average_log_squared,
                 f"{self.average} of log_squared_innovation",
                 each,
+                AVERAGE_OF_LOG1P,
             ),
             Block(
                 "log_likelihood",
@@ -397,7 +411,9 @@ class FilterBank(_RadarBank):
                 each,
                 SIGNED_LOG,
             ),
-            Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", each),
+            Block(
+                "last_weight", lambda f, _: f.probabilities, "weight in force before this scan", each, SHARE
+            ),
             *self.surroundings(),
         )
 
@@ -515,7 +531,10 @@ class SteeredFilterBank(FilterBank):
     def blocks(self) -> Sequence[Block]:
         """What every bank shows, and the gains."""
         each = tuple(str(j + 1) for j in range(self.count))
-        return (*super().blocks, Block("last_alpha", lambda f, _: f.alpha, "position gain used last", each))
+        return (
+            *super().blocks,
+            Block("last_alpha", lambda f, _: f.alpha, "position gain used last", each, SHARE),
+        )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update every filter with its gain, ``logit alpha = logit gain + gain_logits a``, and weigh by Bayes' rule."""

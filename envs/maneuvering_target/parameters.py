@@ -4,6 +4,11 @@ from dataclasses import dataclass
 
 from ..parameters import TaskParameters, check_length, parameter, square_matrix
 
+PLOT_SLOTS = 12
+"""Plots of a scan at most, where there is clutter."""
+MOST_FALSE_PLOTS = 3.0
+"""In the window on average: one more than there are slots for then comes in one scan of 14,000."""
+
 
 @dataclass(frozen=True)
 class ManeuveringTargetParameters(TaskParameters):
@@ -50,8 +55,29 @@ class ManeuveringTargetParameters(TaskParameters):
     """That both errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
     glint_factor: float = parameter(5.0, above=0.0)
     """Their standard deviation over that of the others (ours)."""
+    coloured_sigma: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Limits of the standard deviation of coloured errors along x and y, first-order Gauss-Markov, beside the white
+    ones and in units of theirs; each episode draws its own, and nobody says so (ours; the paper: none)."""
+    coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
+    """Limits of their correlation time, s; each episode draws its own (ours)."""
+    bias: float = parameter(0.0, at_least=0.0)
+    """Constant errors along x and y, in units of the white ones' standard deviations, are drawn within this for each
+    episode, and nobody says so (ours; the paper: none)."""
+    clutter_density: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    """Limits of the density of false plots, per square kilometre; each episode draws its own. A Poisson number of them
+    lies in the window (ours; the paper: none)."""
+    clutter_window: float = parameter(3000.0, above=0.0)
+    """Where there is clutter, plots are reported within this of the position that the filter predicts, along x and y, m
+    (ours)."""
+    gate: float = parameter(16.0, above=0.0)
+    """Where there is clutter, the plot that is taken for the target's is the nearest to the predicted position, if its
+    squared distance, normalised with the covariances of prediction and plot, is below this; otherwise the scan missed
+    the target (ours)."""
+    gate_acceleration: float = parameter(3.0, at_least=0.0)
+    """Standard deviation of an acceleration that the prediction of the gate allows for, m/s^2 (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode in which every scan sees the target and none comes early, where others may (ours)."""
+    """Probability of an episode in which every scan sees the target, none comes early and no errors are coloured, where
+    others may (ours)."""
     unmodelled_acceleration: float = parameter(0.87, at_least=0.0, at_most=100.0)
     """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
     the covariance that control ``gain`` reports (ours)."""
@@ -96,8 +122,24 @@ class ManeuveringTargetParameters(TaskParameters):
 
     @property
     def regular(self) -> bool:
-        """Whether every scan sees the target and none comes early."""
-        return self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
+        """Whether every scan sees the target, and nothing else, and none comes early."""
+        on_time = self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
+        return on_time and not self.cluttered
+
+    @property
+    def cluttered(self) -> bool:
+        """Whether there are false plots."""
+        return self.clutter_density[1] > 0.0
+
+    @property
+    def coloured(self) -> bool:
+        """Whether errors may be coloured."""
+        return self.coloured_sigma[1] > 0.0
+
+    @property
+    def window_area(self) -> float:
+        """Area in which plots are reported, m^2."""
+        return (2.0 * self.clutter_window) ** 2
 
     def check(self) -> None:
         """Check what concerns several fields together."""
@@ -118,6 +160,12 @@ class ManeuveringTargetParameters(TaskParameters):
         if any(scans % self.decision_interval for scans in self.track_scans):
             raise ValueError(
                 f"track_scans must be multiples of decision_interval {self.decision_interval}, got {self.track_scans!r}"
+            )
+        most = 1e-6 * self.clutter_density[1] * self.window_area
+        if most > MOST_FALSE_PLOTS:
+            raise ValueError(
+                f"clutter_density {self.clutter_density!r} puts {most:.3g} false plots into the window on average, "
+                f"more than {MOST_FALSE_PLOTS:g}: choose a lower density, or a smaller clutter_window"
             )
         if self.flight == "track":
             if self.scan_jitter[1] > 0.0:

@@ -5,7 +5,7 @@ are legs that no training episode contains: time straight or turning (s) and tur
 flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
 learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart. In
 ``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault at a stated
-strength.
+strength; likewise in ``glint``, ``biased`` and ``clutter``, whose faults no training episode holds.
 """
 
 from collections.abc import Mapping
@@ -32,11 +32,13 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: any start, speed and course; up to three manoeuvres of any kind; in half of the "
-            "episodes scans miss the target and come early, from hardly ever to four of ten.",
+            "episodes scans miss the target and come early, from hardly ever to four of ten, and coloured errors of up "
+            "to half the deviation of the white ones are added to these.",
             {
                 "flight": "random",
                 "detection_probability": (0.6, 1.0),
                 "scan_jitter": (0.0, 0.95),
+                "coloured_sigma": (0.0, 0.5),
                 "undisturbed": 0.5,
             },
             {"start": (1, 10), "settled": (11, 100)},
@@ -101,6 +103,24 @@ SCENARIOS: Mapping[str, Scenario] = {
             "Flights as in random, every scan on time; one scan in ten has errors five times as large. No training "
             "episode holds any.",
             {"flight": "random", "glint_probability": 0.1},
+            {"start": (1, 10), "settled": (11, 100)},
+        ),
+        Scenario(
+            "biased",
+            "Flights as in random, every scan on time; a radar that is not aligned: constant errors along x and y of "
+            "up to one white sigma each. No training episode holds any.",
+            {"flight": "random", "bias": 1.0},
+            {"start": (1, 10), "settled": (11, 100)},
+        ),
+        Scenario(
+            "clutter",
+            "Flights as in random, every scan on time; scans miss the target now and then, and show false plots beside "
+            "it: 0.2 to 1.8 on average in the window of 6 km by 6 km about the track. No training episode holds any.",
+            {
+                "flight": "random",
+                "detection_probability": (0.8, 0.95),
+                "clutter_density": (0.005, 0.05),
+            },
             {"start": (1, 10), "settled": (11, 100)},
         ),
     )

@@ -19,6 +19,7 @@ from ..trajectory import Trajectory
 from . import ID
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .causes import CAUSES
+from .clutter import Track
 from .kalman_net import KalmanNetBank
 from .live import PlotInput
 from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
@@ -145,6 +146,12 @@ class ManeuveringTarget(Task):
         """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
+
+    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Track | None:
+        """Where there is clutter, the track about which the radar looks for plots."""
+        if not self.parameters.cluttered:
+            return None
+        return Track(filter.mean(state), filter.covariance(state))
 
     def _sampling_interval(self) -> float | None:
         """Return the time between scans, s; None where some miss the target, or come early."""

@@ -5,14 +5,26 @@ from typing import Any, NamedTuple
 
 from ...filters import polar
 from ..draws import Draws
-from ..faults import Outliers
+from ..faults import GaussMarkov, Outliers
 from ..filter import Initial
 from ..observation import Array
 from ..task import Task
 from ..world import World
+from .clutter import Clutter, ClutterState, Echo, Plots, Track
 from .courses import course_of
 from .parameters import ManeuveringTargetParameters
 from .scans import RegularScans, Reliability, UnreliableScans
+
+
+class ColouredErrors(NamedTuple):
+    """Errors that last from scan to scan, along x and y, in units of the white ones' standard deviations."""
+
+    deviation: Array
+    """``(N,)``."""
+    correlation_time: Array
+    """s, ``(N,)``."""
+    level: Array
+    """In this scan, ``(2, N)``."""
 
 
 class Truth(NamedTuple):
@@ -30,6 +42,12 @@ class Truth(NamedTuple):
     """None where every scan comes on time and sees the target."""
     error_factor: Array | None = None
     """Standard deviation of this scan's errors over that of usual ones, ``(N,)``; None where there is no glint."""
+    coloured: ColouredErrors | None = None
+    """None where no errors are."""
+    bias: Array | None = None
+    """Constant errors in the same units, ``(2, N)``; None where there are none."""
+    clutter: ClutterState | None = None
+    """None where there are no false plots."""
 
 
 class Odometry(NamedTuple):
@@ -42,7 +60,11 @@ class Odometry(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """What the radar says in a scan."""
+    """What the radar says in a scan.
+
+    Where there is clutter, what is said of one plot is of the nearest in the gate; a scan with none there missed the
+    target.
+    """
 
     scan: Array
     """Scans since the start of the track, ``(N,)``."""
@@ -61,6 +83,8 @@ class Measurement(NamedTuple):
     odometry: Odometry | None = None
     """What a second sensor says of the motion; None except in recordings that have one. No bank reads it, and no agent
     is shown it."""
+    plots: Plots | None = None
+    """All plots about the track; None where there is no clutter. No bank reads them, and no agent is shown them."""
 
 
 class RadarWorld(World[Task, Truth, Measurement]):
@@ -70,6 +94,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         course: what the aircraft flies.
         scans: when scans come, and which of them see it.
         glint: which of them have larger errors.
+        clutter: false plots beside that of the target.
     """
 
     own_parameters = ("flight", "track", "track_scans")
@@ -85,7 +110,10 @@ class RadarWorld(World[Task, Truth, Measurement]):
         self.course = course_of(task)
         self.scans = (RegularScans if p.regular else UnreliableScans)(task, self.course)
         self.glint = Outliers(p.glint_probability, p.glint_factor)
-        self.row_uniforms = self.scans.row_uniforms + self.glint.row_uniforms
+        self.clutter = Clutter(task)
+        if p.coloured:
+            self.initial_normals, self.normals = 6, 4
+        self.row_uniforms = self.scans.row_uniforms + self.glint.row_uniforms + self.clutter.row_uniforms
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""
@@ -94,20 +122,33 @@ class RadarWorld(World[Task, Truth, Measurement]):
         flight, (position, velocity) = self.course.begin(draws, ones)
         sigma = xp.sqrt(self._variances(position))
         start = position + sigma * normals[:2]
-        start_velocity = velocity + (math.sqrt(2.0) / p.sampling_interval) * sigma * normals[2:]
+        start_velocity = velocity + (math.sqrt(2.0) / p.sampling_interval) * sigma * normals[2:4]
         # The start is a measurement too: its variance is evaluated where it puts the target.
         variance = self._variances(start)
         diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
         factor = ones if p.glint_probability else None
-        truth = Truth(0.0 * ones, position, velocity, flight, scans, factor)
+        coloured = self._begin_coloured(draws, normals[4:]) if p.coloured else None
+        bias = draws.uniform("bias", (-p.bias, p.bias), 2) if p.bias else None
+        clutter = self.clutter.begin(draws, position)
+        truth = Truth(0.0 * ones, position, velocity, flight, scans, factor, coloured, bias, clutter)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 
-    def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Fly one scan and measure."""
+    def _begin_coloured(self, draws: Draws, normals: Array) -> ColouredErrors:
+        """Draw how large coloured errors are and how long they last; they are stationary from the start."""
+        p = self.parameters
+        deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
+        if p.undisturbed:
+            drawn = draws.drawn.get("undisturbed")
+            calm = draws.event("undisturbed", p.undisturbed) if drawn is None else drawn
+            deviation = self.xp.where(calm, 0.0, deviation)
+        return ColouredErrors(deviation, draws.uniform("coloured_time", p.coloured_time), deviation * normals)
+
+    def advance(self, truth: Truth, noise: Array, feedback: Track | None) -> tuple[Truth, Measurement]:
+        """Fly one scan and measure; in clutter, about the track of the filter."""
         p, number, flight = self.parameters, truth.scan + 1.0, truth.flight
-        errors, uniforms = noise[: self.normals], noise[self.normals :]
+        errors, uniforms = noise[:2], noise[self.normals :]
         before, glint = (truth.position, truth.velocity), uniforms[self.scans.row_uniforms :]
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
@@ -115,15 +156,34 @@ class RadarWorld(World[Task, Truth, Measurement]):
         if p.glint_probability:
             factor = self.glint.amplify(self.xp.ones_like(number), glint, self.xp)
             errors = factor * errors
+        coloured = truth.coloured
+        if coloured is not None:
+            process = GaussMarkov.sampled(
+                coloured.deviation, coloured.correlation_time, scan.interval, self.xp
+            )
+            coloured = coloured._replace(level=process.advance(coloured.level, noise[2 : self.normals]))
+            errors = errors + coloured.level
+        if truth.bias is not None:
+            errors = errors + truth.bias
         measured = self._measure(position, errors)
         variance = self._variances(measured)
         if not p.regular:
             seen = available > 0.0
             measured = self.xp.where(seen, measured, 0.0)
             variance = self.xp.where(seen, variance, p.range_sigma**2)
+        clutter, plots, elapsed = truth.clutter, None, scan.elapsed
+        if clutter is not None:
+            assert feedback is not None
+            clutter, plots, (measured, variance, available, elapsed) = self.clutter.advance(
+                clutter,
+                feedback,
+                Echo(measured, available),
+                scan.interval,
+                uniforms[uniforms.shape[0] - self.clutter.row_uniforms :],
+            )
         return (
-            Truth(number, position, velocity, flight, scans, factor),
-            Measurement(number, measured, variance, available, scan.interval, scan.elapsed),
+            Truth(number, position, velocity, flight, scans, factor, coloured, truth.bias, clutter),
+            Measurement(number, measured, variance, available, scan.interval, elapsed, plots=plots),
         )
 
     def _variances(self, position: Array) -> Array:
@@ -142,6 +202,15 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
+
+    def mask_missing(self, measurement: Measurement) -> Measurement:
+        """Replace what was not received, of all plots too."""
+        masked = super().mask_missing(measurement)
+        if masked.plots is None:
+            return masked
+        plots = masked.plots
+        position = self.xp.where(plots.available > 0.0, plots.position, math.nan)
+        return masked._replace(plots=plots._replace(position=position))
 
     def add_recorded_fields(self, measurement: Measurement) -> Measurement:
         """Add the odometry, which is not simulated."""
@@ -163,10 +232,17 @@ class RadarWorld(World[Task, Truth, Measurement]):
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """In clutter, whether the plot that the filter was given is false."""
+        return {} if truth.clutter is None else {"false_association": truth.clutter.false_association}
+
     def context(self, truth: Truth) -> dict[str, Array]:
         """What course and scans tell of themselves."""
         time = self.scans.time(truth.scans, truth.scan)
         return {
             **self.course.context(truth.flight, truth.scan, time),
             **self.scans.context(truth.scans),
+            **({} if truth.coloured is None else {"coloured_sigma": truth.coloured.deviation}),
+            **({} if truth.bias is None else {"bias": truth.bias}),
+            **self.clutter.context(truth.clutter),
         }

@@ -1,0 +1,82 @@
+"""Estimators of ManeuveringTarget that take all plots of a scan in, where there is clutter.
+
+Equations: ``filters/data_association.py``. Without clutter each is the estimator that it is made of.
+"""
+
+import math
+
+from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.world import Measurement, Plots
+from ...envs.observation import Array
+from ...evaluation.competitors import Likelihood
+from ...filters import data_association, kalman
+from ...filters.ordered_sums import ordered_sum
+from ...filters.semi_markov import Hypotheses
+from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
+from .semi_markov import SemiMarkov
+
+
+class AllPlots(KalmanModel):
+    """Probabilistic data association in place of the nearest plot.
+
+    The density of false plots is not known; it is taken to be that of the plots of the scan (nonparametric; Bar-Shalom
+    and Fortmann 1988, section 6.4).
+    """
+
+    detection_probability = 0.9
+
+    def density(self, plots: Plots) -> Array:
+        """Plots of the scan over the area of the window, at least of one, 1/m^2, ``(N,)``."""
+        parameters: ManeuveringTargetParameters = self.task.parameters
+        count = ordered_sum(plots.available[i] for i in range(plots.available.shape[0]))
+        return self.xp.clip(count, 1.0, None) / parameters.window_area
+
+    def update_estimate(
+        self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
+    ) -> kalman.Update:
+        """Update with all plots; where a measurement holds one, with that."""
+        plots = measurement.plots
+        if plots is None:
+            return super().update_estimate(predicted, measurement, H)
+        density = self.density(plots)
+        return data_association.update_position(*predicted, *plots, self.detection_probability, density)
+
+    def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
+        """Tell how well one plot was predicted, nothing of several: densities of different numbers of plots cannot be
+        compared.
+        """
+        if measurement.plots is None:
+            return super().likelihood(measurement, log_likelihood, nis)
+        return Likelihood(math.nan + 0.0 * log_likelihood)
+
+
+class ProbabilisticDataAssociation(AllPlots, ConstantVelocity):
+    """One Kalman filter of constant velocity that weighs all plots of a scan (Bar-Shalom and Tse 1975).
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
+    """
+
+    def __init__(self, task: ManeuveringTarget, acceleration: float = 3.0) -> None:
+        super().__init__(task, acceleration)
+
+
+class InteractingMultipleModelDataAssociation(AllPlots, KalmanInteractingMultipleModel):
+    """The usual IMM over two Kalman filters of constant velocity, each of which weighs all plots of a scan."""
+
+
+class SemiMarkovDataAssociation(AllPlots, SemiMarkov):
+    """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
+
+    def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:
+        """Update every hypothesis with all plots; where a measurement holds one, with that."""
+        plots = measurement.plots
+        if plots is None:
+            return super().update_table(table, measurement)
+        each = Plots(plots.position[:, :, None], plots.variance[:, :, None], plots.available[:, None])
+        density = self.density(plots)
+        return data_association.update_position(
+            table.mean, table.covariance, *each, self.detection_probability, density
+        )

@@ -1,0 +1,157 @@
+"""Clutter of ManeuveringTarget: false plots about a track, and the plot that a filter takes for the target's.
+
+False plots are a Poisson field over the whole plane, new in every scan. A tracker looks at a window about where it
+expects the target, so the plots of a scan are those in the window of the filter that is run: uniform, whatever the
+target does, and nothing tells which is whose. That closes a loop: the filter says what it estimates, and the radar
+answers with the plots about it. The same random numbers make false plots at the same places of every filter's window.
+
+Filters that take one plot are given the nearest to their prediction, as a front end of any tracker does it; the rule is
+the same for all: their own estimate and covariance, carried on at constant velocity.
+"""
+
+import math
+from typing import NamedTuple
+
+from ...filters import data_association, polar
+from ..draws import Draws
+from ..observation import Array
+from ..task import Task
+from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
+
+
+class Track(NamedTuple):
+    """What a filter tells the radar, to be answered with plots about it."""
+
+    mean: Array
+    """Position and velocity after the scan before, ``(4, N)``."""
+    covariance: Array
+    """``(4, 4, N)``."""
+
+
+class Plots(NamedTuple):
+    """All plots of a scan in the window of a track, in random order."""
+
+    position: Array
+    """x and y, m, ``(2, K, N)``; zero where there is none, where an estimator gets NaN."""
+    variance: Array
+    """Variances of their errors, evaluated at the plots, m^2, ``(2, K, N)``."""
+    available: Array
+    """1 where there is a plot, 0 where not, ``(K, N)``."""
+
+
+class Echo(NamedTuple):
+    """The plot of the target itself, which no competitor is told."""
+
+    position: Array
+    """m, ``(2, N)``."""
+    available: Array
+    """1 if the scan saw the target, ``(N,)``."""
+
+
+class ClutterState(NamedTuple):
+    """What is true of the plots."""
+
+    density: Array
+    """False plots per square metre, ``(N,)``."""
+    unseen: Array
+    """s since the last scan with a plot in the gate, zero if that is the current one, ``(N,)``."""
+    echo: Echo
+    false_association: Array
+    """1 if the plot in the gate is not the target's, ``(N,)``."""
+
+
+class Clutter:
+    """False plots, uniform in a window about the track.
+
+    Args:
+        task: with density, window and gate.
+
+    Attributes:
+        row_uniforms: uniform numbers that a scan takes: place of each plot, their count, and which is the target's.
+    """
+
+    parameters: ManeuveringTargetParameters
+
+    def __init__(self, task: Task) -> None:
+        self.parameters, self.xp = task.parameters, task.xp
+        self.row_uniforms = 2 * PLOT_SLOTS + 2 if self.parameters.cluttered else 0
+
+    def begin(self, draws: Draws, position: Array) -> ClutterState | None:
+        """Draw the density, which the parameters give per square kilometre."""
+        if not self.parameters.cluttered:
+            return None
+        density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
+        return ClutterState(density, 0.0 * density, Echo(position, 0.0 * density), 0.0 * density)
+
+    def count(self, uniform: Array, density: Array) -> Array:
+        """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
+        distribution, ``(N,)``.
+        """
+        mean = density * self.parameters.window_area
+        term = self.xp.exp(-mean)
+        cumulative, count = term, 0.0 * mean
+        for i in range(1, PLOT_SLOTS):
+            count = count + self.xp.astype(uniform >= cumulative, count.dtype)
+            term = term * mean / float(i)
+            cumulative = cumulative + term
+        return count
+
+    def advance(
+        self, state: ClutterState, track: Track, echo: Echo, interval: Array, uniforms: Array
+    ) -> tuple[ClutterState, Plots, tuple[Array, Array, Array, Array]]:
+        """Put false plots beside that of the target, and associate one with the track.
+
+        Args:
+            state: at the scan before.
+            track: of the filter, after the scan before.
+            echo: plot of the target.
+            interval: s since the scan before, ``(N,)``.
+            uniforms: ``(row_uniforms, N)``.
+
+        Returns:
+            The state, the plots, and of the one that is nearest position, variance, whether there is one, and seconds
+            since there was one before.
+        """
+        xp, p = self.xp, self.parameters
+        elapsed = state.unseen + interval
+        centre, covariance = self.predict(track, interval, elapsed)
+        offset = xp.abs(echo.position - centre)
+        inside = (offset[0] < p.clutter_window) & (offset[1] < p.clutter_window)
+        seen = xp.where(inside, echo.available, 0.0)
+        total = self.count(uniforms[0], state.density) + seen
+        place = xp.where(seen > 0.0, xp.floor(uniforms[1] * total), -1.0)
+        rows = uniforms[2:]
+        places = xp.stack([rows[:PLOT_SLOTS], rows[PLOT_SLOTS:]])
+        false = centre[:, None] + p.clutter_window * (2.0 * places - 1.0)
+        slots = range(PLOT_SLOTS)
+        positions = xp.stack([xp.where(place == float(i), echo.position, false[:, i]) for i in slots], axis=1)
+        there = xp.stack([xp.astype(float(i) < total, total.dtype) for i in slots])
+        positions = xp.where(there > 0.0, positions, 0.0)
+        variances = polar.cartesian_variances(positions, p.range_sigma, math.radians(p.bearing_sigma))
+        variances = xp.where(there > 0.0, variances, p.range_sigma**2)
+        distances = data_association.squared_distances(centre, covariance, positions, variances)
+        picked, found = data_association.nearest_neighbour(distances, there, p.gate)
+        position, variance, own = 0.0 * centre, 0.0 * centre, 0.0 * total
+        for i in slots:
+            position = position + picked[i] * positions[:, i]
+            variance = variance + picked[i] * variances[:, i]
+            own = own + xp.where(place == float(i), picked[i], 0.0)
+        variance = xp.where(found, variance, p.range_sigma**2)
+        available = xp.astype(found, total.dtype)
+        state = ClutterState(state.density, (1.0 - available) * elapsed, echo, available - own)
+        return state, Plots(positions, variances, there), (position, variance, available, elapsed)
+
+    def predict(self, track: Track, interval: Array, elapsed: Array) -> tuple[Array, Array]:
+        """Position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant velocity, but for an
+        acceleration of ``gate_acceleration`` since the last plot.
+        """
+        P, T = track.covariance, interval
+        centre = track.mean[:2] + T * track.mean[2:]
+        carried = P[:2, :2] + T * (P[:2, 2:] + P[2:, :2]) + T**2 * P[2:, 2:]
+        left = (0.5 * elapsed**2 * self.parameters.gate_acceleration) ** 2
+        identity = self.xp.eye(2, dtype=P.dtype, device=P.device)[:, :, None]
+        return centre, carried + left * identity
+
+    def context(self, state: ClutterState | None) -> dict[str, Array]:
+        """False plots per square kilometre."""
+        return {} if state is None else {"clutter_density": 1e6 * state.density}
