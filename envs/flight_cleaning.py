@@ -42,6 +42,10 @@ CLEANING_COUNTS: dict[str, Any] = {
 """What is counted while a flight is cleaned, and how it is told."""
 
 
+LANDED = 1800.0
+"""s; after a longer gap an aircraft flies another flight."""
+
+
 def clean_flight(
     name: str, rows: "pandas.DataFrame", limits: Cleaning
 ) -> tuple[list[Trajectory], dict[str, int]]:
@@ -96,13 +100,16 @@ def clean_flight(
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     long = [part for part in parts if part.stop - part.start > 1]
+    begins = [True, *(time[b.start] - time[a.stop - 1] > LANDED for a, b in itertools.pairwise(long))]
+    flights = numpy.cumsum(begins).tolist()
     pieces = []
-    for number, part in enumerate(long, 1):
+    for number, (part, flight) in enumerate(zip(long, flights, strict=True), 1):
         flown, moving = position[part], None if velocity is None else velocity[part]
         if limits.smoothing and len(flown) >= FEWEST_IN_WINDOW:
             flown, moving = fit_parabolas(time[part], flown, limits.smoothing)
         own = name if len(parts) == 1 else f"{name} {number}/{len(long)}"
-        pieces.append(Trajectory(time[part], flown, moving, own, name))
+        whole = name if flights[-1] == 1 else f"{name} flight {flight}"
+        pieces.append(Trajectory(time[part], flown, moving, own, whole))
     return pieces, counts
 
 

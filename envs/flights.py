@@ -199,20 +199,27 @@ TRAFFIC = "traffic:"
 """Before the name of a sample of the Python package ``traffic``."""
 
 
-def _traffic_sample(name: str) -> Path:
-    """File of a sample in the package ``traffic``, which is installed but not imported: it would bring a long chain of
-    libraries, and the samples are JSON.
+def traffic_samples() -> dict[str, Path]:
+    """Files of the samples in the package ``traffic`` by their names; none where it is not installed.
 
-    Raises:
-        ValueError: if there is no such sample, or no such package.
+    It is not imported: that would bring a long chain of libraries, and the samples are JSON.
     """
     found = importlib.util.find_spec("traffic")
     folders = list(found.submodule_search_locations or ()) if found else []
-    samples = {
+    return {
         file.name.removesuffix(".json.gz"): file
         for folder in folders
         for file in sorted(Path(folder, "data", "samples").glob("*/*.json.gz"))
     }
+
+
+def _traffic_sample(name: str) -> Path:
+    """File of a sample in the package ``traffic``.
+
+    Raises:
+        ValueError: if there is no such sample, or no such package.
+    """
+    samples = traffic_samples()
     if not samples:
         raise ValueError(
             f"scenario {TRAFFIC + name!r} is in the Python package traffic, which is not installed; its samples need "

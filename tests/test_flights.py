@@ -658,3 +658,11 @@ def test_site_without_flights_is_refused(monkeypatch, capsys):
         main()
     assert end.value.code == 2
     assert "--site is for flights from files" in capsys.readouterr().err
+
+
+def test_an_aircraft_that_has_landed_flies_another_flight(tmp_path):
+    # Gaps of two minutes, and of an hour.
+    time = np.concatenate([FIVE, 320.0 + FIVE, 4100.0 + FIVE])
+    found = read_flights(flight_file(tmp_path / "day.csv", time)).trajectories
+    assert [piece.name for piece in found] == ["day 1/3", "day 2/3", "day 3/3"]
+    assert [piece.flight for piece in found] == ["day flight 1", "day flight 1", "day flight 2"]

@@ -1,0 +1,147 @@
+"""Every set of real flights at hand, raw and smoothed: which competitors carry over from simulated ones.
+
+    pip install --no-deps traffic
+    python benchmarks/flights.py --out docs/data/flights.csv
+
+The sets are samples of ADS-B flights in the Python package ``traffic``, which is read, not imported. A sample of at
+least ``FEWEST`` flights is a set of its own; what else lies in its folder is another one if that has as many, and the
+rest together is "others". Each sample has its radar in the median of its positions, the radar's noise is simulated,
+and scans are 6 s apart. Samples whose positions are more than ``COARSEST`` seconds apart are left out, as are those on
+the ground and those whose errors are the point of them.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy
+import pandas
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.flights import TRAFFIC, Flights, flight_of, read_flights, traffic_samples
+
+from filtergym.names import competitors_of, tidy_records
+
+ID = "filtergym/ManeuveringTarget-v0"
+FEWEST, COARSEST, INTERVAL, SMOOTHING = 20, 10.0, 6.0, 10.0
+MOST_SCANS = 90_000
+"""Of a set: of a larger one every second flight is flown, or every third, ..."""
+LEFT_OUT = ("noisy", "onground")
+"""Folders of what is no flight in the air, or wrong on purpose."""
+COMPETITORS = (
+    "imm",
+    "semi-markov",
+    "semi-markov-vague",
+    "semi-markov-vague-tuned",
+    "kalman-imm-turn",
+    "kalman-imm-turn-tuned",
+    "kalman-imm-tuned",
+    "imm-tuned",
+    "adaptive-rearm-tuned",
+    "kalman-net",
+    "bptt",
+    "ppo",
+)
+METRICS = {
+    "relative_cost_difference": ("cost", 100.0),
+    "median_cost_ratio": ("median", 100.0),
+    "win_rate": ("wins", 100.0),
+    "anees": ("anees", 1.0),
+}
+"""Records that are kept, their columns and their unit in the table."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, help="table of all figures, CSV")
+    parser.add_argument("--policy", action="append", help="default: the strongest of every kind")
+    asked = parser.parse_args()
+    problem = problem_of(ID)
+    competitors = competitors_of(problem, asked.policy or COMPETITORS)
+    rows = []
+    for smoothing in (SMOOTHING, 0.0):
+        for name, flights in sets(smoothing).items():
+            pieces, _ = flights.flyable(INTERVAL, numpy.inf)
+            data = problem.evaluate(
+                competitors, flights, episodes=len(pieces), seed=1, sampling_interval=INTERVAL
+            )
+            own = {
+                "set": name,
+                "smoothing": smoothing,
+                "flights": len({flight_of(piece) for piece in pieces}),
+                "pieces": len(pieces),
+                "hours": round(sum(piece.time[-1] - piece.time[0] for piece in pieces) / 3600.0, 1),
+            }
+            rows += _rows(own, tidy_records(data))
+            print(f"{name}, smoothed over {smoothing:g} s: {own['flights']} flights", flush=True)
+    table = pandas.DataFrame(rows)
+    if asked.out:
+        table.to_csv(asked.out, index=False, lineterminator="\n", float_format="%.4g")
+    print_tables(table)
+
+
+def sets(smoothing: float) -> dict[str, Flights]:
+    """Return the sets of flights by their names, the largest first."""
+    own: dict[str, list] = {}
+    rest: dict[str, list] = {}
+    for name, file in traffic_samples().items():
+        folder = file.parent.name
+        if folder in LEFT_OUT:
+            continue
+        try:
+            found = read_flights(TRAFFIC + name, smoothing=smoothing).trajectories
+        except ValueError as error:
+            print(f"left out: {error}", flush=True)
+            continue
+        if numpy.median(numpy.concatenate([numpy.diff(piece.time) for piece in found])) > COARSEST:
+            continue
+        if len({flight_of(piece) for piece in found}) < FEWEST:
+            rest.setdefault(folder, []).extend(found)
+        else:
+            own[name] = found
+    for folder, pieces in rest.items():
+        enough = len({*map(flight_of, pieces)}) >= FEWEST
+        own.setdefault(folder if enough else "others", []).extend(pieces)
+    ordered = sorted(own, key=lambda name: -len(own[name]))
+    return {name: Flights(tuple(_every(own[name])), name) for name in ordered}
+
+
+def _every(pieces: list) -> list:
+    """Pieces of a set, or every second, third, ... of a set that is too long for one scenario."""
+    scans = sum(piece.intervals(INTERVAL) for piece in pieces)
+    return pieces[:: 1 + int(scans // MOST_SCANS)]
+
+
+def _rows(own: dict, records: list) -> list[dict]:
+    """Return one row for each competitor."""
+    found: dict[str, dict] = {}
+    for record in records:
+        if record.metric in METRICS and record.window == "all" and record.component in ("", "state"):
+            column, unit = METRICS[record.metric]
+            row = found.setdefault(record.policy, {**own, "policy": record.policy})
+            row[column] = unit * record.value
+            if column == "cost":
+                row["low"], row["high"] = unit * record.low, unit * record.high
+    return list(found.values())
+
+
+def print_tables(table: pandas.DataFrame) -> None:
+    """Print the cost of every competitor against the paper's: mean, interval and median, %."""
+    for smoothing, part in table.groupby("smoothing", sort=False):
+        print(f"\nSmoothed over {smoothing:g} s:\n" if smoothing else "\nAs recorded:\n")
+        cells = zip(part.cost, part.low, part.high, part["median"], strict=True)
+        text = part.assign(
+            cell=[
+                f"{cost:+.1f} [{low:.1f}, {high:.1f}], {median - 100:+.0f}"
+                for cost, low, high, median in cells
+            ],
+            heading=part["set"] + ", " + part.flights.astype(str) + " flights",
+        )
+        wide = text.pivot(index="policy", columns="heading", values="cell")
+        order = part.groupby("policy").cost.mean().sort_values().index
+        wide = wide.loc[order, list(dict.fromkeys(text.heading))]
+        print(" | ".join(["| competitor", *wide.columns]) + " |\n|---" + "|---:" * wide.shape[1] + "|")
+        for name, cells in wide.iterrows():
+            print(" | ".join([f"| `{name}`", *cells]) + " |")
+
+
+if __name__ == "__main__":
+    main()
