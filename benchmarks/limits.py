@@ -1,57 +1,138 @@
-"""Whether a reference is a limit: no competitor may cost significantly less, in any scenario.
+"""Whether references are limits: no competitor may cost significantly less, in any scenario.
 
-``python benchmarks/limits.py ENVIRONMENT`` runs the ranked competitors and the reference of an environment over the
-same episodes and prints, for each scenario, who comes nearest: the mean paired difference of the cost to the
-reference's, in standard errors over the episodes. It ends with status 1 where one is below -``SIGNIFICANT``.
+``python benchmarks/limits.py [ENVIRONMENT ...]`` runs all that is ranked, each under its own control, and the reference
+over the same episodes, a block at a time, and prints for each scenario who costs least, and the mean paired difference
+of its cost to the reference's, in standard errors over the episodes. It ends with status 1 where anybody's is below
+-``SIGNIFICANT``.
 """
 
 import argparse
 import sys
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy
-from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import problem_of
+import xarray
+from filtergym.baselines.problem import Problem, problem_of
+from filtergym.envs.catalogue import catalogue
+from filtergym.evaluation.metrics import mean_over_time
+from filtergym.evaluation.statistics import ALL, Statistic
+from filtergym.evaluation.summary import reduce_episodes
+from filtergym.papers.grid import markdown_table
 
-from filtergym.names import competitors_of
+from filtergym.names import evaluation_requests
+from filtergym.reports.benchmark import affordable_episodes, ranked_names
 
 SIGNIFICANT = 3.0
 """Standard errors; of a few hundred comparisons, one in a thousand lies beyond by chance."""
 
 
+class Nearest(NamedTuple):
+    """How the competitors of a scenario stand to the reference."""
+
+    environment: str
+    scenario: str
+    reference: str
+    episodes: int
+    name: str
+    """Of the competitor that costs least."""
+    relative: float
+    """Its cost over the reference's, less one."""
+    errors: float
+    """Its difference in standard errors."""
+    below: list[str]
+    """Names of those that cost significantly less than the reference."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether the reference is a limit, in words."""
+        return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
+
+
+def episode_costs(
+    problem: Problem, scenario: str, names: Sequence[str], episodes: int, seed: int
+) -> dict[str, numpy.ndarray]:
+    """Return the mean cost of every episode by name, of the same episodes."""
+
+    def declare(run: xarray.Dataset) -> Iterator[Statistic]:
+        yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+
+    experiment = problem.experiment(scenario, episodes, seed)
+    asked = evaluation_requests(problem, experiment, names)
+    return {
+        one.name: reduce_episodes(one, declare, lambda done: None).reduction.results()["cost",]
+        for one in asked
+    }
+
+
+def nearest(
+    problem: Problem, scenario: str, episodes: int, seed: int = 1, names: Sequence[str] = ()
+) -> Nearest:
+    """Compare competitors with the reference in a scenario.
+
+    Args:
+        problem: the environment.
+        scenario: its name.
+        episodes: of each competitor.
+        seed: number of the experiment.
+        names: of competitors; none: all that is ranked.
+    """
+    reference = problem.baselines.score_reference
+    costs = episode_costs(problem, scenario, [*(names or ranked_names(problem)), reference], episodes, seed)
+    told = costs.pop(reference)
+    differences = {name: own - told for name, own in costs.items()}
+    errors = {
+        # Where every episode is the same as the reference's, there is no difference in units of anything.
+        name: float(d.mean() / max(d.std(ddof=1) / numpy.sqrt(episodes), 1e-12 * told.mean()))
+        for name, d in differences.items()
+    }
+    name = min(costs, key=lambda each: costs[each].mean())
+    below = [name for name, value in errors.items() if value < -SIGNIFICANT]
+    relative = float(costs[name].mean() / told.mean()) - 1.0
+    return Nearest(problem.id, scenario, reference, episodes, name, relative, errors[name], below)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("environment")
-    parser.add_argument("--episodes", type=int, default=2000)
+    parser.add_argument("environment", nargs="*", help="default: all")
+    parser.add_argument(
+        "--episodes", type=int, default=2000, help="of each competitor; fewer where a measurement is dear"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--policy", action="append", help="default: everything that is ranked")
     asked = parser.parse_args()
-    problem = problem_of(asked.environment)
-    known = problem.baselines
-    everything = [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
-    names, reference = asked.policy or everything, known.score_reference
-    beaten = False
-    for scenario in problem.task.scenarios:
-        data = problem.evaluate(
-            competitors_of(problem, [*names, reference]),
-            scenario,
-            episodes=asked.episodes,
-            seed=asked.seed,
-        )
-        cost = data["cost"].mean("time")
-        difference = cost.sel(policy=names) - cost.sel(policy=reference)
-        t = difference.mean("episode") / (difference.std("episode", ddof=1) / numpy.sqrt(asked.episodes))
-        nearest = t.argmin("policy")
-        name, ratio = names[int(nearest)], cost.mean("episode")
-        relative = float(ratio.sel(policy=name) / ratio.sel(policy=reference)) - 1.0
-        below = [name for name, value in zip(names, t.values, strict=True) if value < -SIGNIFICANT]
-        beaten = beaten or bool(below)
-        verdict = f"beaten by {', '.join(below)}" if below else "a limit"
-        print(
-            f"{scenario:20s} {reference}: {verdict}; nearest {name}, {100 * relative:+.1f} % of its cost, "
-            f"{float(t[nearest]):+.1f} standard errors",
-            flush=True,
-        )
-    sys.exit(int(beaten))
+    found = []
+    for id in asked.environment or catalogue():
+        problem = problem_of(id)
+        for scenario in problem.task.scenarios:
+            episodes = affordable_episodes(problem, scenario, asked.episodes)
+            found.append(nearest(problem, scenario, episodes, asked.seed, asked.policy or ()))
+            print(f"{id} {scenario}: {found[-1].verdict}", file=sys.stderr, flush=True)
+    header = [
+        "environment",
+        "scenario",
+        "episodes",
+        "reference",
+        "nearest",
+        "its cost, %",
+        "standard errors",
+        "verdict",
+    ]
+    rows = [
+        [
+            each.environment.rpartition("/")[2].removesuffix("-v0"),
+            each.scenario,
+            str(each.episodes),
+            f"`{each.reference}`",
+            f"`{each.name}`",
+            f"{100.0 * each.relative:+.1f}",
+            f"{each.errors:+.1f}",
+            each.verdict,
+        ]
+        for each in found
+    ]
+    print("\n".join(markdown_table(header, rows)))
+    sys.exit(int(any(each.below for each in found)))
 
 
 if __name__ == "__main__":

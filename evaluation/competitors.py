@@ -9,8 +9,10 @@ that may be told what no competitor knows; it is never ranked. A **bound** is co
 Stable-Baselines3.
 """
 
+import functools
 import inspect
 import math
+import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
@@ -147,6 +149,13 @@ class Policy:
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Answer a batch; ``start`` is true where memory must begin anew."""
         raise NotImplementedError
+
+
+def compilation_key(maker: Any) -> Any:
+    """Return what code compiled of a competitor is kept by: what makes it, or of a function, which may make another one
+    next time, an object of this call's own.
+    """
+    return functools.partial(maker) if isinstance(maker, types.FunctionType) else maker
 
 
 def says_traceable(policy: Any) -> bool:

@@ -27,6 +27,7 @@ from .metrics import (
 )
 from .statistics import ALL, Key, Statistic, reduce_run
 from .threads import one_thread
+from .times import COORDINATES
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
@@ -76,10 +77,11 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           that of the paper's algorithm and of the best that is ranked, paired, with ``_low`` and ``_high``.
 
         Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
-        256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every
-        quantity (the groups of components where there are any, else the first three components), ``elapsed`` (s) of
-        every measurement, where they come regularly, and windows as the dataset has them. Attributes environment,
-        scenario, split, seed, episodes, paper, reference, cost, truth and recorded.
+        256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``nanoseconds`` and
+        ``compiled`` if the evaluation was timed, ``unit`` of every quantity (the groups of components where there are
+        any, else the first three components), ``elapsed`` (s) of every measurement, where they come regularly, and
+        windows as the dataset has them. Attributes environment, scenario, split, seed, episodes, paper, reference,
+        cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
     declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)
@@ -212,7 +214,7 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
     variables |= differences
     coords: dict[str, Any] = {
         name: dataset[name].variable
-        for name in ("policy", "kind", "control", "time", "elapsed")
+        for name in ("policy", "kind", "control", *COORDINATES, "time", "elapsed")
         if name in dataset.coords
     }
     if dataset.attrs["truth"]:

@@ -29,10 +29,11 @@ from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .innovations import with_innovations
 from .parallel import Workers, check_workers
-from .rollout import More, Progress, run_episodes
+from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
+from .times import with_times
 
 if TYPE_CHECKING:
     import xarray
@@ -172,6 +173,7 @@ def _report(model: Model, tracks: bool) -> Report:
 
 OPTIONS = (
     "scenario", "episodes", "seed", "split", "control", "tracks", "drawn_episodes", "backend", "threads", "strict",
+    "timed",
 )  # fmt: skip
 """Fields of an experiment that a user names side by side with parameters of the task."""
 
@@ -211,6 +213,9 @@ class Experiment:
     """How many share the episodes, of the compiled backend."""
     strict: bool = False
     """Raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`."""
+    timed: bool = False
+    """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: of all that is
+    kept the one thing that differs from run to run."""
     keywords: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the task."""
 
@@ -259,8 +264,9 @@ def run_experiment(
         action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
         :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component,
         ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
-        number), ``window_first`` and ``window_last`` of every window, and ``elapsed``, seconds since the start of the
-        track, where measurements come regularly. Of a set of flights ``flight`` and ``length`` say which each episode
+        number), ``nanoseconds`` and ``compiled`` of every policy where the experiment is timed, ``window_first`` and
+        ``window_last`` of every window, and ``elapsed``, seconds since the start of the track, where measurements come
+        regularly. Of a set of flights ``flight`` and ``length`` say which each episode
         flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
         recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
         ``error``, ``cost``, ``charge`` nor ``nees``, and where some of it is not known, errors of that are NaN,
@@ -288,7 +294,10 @@ def run_experiment(
     for i, name in enumerate(competitors):
         per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
         chunks[i * count : (i + 1) * count] = [None] * count
-    return plan.dataset(per_policy, plan.seeds)
+    dataset = plan.dataset(per_policy, plan.seeds)
+    if experiment.timed:
+        return with_times(dataset, [plan.time(name) for name in competitors])
+    return dataset
 
 
 class Piece(NamedTuple):
@@ -414,6 +423,10 @@ class Plan(NamedTuple):
             model.task.horizon,
             model if here else None,
         )
+
+    def time(self, name: str) -> ProcessorTime | None:
+        """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
+        return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def dataset(
         self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]

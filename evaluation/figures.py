@@ -14,6 +14,7 @@ import xarray
 
 from .curves import stretches_of
 from .dataset import windows_of, with_windows
+from .front_figure import draw_front, points_of_curves
 from .looks import GREY, distinguish_lines, group_equal_lines, join_names, looks, styles
 from .print_layout import (
     add_title,
@@ -440,6 +441,8 @@ def evaluation_figures(
         yield "error_distribution", draw_error_distribution(curves, look, columns=columns)
     if {"cost_minus_paper", "cost_minus_best"} & set(curves.data_vars):
         yield "cost_difference", draw_cost_difference(curves, look, columns=columns)
+    if points_of_curves(curves):
+        yield "cost_and_time", draw_front(curves, learned, columns=columns)
     if {"anees", "anis"} & set(curves.data_vars):
         yield "consistency", draw_consistency(curves, look, columns=columns)
     if "true_class_probability" in curves:

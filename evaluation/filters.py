@@ -4,9 +4,7 @@ What says that it is ``traceable`` is compiled like a bank. The rest runs as Pyt
 world, and keeps its memory to itself: it may be anything.
 """
 
-import functools
 import math
-import types
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,7 +20,7 @@ from ..envs.model import Model
 from ..envs.observation import Array
 from ..envs.task import Task, named_arrays
 from ..filters.small_matrices import cholesky
-from .competitors import Kind, Likelihood, check_competitor, make_competitor
+from .competitors import Kind, Likelihood, check_competitor, compilation_key, make_competitor
 from .dataset import FAULTS
 
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
@@ -408,10 +406,8 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
         own = make_competitor(competitor, model.task)
     check_competitor(name, own, kind)
     if _can_be_traced(competitor, own):
-        # A function may make another one next time: what is compiled is kept by an object of this call's own.
-        maker = functools.partial(competitor) if isinstance(competitor, types.FunctionType) else competitor
         try:
-            return model.with_filter(_Maker(kind, maker))
+            return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
             warn_of(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None))

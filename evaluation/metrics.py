@@ -19,6 +19,7 @@ from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices
 from .predictions import correlation, stretch_interval
 from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
 from .threads import one_thread
+from .times import COMPILED, IN_PYTHON, METRIC, time_of
 
 if TYPE_CHECKING:
     import xarray
@@ -391,8 +392,10 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
     ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
-    ``lost_episodes`` of estimators (share). Without truth what needs it is left out. Of a recording with tracks
-    ``prediction_error`` and ``innovation_correlation``, whose intervals are over stretches of measurements.
+    ``lost_episodes`` of estimators (share). Where the evaluation was timed ``nanoseconds``, processor time of a
+    measurement, whose component says whether it is ``compiled`` code's or ``python``'s. Without truth what needs it is
+    left out. Of a recording with tracks ``prediction_error`` and ``innovation_correlation``, whose intervals are over
+    stretches of measurements.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -437,6 +440,9 @@ def contender_of(
     if ("causes",) in results:
         found, causes = split(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
+    if (time := time_of(run)) is not None:
+        estimate = Estimate(time.nanoseconds, math.nan, math.nan)
+        measures.append(Measure(METRIC, COMPILED if time.compiled else IN_PYTHON, "all", estimate, "ns"))
     return Contender(
         name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
     )

@@ -1,6 +1,7 @@
 """Episodes from their seeds to their end, with whatever competes in the loop."""
 
-import types
+import itertools
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from ..envs.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Kind, check_competitor, kind_of, make_competitor
+from .competitors import Kind, check_competitor, compilation_key, kind_of, make_competitor
 from .filters import put_in_loop
 from .smoothers import SmoothedTrack, check_open_loop, run_forward
 from .steered_filter import compile_policy, trace_policy
@@ -237,10 +238,8 @@ def _steering_of(model: Model, competitor: Any, name: str) -> Specialised | None
 
     if not isinstance(model, CompiledModel):
         return None
-    if isinstance(competitor, types.FunctionType):  # it may return another one next time
-        return trace()
     try:
-        return model.programs.keep((run_episodes, competitor), trace)
+        return model.programs.keep((run_episodes, compilation_key(competitor)), trace)
     except TypeError:  # it has no hash
         return trace()
 
@@ -265,6 +264,88 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
     for k in numpy.flatnonzero(wrong.any(axis=(0, *range(2, wrong.ndim))))[:1]:
         check_action(space, kept[:, k], count)
     return kept
+
+
+TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
+"""Episodes side by side, and measurements of each, of which a time is taken: enough for two digits."""
+TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.2, 3, 20
+"""For how long, and how often, runs are repeated of which the quickest counts."""
+
+
+class ProcessorTime(NamedTuple):
+    """What a measurement takes on one core: world and competitor together."""
+
+    nanoseconds: float
+    """Of a measurement of one of many episodes side by side."""
+    compiled: bool
+    """Whether all of it is native code; else the time is mostly that of the steps between, in Python."""
+
+
+def measure_time(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str = "competitor"
+) -> ProcessorTime | None:
+    """Measure the processor time of a measurement: the world moves, is measured, and the competitor estimates.
+
+    Of :data:`TIMED_EPISODES` episodes side by side, after everything is traced and compiled: of native code the
+    quickest of several runs, since what disturbs one only adds to it; of what is asked in Python the median decision.
+
+    Args:
+        model: as in :func:`rollout`, likewise what follows.
+        competitor: likewise.
+        kind: likewise. A smoother answers when all is measured, and a bound estimates nothing: None.
+        seeds: of some episodes, which are repeated where they are fewer.
+        name: of the competitor, in errors.
+    """
+    if kind in ("smoother", "bound"):
+        return None
+    seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
+    task, steers = model.task, kind == "policy"
+    decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
+    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
+    steering = _steering_of(model, competitor, name) if steers else None
+    if can_step(looped, _report_estimate) and (steering is not None or not steers):
+        spent = _time_compiled(looped, steering, seeds, decisions)
+        return ProcessorTime(1e9 * spent / (len(seeds) * decisions * task.decision_interval), True)
+    steps = (
+        _steer_by_python(model, competitor, seeds, _report_estimate, name)
+        if steers
+        else _step_filter(looped, seeds, _report_estimate)
+    )
+    spent = _time_steps(steps, decisions, task.decision_interval)
+    return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False)
+
+
+def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
+    return {"estimate": model.mean(episode)}
+
+
+def _time_compiled(
+    looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
+) -> float:
+    """Seconds of the quickest run."""
+    lanes, measurements = start_lanes(looped, seeds), decisions * looped.task.decision_interval
+    identities = identities_of_seeds(seeds)
+    spent: list[float] = []
+    lanes.run(_report_estimate, steering, measurements)  # compiles
+    while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+        lanes.begin(identities)
+        began = time.process_time()
+        lanes.run(_report_estimate, steering, measurements)
+        spent.append(time.process_time() - began)
+    return min(spent)
+
+
+def _time_steps(steps: Iterator[Any], decisions: int, interval: int) -> float:
+    """Seconds of the median decision."""
+    spent: list[float] = []
+    for _ in range(decisions):
+        began = time.process_time()
+        for _ in range(interval):
+            next(steps)
+        spent.append(time.process_time() - began)
+        if sum(spent[1:]) > 2.0 * TIMED_SECONDS:
+            break
+    return float(numpy.median(spent[1:] or spent))  # the first starts the episodes and compiles
 
 
 def run_competitor(

@@ -36,6 +36,14 @@ class SmoothedTrack:
         return self.means[:, memory], self.covariances[:, :, memory], memory + 1
 
 
+def is_open_loop(model: Model) -> bool:
+    """Whether the estimate does not decide what is measured next."""
+    plain = model.on_numpy()
+    noise = plain.task.noise
+    episode = plain.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
+    return plain.filter.feedback(episode.filter, episode.measurement) is None
+
+
 def check_open_loop(model: Model, name: str) -> None:
     """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed.
 
@@ -43,12 +51,9 @@ def check_open_loop(model: Model, name: str) -> None:
         model: in which a smoother is to run.
         name: of the smoother.
     """
-    plain = model.on_numpy()
-    noise = plain.task.noise
-    episode = plain.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
-    if plain.filter.feedback(episode.filter, episode.measurement) is not None:
+    if not is_open_loop(model):
         raise ValueError(
-            f"smoother {name!r} cannot run in {plain.task.id}, a closed loop with these parameters, in which the "
+            f"smoother {name!r} cannot run in {model.task.id}, a closed loop with these parameters, in which the "
             "estimate steers what is measured later: leave it out"
         )
 

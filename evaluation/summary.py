@@ -21,6 +21,7 @@ from .rollout import Progress
 from .statistics import Reduction, Statistic, reduce_run
 from .store import Store, Work
 from .threads import one_thread
+from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
@@ -143,7 +144,10 @@ def reduce_episodes(
             run = run.isel(policy=0)
             yield Part(reduce_run(run, declare, bootstrap, i), _head(run))
 
-    return functools.reduce(Part.merge, parts())
+    found = functools.reduce(Part.merge, parts())
+    if asked.experiment.timed and asked.first == 0:
+        return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
+    return found
 
 
 def _head(run: xarray.Dataset) -> xarray.Dataset:
@@ -279,6 +283,9 @@ def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
         coords |= {str(n): c.variable for n, c in head.coords.items() if n not in coords}
     for name in ("policy", "kind", "control"):
         coords[name] = ("policy", [str(head[name].values) for head in heads])
+    for name in COORDINATES:
+        if name in coords:
+            coords[name] = ("policy", [head[name].values.item() for head in heads], heads[0][name].attrs)
     variables: dict[str, Any] = {}
     for name in sorted({str(name) for head in heads for name in head.data_vars}):
         example = next(head[name] for head in heads if name in head)

@@ -1,5 +1,7 @@
 """Commands that make this project's own pages: ``python docs/make COMMAND``."""
 
+import itertools
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -10,12 +12,16 @@ import typer
 from command_line import MARKER as COMMANDS_MARKER
 from command_line import command_line_markdown
 from environment_page import environment_tables, put_tables
+from filtergym.agents.export import export_run
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.scenario_choice import find_scenario
 from filtergym.evaluation.files import whole_files, writable_file
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
+from filtergym.evaluation.rollout import Progress
 from filtergym.evaluation.store import UNFINISHED, Store
+from front import draw_fronts, fronts_in_words, measure_fronts, panels_of
 from pages import check_markers, insert_between_markers, markers_of
 from room import MARKER, measure_room, room_markdown
 
@@ -37,7 +43,7 @@ from filtergym.commands.terminal import (
     console,
     progress_bar,
 )
-from filtergym.reports.records import write_records
+from filtergym.reports.records import read_records, write_records
 
 PROGRAM = "python docs/make"
 
@@ -106,6 +112,57 @@ def room(
         command = f"{PROGRAM} room {problem.name} --episodes {episodes} --seed {seed} --into {into}"
         insert_between_markers(into, {MARKER: room_markdown(records, paper, command)})
     print_results(records, problem.knows)
+
+
+def front(
+    records: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="results.json of benchmarks, or what --data has written; default: everything is run."
+        ),
+    ] = None,
+    into: Annotated[Path, typer.Option(help="PNG, SVG or PDF file for the picture.")] = Path(
+        "docs/images/front.png"
+    ),
+    data: Annotated[Path, typer.Option(help="File for the records of what is run.")] = Path(
+        "docs/data/front.json"
+    ),
+    episodes: Episodes = 2000,
+    seed: Experiment = 0,
+    columns: Columns = 2,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """Draw cost against time of all competitors of every environment, and the front of both.
+
+    Every competitor runs over the training distribution, where episodes are long over fewer of them. What is done is
+    kept until all is: after an interruption the same command goes on.
+
+    Example: python docs/make front --jobs 2
+    """
+    check_columns(columns)
+    check_formats([into.suffix.removeprefix(".").lower()])
+    problems = [problem_of(id) for id in catalogue()]
+    found = [] if records is None else read_records(records)
+    if not found:
+        writable_file(into)
+        writable_file(data)
+        store = Store(data.with_name(UNFINISHED))
+        with Workers(jobs, cluster) as workers, progress_bar() as bar:
+
+            def start(total: int) -> Progress:
+                line = bar.add_task("evaluating", total=total)
+                return lambda done: bar.update(line, advance=done)
+
+            found = measure_fronts(problems, episodes, seed, workers, store, start)
+        write_records(data, found)
+        store.clear()
+    panels = panels_of(problems, found)
+    if not panels:
+        raise ValueError("the records hold no times: make them by filtergym benchmark, or without naming any")
+    save(draw_fronts(panels, columns=columns), into)
+    for title, names in fronts_in_words(panels).items():
+        console.print(f"{title}: {names}", highlight=False)
 
 
 def page(
@@ -194,6 +251,28 @@ def seeds(
         console.print(grid)
 
 
+def _algorithm(seed: training_seeds.SeedRun) -> str:
+    return seed.run.algorithm
+
+
+def ship(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
+    into: Annotated[Path, typer.Option(help="Folder of what is shipped.")] = Path("agents/pretrained"),
+    trust: Trust = False,
+) -> None:
+    """Export of every algorithm the run with the lowest validation cost, over what was shipped of it.
+
+    Example: python docs/make ship runs/ManeuveringTarget/*-?
+    """
+    found = training_seeds.load_runs(runs, trust)
+    for algorithm, own in itertools.groupby(sorted(found, key=_algorithm), _algorithm):
+        best = min(own, key=lambda seed: seed.run.best["cost"] if seed.run.best else math.inf)
+        file = into / best.run.problem.short_name / f"{algorithm}.safetensors"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        export_run(best.folder, file, trust)
+        console.print(f"{file}: {best.name}, of the lowest validation cost")
+
+
 def command_line(
     into: Annotated[Path, typer.Argument(help="Page whose sections are replaced.")],
 ) -> None:
@@ -207,8 +286,10 @@ def command_line(
 COMMANDS: dict[str, Callable[..., None]] = {
     "page": page,
     "room": room,
+    "front": front,
     "comparison": comparison_page,
     "seeds": seeds,
+    "ship": ship,
     "command-line": command_line,
 }
 

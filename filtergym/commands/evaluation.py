@@ -35,7 +35,7 @@ from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
-from ..reports.benchmark import result_of
+from ..reports.benchmark import result_of, without_smoothers_of_closed_loops
 from ..reports.export import latex_table, records_as_csv
 from ..reports.reasons import explained_by_default, fill, reason_sentences
 from ..reports.recording_tables import recording_tables
@@ -158,8 +158,10 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
         policies: names that are given.
     """
     known = problem.baselines
-    if policies or not isinstance(data, Recording):
-        return list(policies or known.benchmark or known.names)
+    if policies:
+        return list(policies)
+    if not isinstance(data, Recording):
+        return list(without_smoothers_of_closed_loops(problem, known.benchmark or known.names, data))
     return [*causal_names(problem, data), *known.smoothers]
 
 

@@ -181,6 +181,7 @@ def evaluate_policies(
         backend=backend,
         threads=threads,
         strict=strict,
+        timed=True,
         keywords=keywords,
     )
     with Workers(jobs, cluster) as workers:

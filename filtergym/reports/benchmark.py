@@ -12,13 +12,16 @@ import xarray
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
+from ..envs.backend import make_model
 from ..envs.catalogue import catalogue
 from ..evaluation.cause_split import CAUSE_METRICS, phrases_of
+from ..evaluation.competitors import RandomPolicy
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress
+from ..evaluation.smoothers import is_open_loop
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import EvaluationRequest, Summary, combine_summaries, summaries
 from ..names import evaluation_requests
@@ -97,6 +100,37 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
     return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
 
 
+def ranked_names(problem: Problem) -> list[str]:
+    """Names of all that is ranked, each under its own control, but random actions."""
+    known = problem.baselines
+    ranked = (*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id))
+    return [
+        name for name in dict.fromkeys(ranked) if problem.baselines.policies.get(name) is not RandomPolicy
+    ]
+
+
+def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
+    """Return how many episodes a competitor runs in some seconds: 2000, or 400 where a measurement is dear.
+
+    Args:
+        problem: whose competitor it is.
+        scenario: of the episodes.
+        most: no more than these.
+    """
+    seconds = problem.baselines.measurement_seconds * _horizon(problem.task, scenario)
+    return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
+
+
+def without_smoothers_of_closed_loops(
+    problem: Problem, names: Sequence[str], scenario: Any
+) -> tuple[str, ...]:
+    """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
+    smoothers = {*names} & {*problem.baselines.smoothers}
+    if not smoothers or is_open_loop(make_model(problem.task, None, scenario, backend="numpy")):
+        return tuple(names)
+    return tuple(name for name in names if name not in smoothers)
+
+
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
     """List the work: quick, the paper's and the default scenario; full, all of them and more episodes.
 
@@ -117,7 +151,10 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
                 affordable = int(FULL_SECONDS / problem.baselines.measurement_seconds)
                 measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
             episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
-            wanted.append(Cell(problem, name, episodes, benchmark_policies(problem, full, horizon)))
+            names = without_smoothers_of_closed_loops(
+                problem, benchmark_policies(problem, full, horizon), name
+            )
+            wanted.append(Cell(problem, name, episodes, names))
     return wanted
 
 
@@ -185,6 +222,8 @@ class BenchmarkOptions(NamedTuple):
     """How many share the episodes, of the compiled backend."""
     command: str = "filtergym benchmark"
     """That runs this, kept in the results."""
+    timed: bool = True
+    """Measure the processor time of every competitor, which differs from run to run."""
 
     def requests(self, cell: Cell) -> list[EvaluationRequest]:
         """Return what is asked for in a cell."""
@@ -196,6 +235,7 @@ class BenchmarkOptions(NamedTuple):
             drawn_episodes=1,
             backend=self.backend,
             threads=self.threads,
+            timed=self.timed,
         )
         return evaluation_requests(cell.problem, experiment, cell.policies)
 

@@ -5,6 +5,13 @@ from typing import Any, NamedTuple
 
 from ..evaluation.competitors import NOT_CAUSAL, RANKED
 from ..evaluation.metrics import Record
+from ..evaluation.times import (
+    TIME_TITLE,
+    column_of_times,
+    front,
+    points_of_records,
+    times_of_records,
+)
 from .headline import headline
 from .html_page import pack, render_page
 from .ranking import origin, ranking_sentence, verdict
@@ -90,6 +97,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
                 "lines": _lines(result, group),
                 "paper": result.paper,
                 "ranking": _differences(result),
+                "front": _front(result),
                 "worst": worst_data(result),
                 **serialise_datasets(result),
             }
@@ -111,6 +119,8 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
 
     against = f"cost against {result.paper or 'paper'}, %"
     header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
+    times, texts = times_of_records(records), column_of_times(records)
+    header += [TIME_TITLE] * bool(times)
     header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
     predicted = {r.component: r.unit for r in records if r.metric == "prediction_error"}
     for group, unit in predicted.items():
@@ -131,6 +141,10 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry("-" if value is None else f"{value:.3g}", value),
                 Entry(consistency_word(nees), consistency_word(nees)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
+                *[
+                    Entry(texts.get(name, "-"), times[name].nanoseconds if name in times else None)
+                    for _ in range(bool(times))
+                ],
                 *(number(name, "rmse", component) for component in shown),
                 *(
                     number(name, metric, group)
@@ -164,6 +178,26 @@ def _differences(result: Result) -> list[list[Any]]:
         low, high = (record.value if end is None else end for end in (record.low, record.high))
         rows.append([name, origin(result, name, kind), *(100.0 * x for x in (record.value, low, high))])
     return rows
+
+
+def _front(result: Result) -> list[list[Any]]:
+    """Name, origin, nanoseconds, cost against the paper's algorithm in percent, whether compiled, and whether on the
+    front, of the ranked and the reference.
+    """
+    points = points_of_records(result.records)
+    on_front = front(points)
+    return [
+        [
+            p.name,
+            origin(result, p.name, p.kind),
+            p.time.nanoseconds,
+            p.cost,
+            p.time.compiled,
+            p.name in on_front,
+        ]
+        for p in points
+        if p.kind in RANKED or p.name == result.reference
+    ]
 
 
 def _dots(group: Sequence[Result]) -> dict[str, Any]:
@@ -223,6 +257,17 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "title": f"Cost against {result.paper or 'the paper'}",
                 "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
                 "alternative": "The table above holds these numbers.",
+            }
+        )
+    if points := points_of_records(result.records):
+        figures.append(
+            {
+                "kind": "front",
+                "title": "Cost and time",
+                "text": "Mean cost against the processor time of a measurement, of simulated world and competitor "
+                "together. Nobody else costs less in as much time as those on the front, the line; open: asked in "
+                "Python.",
+                "alternative": f"On the front, the quickest first: {', '.join(front(points))}.",
             }
         )
     if result.curves is not None and "rmse" in result.curves:

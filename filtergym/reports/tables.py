@@ -13,6 +13,7 @@ from rich.table import Table
 
 from ..baselines.tuned_values import Tuned
 from ..evaluation.competitors import NOT_CAUSAL, RANKED
+from ..evaluation.times import TIME_NOTE, TIME_TITLE, column_of_times
 from ..offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
@@ -157,6 +158,8 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
         "score": lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0],
     }
+    if times := column_of_times(records):
+        costs[TIME_TITLE] = lambda name: times.get(name, "-")
     lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
     if lost:
         costs["lost"] = lambda name: f"{lost.get(name, 0)}"
@@ -169,7 +172,10 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
     tables = [competitors_table(names, {**costs, **errors}, True)]
     if _widest(tables[0]) > width:
         narrow = [competitors_table(names, costs, True), competitors_table(names, costs, False)]
-        tables = [first_fitting(narrow, width) or competitors_table(names, costs, False, compact=True)]
+        fitting = first_fitting(narrow, width)
+        if fitting is None and TIME_TITLE in costs:
+            errors = {TIME_TITLE: costs.pop(TIME_TITLE), **errors}
+        tables = [fitting or competitors_table(names, costs, False, compact=True)]
         beside = first_fitting(
             [competitors_table(names, errors, False, compact) for compact in (False, True)], width
         )
@@ -182,6 +188,8 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         "score: 0 = the paper's algorithm, 1 = the reference that it is measured against; no room where that is not "
         "significantly better.",
     ]
+    if times:
+        notes.append(TIME_NOTE)
     if lost:
         notes.append(
             "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."

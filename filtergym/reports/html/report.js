@@ -119,6 +119,7 @@
   const logarithmic = { type: "log", exponentformat: "none", dtick: "D2", minorloglabels: "complete" };
 
   const FIGURES = {
+    front: (cell) => [["front", () => frontOf(cell.front, cell.paper)]],
     ranking: (cell) => [["cost", () => dotted([["", "", cell.ranking]], null, cell.paper)]],
     rmse: ({ curves, ...cell }) => curves.words("quantity").map((name, i) => [words(name), () =>
       overTime({ curves, ...cell }, "rmse", [i], `RMSE of ${words(name)}, ${plain(curves.words("unit")[i])}`, logarithmic)]),
@@ -189,6 +190,31 @@
     const height = single ? Math.max(280, 110 + 19 * entries.length) : (narrow ? 270 : 190) + rows.length * Math.max(44, 11 * entries.length);
     const legend = single ? {} : { legend: { ...layout({}).legend, yref: "container", y: 0, yanchor: "bottom" } };
     return [drawn, layout({ xaxis: { title: { text: title }, range, zeroline: true, zerolinewidth: 2 }, yaxis, shapes, height, ...legend })];
+  }
+
+  // --- cost and time: a point for each competitor, steps along the front, a line for the reference
+
+  function frontOf(points, paper) {
+    const ranked = points.filter(([, origin]) => origin !== "reference"), reference = points.find(([, origin]) => origin === "reference");
+    // Beyond twice the paper's cost is nobody on the front.
+    const top = Math.min(100, Math.max(5, ...ranked.map(([, , , cost]) => cost))), shown = ranked.filter(([, , , cost]) => cost <= top);
+    const steps = shown.filter(([, , , , , on]) => on).sort((a, b) => a[2] - b[2]), times = shown.map(([, , time]) => time);
+    const right = Math.max(...times) * 1.6, left = Math.min(...times) / 1.3;
+    const drawn = [{ x: [...steps.map((p) => p[2]), right], y: [...steps.map((p) => p[3]), (steps[steps.length - 1] || [0, 0, 0, 0])[3]], mode: "lines", name: "the front", line: { shape: "hv", color: css("--fg"), width: 1.4 }, hoverinfo: "skip" }];
+    for (const kind of ["paper", "classical", "estimator", "learned"]) {
+      const own = shown.filter(([, origin]) => origin === kind);
+      if (!own.length) continue;
+      const color = look({ origin: kind, colour: { learned: 0, classical: 1, estimator: 2 }[kind] ?? null }).color;
+      drawn.push({ x: own.map((p) => p[2]), y: own.map((p) => p[3]), name: kind, mode: "markers+text", cliponaxis: false,
+        text: own.map(([name, , , , , on]) => on ? plain(name) : ""), textposition: "bottom left", textfont: { size: 10 },
+        customdata: own.map(([name, , , , compiled]) => plain(name) + (compiled ? "" : ", asked in Python")),
+        hovertemplate: "%{y:.1f} %, %{x:.3g} ns<extra>%{customdata}</extra>",
+        marker: { color, size: 8, line: { color, width: 1.2 }, symbol: own.map(([, , , , compiled]) => ({ paper: "star", learned: "diamond", estimator: "square" }[kind] || "circle") + (compiled ? "" : "-open")) } });
+    }
+    if (reference) drawn.push({ x: [left, right], y: [reference[3], reference[3]], mode: "lines", name: plain(reference[0]), line: { color: css("--fg"), width: 1.4, dash: "dash" }, hovertemplate: `%{y:.1f} %, ${reference[2].toPrecision(2)} ns<extra>${plain(reference[0])}</extra>` });
+    const beyond = ranked.length - shown.length, low = Math.min(...drawn.flatMap(({ y }) => y));
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} beyond the top)` : "");
+    return [drawn, layout({ xaxis: { title: { text: "nanoseconds a measurement" }, ...logarithmic, range: [left, right].map(Math.log10) }, yaxis: { title: { text: title }, range: [low - 0.08 * (top - low), top + 0.05 * (top - low)] } })];
   }
 
   // --- a track with a slider
