@@ -27,7 +27,7 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,ins,adapters
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test test-slow coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: benchmark test test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -103,6 +103,9 @@ check: $(VENV)/.dev  ## format, lint and types
 
 docs: $(VENV)/.dev  ## build the documentation into site/
 	$(SITE)
+
+numbers: $(VENV)/.dev  ## tune, train and ship again, and make every published table; hours, goes on after an interruption
+	$(MAKE) -f docs/make/numbers.mk JOBS=$(JOBS)
 
 format: $(VENV)/.dev  ## put the code into its form
 	$(BIN)/ruff format $(SOURCES)

@@ -102,13 +102,13 @@ def _intervals_in_one_piece(app: Any, document: nodes.document) -> None:
 
 
 MOVED = """
-:::{admonition} These numbers were made before the noise by counter
+:::{admonition} These numbers are of earlier distributions
 :class: note
 
-The random numbers of an episode have since become a function of its seed and of the time alone. Every episode has
-changed once by it: the same seed draws another flight and other noise. Their distributions have not changed. What
-stands on this page is of the episodes before, and whoever runs a command again gets numbers that differ from it as
-those of other seeds do. All tables, figures and agents are made again together.
+Since they were made the random numbers of an episode have become a function of its seed and of the time alone,
+sensors have coloured errors in training, motion is drawn anew for every episode, and references are told the whole
+draw. Whoever runs a command again gets other numbers. Agents have not been trained for it yet; then all tables,
+figures and agents are made again together.
 :::
 """
 """Said at the top of pages whose numbers come from runs, until they are made again."""

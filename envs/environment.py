@@ -279,15 +279,19 @@ class _EnvBase:
     # --- what is shown
 
     def _observation_space(self) -> gymnasium.Space:
-        def box(size: int) -> gymnasium.spaces.Box:
-            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.options.dtype).type)
-
-        measured = box(len(self.model.fields))
+        dtype = numpy.dtype(self.options.dtype).type
+        low, high = (limits.astype(dtype) for limits in self.model.observation_limits)
+        measured = gymnasium.spaces.Box(low, high, dtype=dtype)
         if not self.privileged:
             return measured
         context = sum(math.prod(shape) for shape in context_shapes(self.task).values())
         return gymnasium.spaces.Dict(
-            {"observation": measured, "privileged": box(context + len(self.task.components))}
+            {
+                "observation": measured,
+                "privileged": gymnasium.spaces.Box(
+                    -numpy.inf, numpy.inf, (context + len(self.task.components),), dtype
+                ),
+            }
         )
 
     def _to_dtype(self, values: Array) -> Array:

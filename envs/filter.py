@@ -110,7 +110,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
             state: after :meth:`start` or :meth:`update`.
             measurement: that it has taken in, or the initial estimate.
         """
-        return self.task.feedback(self.mean(state), measurement)  # type: ignore[attr-defined]
+        return self.task.filter_feedback(self, state, measurement)  # type: ignore[attr-defined]
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for

@@ -6,6 +6,7 @@ list, and a :class:`Reader` that gives a quantity back: policies never undo a co
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
@@ -37,6 +38,8 @@ class Compression(NamedTuple):
     """From the value to what is shown; None where it is shown as it is."""
     inverse: Callable[[numpy.ndarray], numpy.ndarray] | None
     """From what is shown to the value; None where they are the same."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Of what is shown, whatever the filters do: bounds of the observation space."""
 
 
 def symlog(value: Array, xp: ModuleType) -> Array:
@@ -50,7 +53,22 @@ def symexp(value: Array, xp: ModuleType) -> Array:
 
 
 PLAIN = Compression("", None, None)
-SIGNED_LOG = Compression("sign(x) log(1 + |x|) of ", symlog, lambda shown: symexp(shown, numpy))
+"""As it is, and without limits."""
+
+
+def within(low: float, high: float) -> Compression:
+    """As it is, where that cannot lie outside these limits."""
+    return Compression("", None, None, (low, high))
+
+
+SHARE = within(0.0, 1.0)
+ACTION = within(-1.0, 1.0)
+LARGEST_LOG = 710.0
+"""No finite number has a larger logarithm, and none but zero one below the negative of :data:`SMALLEST_LOG`."""
+SMALLEST_LOG = 746.0
+SIGNED_LOG = Compression(
+    "sign(x) log(1 + |x|) of ", symlog, lambda shown: symexp(shown, numpy), (-LARGEST_LOG, LARGEST_LOG)
+)
 LIMIT = 8.0
 """What a bounded logarithm stays below."""
 
@@ -67,19 +85,34 @@ def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
 
 
 BOUNDED_LOG = Compression(
-    "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of ", bounded_logarithm, bounded_exponential
+    "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of ",
+    bounded_logarithm,
+    bounded_exponential,
+    (-LIMIT, LIMIT),
 )
 """For what a wrong hypothesis makes as large as one likes."""
-KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1)
+KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1, (0.0, LARGEST_LOG))
 """The block's function returns log(1 + x) already, because the filters keep that; reading gives x."""
-LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1)
-KEPT_AS_LOG = Compression("log of ", None, numpy.exp)
+LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1, KEPT_AS_LOG1P.limits)
+AVERAGE_OF_LOG1P = within(*KEPT_AS_LOG1P.limits)
+KEPT_AS_LOG = Compression("log of ", None, numpy.exp, (-SMALLEST_LOG, LARGEST_LOG))
 """The block's function returns the logarithm already; reading gives the value."""
 
 
-def linear_scale(factor: float, offset: float = 0.0) -> Compression:
-    """``factor (x - offset)``, where the unit of the field says what is left to say."""
-    return Compression("", lambda value, xp: factor * (value - offset), lambda shown: shown / factor + offset)
+def linear_scale(
+    factor: float, offset: float = 0.0, limits: tuple[float, float] = (-math.inf, math.inf)
+) -> Compression:
+    """``factor (x - offset)``, where the unit of the field says what is left to say.
+
+    Args:
+        factor: above zero.
+        offset: what is shown as zero.
+        limits: of x.
+    """
+    low, high = (factor * (value - offset) for value in limits)
+    return Compression(
+        "", lambda value, xp: factor * (value - offset), lambda shown: shown / factor + offset, (low, high)
+    )
 
 
 class Block(NamedTuple):
@@ -135,6 +168,9 @@ class Blocks:
             for block in self.blocks
             for name in _field_names(block)
         )
+        limits = [block.shown.limits for block in self.blocks for _ in _field_names(block)]
+        self.limits = numpy.array(limits).reshape(-1, 2).T
+        """Lower and upper bounds of what is shown, ``(2, fields)``."""
         names = [field.name for field in self.fields]
         known = [*(block.name for block in self.blocks), *self.quantities]
         for table in (names, known):

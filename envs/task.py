@@ -288,6 +288,16 @@ class Task(ABC):
         """
         return None
 
+    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Any:
+        """Report what a filter gives back to the world, by default what follows from its mean (:meth:`feedback`).
+
+        Args:
+            filter: a :class:`~.filter.Filter` that does not say it itself.
+            state: its state, see :meth:`.Filter.feedback`.
+            measurement: that it has taken in, or the initial estimate.
+        """
+        return self.feedback(filter.mean(state), measurement)
+
     def records(self, model: Any, episode: Any, kept: dict[str, Array]) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement, beside what filter and world report; here nothing.
 

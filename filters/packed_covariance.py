@@ -14,11 +14,13 @@ the Kalman gain of the P in use, so the short form is the Joseph form here.
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy
 
 from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
 
 
 def position(n: int, i: int, j: int) -> int:
@@ -79,25 +81,31 @@ class Update(NamedTuple):
 
 
 def update_coordinates(
-    mean: Array, covariance: Array, z: Array, coordinates: tuple[int, ...], R: Array, available: Array
+    mean: Array,
+    covariance: Array,
+    z: Array,
+    coordinates: Sequence[int | tuple[int, ...]],
+    R: Array,
+    available: Array,
 ) -> Update:
-    """Take in measurements of single coordinates with independent noise.
+    """Take in measurements of single coordinates, or of sums of some, with independent noise.
 
     Args:
         mean: predicted, ``(n, N)``.
         covariance: predicted, packed, ``(n (n + 1) / 2, N)``.
         z: readings, ``(m, N)``; where not available any finite number.
-        coordinates: which coordinate each sensor reads, m of them.
+        coordinates: which coordinate each sensor reads, or the sum of which, m of them.
         R: variances of the readings, ``(m,)`` or ``(m, N)``.
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
     """
     xp = namespace(mean)
     n = mean.shape[0]
     squared_distance = determinant = None
-    for k, i in enumerate(coordinates):
-        p = covariance[column(n, i)]
-        S = p[i] + R[k]
-        innovation = z[k] - mean[i]
+    for k, read in enumerate(coordinates):
+        rows = (read,) if isinstance(read, int) else read
+        p = ordered_sum(covariance[column(n, i)] for i in rows)
+        S = ordered_sum(p[i] for i in rows) + R[k]
+        innovation = z[k] - ordered_sum(mean[i] for i in rows)
         weight = available[k] / S
         scaled = weight * innovation
         mean = mean + p * scaled

@@ -5,6 +5,8 @@ And the pages for each audience run, the command line's page is that of the code
 
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import command_line
@@ -152,3 +154,18 @@ def test_every_page_of_results_says_what_makes_it():
     for report in (DOCS / "reproductions").glob("*/report.md"):
         made = f"\nMade by `filtergym reproduce {report.parent.name} --out DIR`.\n"
         assert made in report.read_text(encoding="utf-8"), report
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make")
+def test_one_command_makes_all_that_is_shipped_and_published():
+    made = ["make", "-n", "-B", "-f", "docs/make/numbers.mk"]
+    done = subprocess.run(made, cwd=DOCS.parent, capture_output=True, text=True, check=True).stdout
+    for file in (DOCS.parent / "agents" / "pretrained").glob("*/*.safetensors"):
+        assert f"--algo {file.stem} " in done, file
+        assert f"runs/{file.parent.name.removesuffix('-v0')}/{file.stem}-? " in done, file
+    for tuned in (DOCS.parent / "baselines").glob("*/tuned.json"):
+        assert f"baselines/{tuned.parent.name}/tuned.json" in done, tuned
+    for page in (DOCS / "environments").glob("*.md"):
+        assert f"--into docs/environments/{page.name}" in done, page
+    for report in (DOCS / "reproductions").glob("*/report.md"):
+        assert f"filtergym reproduce {report.parent.name} " in done, report

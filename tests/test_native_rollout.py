@@ -23,7 +23,7 @@ TIGHT = [
             "urban",
             ("multi-hypothesis", "stuck-check", "fixed-robust", "huber", "known-mode", "known-mode-bound"),
         ),
-        ("accelerometer-failure", ("nis-adaptive", "rest")),
+        ("accelerometer-failure", ("nis-adaptive", "rest", "fault-hypotheses", "fault-hypotheses-vague")),
     )
 ]
 """Every competitor takes seconds to compile."""

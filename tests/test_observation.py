@@ -77,6 +77,20 @@ def test_readers_undo_what_the_observation_does(state):
     np.testing.assert_allclose(blocks.reader("twice")(observation), 2.0 * total, rtol=1e-13)
 
 
+@pytest.mark.parametrize("shown", [SIGNED_LOG, BOUNDED_LOG, LOG1P])
+def test_no_number_is_shown_beyond_the_limits(shown):
+    largest = np.finfo(np.float64).max
+    low, high = shown.limits
+    values = shown.forward(np.array([-largest if low < 0.0 else 0.0, largest]), np)
+    assert low <= values[0] < 0.97 * low or low == values[0] == 0.0
+    assert 0.97 * high < values[1] <= high
+
+
+def test_limits_follow_a_scale():
+    blocks = Blocks([Block("e", lambda s, _: s, "e", "xy", linear_scale(0.1, 45.0, (0.0, 90.0)))], (), np)
+    np.testing.assert_allclose(blocks.limits, [[-4.5, -4.5], [4.5, 4.5]], rtol=1e-15)
+
+
 def test_a_bounded_logarithm_is_the_value_near_zero_and_below_eight_everywhere():
     blocks = Blocks((Block("g", lambda state, _: state, "anything", shown=BOUNDED_LOG),), (), np)
     values = np.array([0.0, 1e-7, -1e-7, 1.0, -math.e + 1.0, 1e4, -1e4, 1e300])

@@ -186,6 +186,19 @@ def test_command_fills_the_page(folders, tmp_path, make_page, monkeypatch):
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 
 
+def test_the_best_of_an_algorithm_is_shipped(folders, tmp_path, make_page):
+    # Both runs hold the validations of one record: the second's are made better.
+    record = json.loads((folders[1] / "run.json").read_text())
+    record["validation"] = [entry | {"cost": 0.9 * entry["cost"]} for entry in record["validation"]]
+    (folders[1] / "run.json").write_text(json.dumps(record))
+    code, _, wrong = make_page("ship", *folders, "--into", tmp_path / "shipped")
+    assert code == 0, wrong
+    [file] = (tmp_path / "shipped" / "ManeuveringTarget-v0").glob("*.safetensors")
+    assert file.read_bytes() == (folders[1] / "best" / "agent.safetensors").read_bytes()
+    shipped = json.loads(file.with_suffix(".json").read_text())
+    assert (shipped["seed"], shipped["exported"]["episodes"]) == (1, 32)
+
+
 def test_the_page_folds_what_the_command_folds():
     page = (Path(__file__).parent.parent / "docs" / "training_seeds.md").read_text(encoding="utf-8")
     tables = re.findall(r"<!-- seeds \S+: begin -->\n(.*?)<!-- seeds \S+: end -->", page, re.S)

@@ -16,7 +16,7 @@ import gymnasium
 import numpy
 from filtergym.baselines.table import Baselines
 from filtergym.envs.draws import Draws
-from filtergym.envs.observation import LOG1P, SIGNED_LOG, Array, Block
+from filtergym.envs.observation import ACTION, LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.parameters import TaskParameters, parameter
 from filtergym.envs.filter import Bank, Initial
 from filtergym.envs.model import Model
@@ -145,7 +145,7 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         return (
             Block("innovation", lambda f, _: f.innovation, "innovation over its sigma", shown=SIGNED_LOG),
             Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
-            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before"),
+            Block("last_action", lambda f, _: self.xp.log(f.scale) / decades, "action applied before", shown=ACTION),
         )
 
     def start(self, initial: Initial) -> Filter:

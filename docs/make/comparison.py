@@ -9,6 +9,7 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.catalogue import catalogue, nearest
 from filtergym.evaluation.competitors import RANKED
 from filtergym.evaluation.metrics import Record
+from filtergym.evaluation.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_differences
 
@@ -88,12 +89,13 @@ def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Cost against the paper's algorithm, median, wins, and ANEES of a competitor in one scenario."""
+    """Cost against the paper's algorithm, median, wins, ANEES and time of a competitor in one scenario."""
     values = _by_name(records)
     return [
         with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
         *against_paper(values, name),
         consistency(values.get((name, "anees", "state", "all"))),
+        column_of_times(records).get(name, "-"),
     ]
 
 
@@ -122,6 +124,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
                 ]
             )
     header = ["environment", "name", "origin", "cost against the paper's, %", "median, %", "wins, %", "ANEES"]
+    header.append(TIME_TITLE)
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
 
@@ -146,7 +149,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
             )
     header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "median, %"]
     last = f"scenarios more than {100.0 * HARM:g} % above the paper"
-    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
+    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", TIME_TITLE, last], rows)
 
 
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
@@ -178,6 +181,8 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
     kinds, learned = {r.policy: r.kind for r in records}, pretrained_agents(cls.id)
     verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
+
+    times = {s: column_of_times([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
         """Table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
@@ -223,6 +228,12 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             f"{INCONSISTENT} off by more than a factor of two",
             columns,
             lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
+        ),
+        grid(
+            f"Nanoseconds a measurement on one core, with the simulated world; {PYTHON_MARK}: asked in Python; "
+            f"{FRONT_MARK}: on the front, where nobody else costs less in as much time",
+            columns,
+            lambda scenario, name: times[scenario].get(name, "-"),
         ),
     ]
     differences: dict[str, dict[str, tuple[float, ...]]] = {}

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem
 from filtergym.evaluation.metrics import Record, tidy_records
+from filtergym.evaluation.times import TIME_NOTE, TIME_TITLE, column_of_times
 from filtergym.papers.grid import markdown_table
 
 from filtergym.names import competitors_of
@@ -31,7 +32,7 @@ def room_policies(problem: Problem) -> list[str]:
 def measure_room(problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
     """Evaluate everything that the room table shows, on the test split of the default scenario."""
     makers = competitors_of(problem, room_policies(problem))
-    dataset = problem.evaluate(makers, None, episodes, seed, progress=progress)
+    dataset = problem.evaluate(makers, None, episodes, seed, progress=progress, timed=True)
     return tidy_records(dataset, problem.baselines.metrics)
 
 
@@ -46,13 +47,14 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
         f"cost against `{paper}`, %",  # what a narrow screen shows without scrolling
         "median, %",
         "wins, %",
+        TIME_TITLE,
         "control",
         "mean cost",
         *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown),
         "ANEES",
         "score",
     ]
-    rows = []
+    rows, times = [], column_of_times(records)
     for name, kind, control in rank_competitors(records):
         rows.append(
             [
@@ -61,6 +63,7 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
                     found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
                 ),
                 *against_paper(found, name),
+                times.get(name, "-"),
                 control if kind == "policy" else f"({kind})",
                 with_interval(found.get((name, "cost", "", "all"))),
                 *(with_interval(found.get((name, "rmse", c, "all"))) for c in shown),
@@ -71,7 +74,7 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. "
         f"ANEES is the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a "
-        "factor of two.\n\n"
+        f"factor of two. {TIME_NOTE}\n\n"
         f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
         f"95 % bootstrap intervals. Made by `{command}`."
     )

@@ -67,6 +67,7 @@ class SeedRun(NamedTuple):
     run: TrainingRun
     agent: Path
     """File of the best agent."""
+    folder: Path
 
     @property
     def name(self) -> str:
@@ -166,7 +167,7 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
                     f"runs of {label} may differ in the seed only: {folder} has {field} "
                     f"{getattr(run, field)!r}, others {getattr(other, field)!r}"
                 )
-        member = SeedRun(label, run, best_agent(folder))
+        member = SeedRun(label, run, best_agent(folder), folder)
         if member.name in found:
             raise ValueError(f"{folder} is a second run of {member.name}")
         found[member.name] = member

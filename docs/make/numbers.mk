@@ -1,0 +1,119 @@
+# Every published number of this project, made again in one go:
+#
+#     make numbers JOBS=2
+#
+# What is done leaves an empty file in build/numbers/. After an interruption the same command goes on, and the long
+# commands go on where they were; to make a part again remove its file. The order is that of what depends on what: values
+# are tuned, agents are trained and shipped, and only then everything is evaluated, on episodes that nobody has seen.
+
+BIN := .venv/bin
+JOBS ?= 2
+DONE := build/numbers
+SEEDS := 0-4
+
+ENVIRONMENTS := ManeuveringTarget UavAutopilot RadarEsmTracking LooselyCoupledNavigation TightlyCoupledNavigation
+
+room_ManeuveringTarget := maneuvering_target
+room_UavAutopilot := uav_autopilot
+room_RadarEsmTracking := radar_esm_tracking
+room_LooselyCoupledNavigation := loosely_coupled_navigation
+room_TightlyCoupledNavigation := tightly_coupled_navigation
+
+agents_ManeuveringTarget := bptt ppo recurrent-ppo sac dqn kalman-net
+agents_UavAutopilot := bptt ppo sac
+agents_RadarEsmTracking := bptt ppo sac
+agents_LooselyCoupledNavigation := bptt ppo sac kalman-net
+agents_TightlyCoupledNavigation := bptt
+
+shipped_ManeuveringTarget := bptt ppo kalman-net
+shipped_UavAutopilot := bptt ppo
+shipped_RadarEsmTracking := bptt ppo
+shipped_LooselyCoupledNavigation := bptt ppo kalman-net
+shipped_TightlyCoupledNavigation := bptt
+
+# Its filters have 17 states, and one wrong step loses a track: fewer episodes, and agents behind the gate.
+training_TightlyCoupledNavigation := --gated
+episodes_TightlyCoupledNavigation := 400
+
+PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-esm-class-fusion uav-autopilot-kalman
+
+episodes = $(or $(episodes_$(1)),2000)
+trained = $(foreach agent,$(agents_$(1)),$(DONE)/train-$(1)-$(agent))
+shipped = $(foreach environment,$(ENVIRONMENTS),$(DONE)/ship-$(environment))
+# Tables that go into a page by hand stand in build/.
+finish = @mkdir -p $(DONE) && touch $@
+
+.PHONY: numbers tuned trained shipped evaluated
+# Two long commands at once would share the same cores: each has its processes by JOBS.
+.NOTPARALLEL:
+
+numbers: tuned trained shipped evaluated
+
+tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
+trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
+shipped: $(shipped)
+evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/comparison $(ENVIRONMENTS:%=$(DONE)/room-%) \
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(PAPERS:%=$(DONE)/paper-%)
+
+# --- values: what is shipped tells the commands that made it
+
+$(DONE)/tune-%:
+	$(BIN)/python -c "import json; [print(own['command']) for own in \
+	  json.load(open('baselines/$(room_$*)/tuned.json')).values()]" | while read -r command; do \
+	  $(BIN)/$$command --jobs $(JOBS) --out build/tuned < /dev/null || exit 1; done
+	cp build/tuned/$*-v0.json baselines/$(room_$*)/tuned.json
+	$(finish)
+
+# --- agents
+
+define training
+$(DONE)/train-$(1)-$(2): $(DONE)/tune-$(1)
+	$(BIN)/filtergym train filtergym/$(1)-v0 --algo $(2) $(training_$(1)) --seeds $(SEEDS) --jobs $(JOBS) --trust \
+	  --out runs/$(1)/$(2)
+	$$(finish)
+endef
+$(foreach environment,$(ENVIRONMENTS),$(foreach agent,$(agents_$(environment)),\
+  $(eval $(call training,$(environment),$(agent)))))
+
+define shipping
+$(DONE)/ship-$(1): $(call trained,$(1))
+	$(BIN)/python docs/make ship $(shipped_$(1):%=runs/$(1)/%-?) --trust
+	$$(finish)
+endef
+$(foreach environment,$(ENVIRONMENTS),$(eval $(call shipping,$(environment))))
+
+# --- evaluations
+
+$(DONE)/seeds-%: $(DONE)/ship-%
+	$(BIN)/python docs/make seeds runs/$*/*-? --scenario random --episodes $(call episodes,$*) --jobs $(JOBS) \
+	  --out results/seeds/$*.json --into docs/training_seeds.md --curves docs/images/training_$*.png --trust
+	$(finish)
+
+$(DONE)/comparison: $(shipped)
+	$(BIN)/filtergym benchmark --full --jobs $(JOBS) --out results/full
+	$(BIN)/python docs/make comparison results/full/results.json --into docs/comparison.md
+	$(finish)
+
+$(DONE)/room-%: $(DONE)/ship-%
+	$(BIN)/python docs/make room filtergym/$*-v0 --episodes $(call episodes,$*) --seed 0 \
+	  --into docs/environments/$(room_$*).md
+	$(BIN)/python docs/make page filtergym/$*-v0 --into docs/environments/$(room_$*).md
+	$(finish)
+
+$(DONE)/flights: $(DONE)/ship-ManeuveringTarget
+	$(BIN)/python -m pip install --quiet --no-deps traffic
+	$(BIN)/python benchmarks/flights.py --out docs/data/flights.csv > build/flights.txt
+	$(finish)
+
+$(DONE)/plain:
+	$(BIN)/python benchmarks/plain_ppo.py --markdown --out build/plain_ppo.json > build/plain_ppo.txt
+	$(finish)
+
+$(DONE)/harm-%: $(DONE)/ship-%
+	$(BIN)/python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*) > build/harm-$*.txt
+	$(BIN)/python benchmarks/gate.py filtergym/$*-v0 bptt > build/gate-$*.txt
+	$(finish)
+
+$(DONE)/paper-%:
+	$(BIN)/filtergym reproduce $* --jobs $(JOBS) --out docs/reproductions/$*
+	$(finish)
