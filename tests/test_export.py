@@ -159,7 +159,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
     options = ("--format", "svg", "--format", "pdf", "--columns", 1)
     assert run(monkeypatch, *words, "--set", "horizon=20", "--out", out, *options) == 0
     figures = ["rmse_over_time", "error_distribution", "cost_difference", "consistency"]
-    figures += ["mode_probabilities", "worst_episodes"]
+    figures += ["mode_probabilities", "worst_episodes", "cost_and_time"]
     expected = {"records.json", "records.csv", "table.tex", "results.nc", "results.json", "report.html"}
     expected |= {f"{name}.{suffix}" for name in figures for suffix in ("svg", "pdf")}
     assert {path.name for path in out.iterdir()} == expected

@@ -183,8 +183,8 @@ def test_a_clone_learned_from_a_data_set_costs_what_its_original_costs(minari):
     }
     records = filtergym.tidy_records(filtergym.evaluate(ENV, names, episodes=200))
     against = {record.policy: record for record in records if record.metric == "relative_cost_difference"}
-    assert against["cloned"].low <= 0.0 <= against["cloned"].high
-    assert against["constant"].low > against["cloned"].high  # so the interval is narrow enough to tell
+    # Nearly linear: the clone gives away little of what tells its original from constant weights.
+    assert against["cloned"].high < 0.2 * against["constant"].low
 
 
 def test_more_episodes_than_are_flown_at_once(minari, monkeypatch):

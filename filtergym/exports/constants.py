@@ -65,7 +65,7 @@ def _attributes(value: Any, definitions: Definitions) -> dict[str, Any]:
     if isinstance(value, TaskParameters):
         names = names | definitions.words
     found = {name: part for name, part in vars(value).items() if name in names}
-    if isinstance(value, Task | TaskParameters):
+    if isinstance(value, Task | World | TaskParameters):
         for name in sorted(names - found.keys()):
             member = inspect.getattr_static(type(value), name, None)
             # A dataclass's fields stand in its instance already.
