@@ -395,11 +395,17 @@ def test_comparison_shows_what_the_records_say(tmp_path, make_page, monkeypatch)
     assert worst[:3] == ["ManeuveringTarget", "`ppo`", "`random`"]
     assert worst[3] == cost.rows[0][2].replace("<br>", " ")
     page = tmp_path / "page.md"
+    page.write_text("<!-- room table: begin -->\n<!-- room table: end -->")
+    monkeypatch.chdir(tmp_path)
+    assert make_page("room", ENV, "results.json", "--into", "page.md")[0] == 0
+    assert "| `ppo` | " in page.read_text()
+    assert "no records of filtergym/UavAutopilot-v0" in make_page(
+        "room", "filtergym/UavAutopilot-v0", "results.json"
+    )[2].replace("\n", " ")
     page.write_text(
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
         "\n<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
     )
-    monkeypatch.chdir(tmp_path)
     assert make_page("comparison", "results.json", "--into", "page.md")[0] == 0
     assert "`ppo` (learned)" in page.read_text()
     assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()

@@ -174,7 +174,7 @@ def test_the_command_line_lists_and_evaluates_it(package, command, make_page, mo
     assert "nobody's" in listed
     code, _, errors = command("benchmark", "--environment", ID, "--out", "results")
     assert code == 0, errors
-    code, _, errors = make_page("room", ID)
+    code, _, errors = make_page("room", ID, "results/results.json")
     assert code == 2
     assert "has no paper's algorithm to compare with" in errors
 

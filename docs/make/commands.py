@@ -19,11 +19,10 @@ from filtergym.envs.scenario_choice import find_scenario
 from filtergym.evaluation.files import whole_files, writable_file
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
-from filtergym.evaluation.rollout import Progress
 from filtergym.evaluation.store import UNFINISHED, Store
-from front import draw_fronts, fronts_in_words, measure_fronts, panels_of
+from front import draw_fronts, fronts_in_words, panels_of
 from pages import check_markers, insert_between_markers, markers_of
-from room import MARKER, measure_room, room_markdown
+from room import MARKER, room_markdown, room_records
 
 from filtergym.__main__ import main as run
 from filtergym.__main__ import program_of
@@ -93,73 +92,41 @@ def comparison_page(
 
 def room(
     environment: Environment,
-    episodes: Episodes = 5000,
-    seed: Experiment = 0,
+    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
     into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
 ) -> None:
     """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
 
-    Example: python docs/make room filtergym/ManeuveringTarget-v0
+    Example: python docs/make room filtergym/ManeuveringTarget-v0 results/results.json
     """
     problem = problem_of(environment)
     paper = problem.paper  # there is no room without it
     if into is not None:
-        check_markers(into, [MARKER])  # a page that cannot take the table is refused before the work
-    with progress_bar() as bar:
-        line = bar.add_task("evaluating", total=None)
-        records = measure_room(problem, episodes, seed, lambda done: bar.update(line, advance=done))
+        check_markers(into, [MARKER])
+    found = room_records(comparison.read_benchmark(records), problem)
     if into is not None:
-        command = f"{PROGRAM} room {problem.name} --episodes {episodes} --seed {seed} --into {into}"
-        insert_between_markers(into, {MARKER: room_markdown(records, paper, command)})
-    print_results(records, problem.knows)
+        first = found[0]
+        command = f"filtergym benchmark --full --seed {first.seed} --split {first.split}"
+        insert_between_markers(into, {MARKER: room_markdown(found, paper, command)})
+    print_results(found, problem.knows)
 
 
 def front(
-    records: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="results.json of benchmarks, or what --data has written; default: everything is run."
-        ),
-    ] = None,
+    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
     into: Annotated[Path, typer.Option(help="PNG, SVG or PDF file for the picture.")] = Path(
         "docs/images/front.png"
     ),
-    data: Annotated[Path, typer.Option(help="File for the records of what is run.")] = Path(
-        "docs/data/front.json"
-    ),
-    episodes: Episodes = 2000,
-    seed: Experiment = 0,
     columns: Columns = 2,
-    jobs: Jobs = 1,
-    cluster: Cluster = None,
 ) -> None:
-    """Draw cost against time of all competitors of every environment, and the front of both.
+    """Draw cost against time of every competitor in the training distribution of each environment, and the front of both.
 
-    Every competitor runs over the training distribution, where episodes are long over fewer of them. What is done is
-    kept until all is: after an interruption the same command goes on.
-
-    Example: python docs/make front --jobs 2
+    Example: python docs/make front results/results.json
     """
     check_columns(columns)
     check_formats([into.suffix.removeprefix(".").lower()])
-    problems = [problem_of(id) for id in catalogue()]
-    found = [] if records is None else read_records(records)
-    if not found:
-        writable_file(into)
-        writable_file(data)
-        store = Store(data.with_name(UNFINISHED))
-        with Workers(jobs, cluster) as workers, progress_bar() as bar:
-
-            def start(total: int) -> Progress:
-                line = bar.add_task("evaluating", total=total)
-                return lambda done: bar.update(line, advance=done)
-
-            found = measure_fronts(problems, episodes, seed, workers, store, start)
-        write_records(data, found)
-        store.clear()
-    panels = panels_of(problems, found)
+    panels = panels_of([problem_of(id) for id in catalogue()], read_records(records))
     if not panels:
-        raise ValueError("the records hold no times: make them by filtergym benchmark, or without naming any")
+        raise ValueError("the records hold no times: make them by filtergym benchmark")
     save(draw_fronts(panels, columns=columns), into)
     for title, names in fronts_in_words(panels).items():
         console.print(f"{title}: {names}", highlight=False)

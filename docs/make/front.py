@@ -1,4 +1,4 @@
-"""The front of cost and time of every environment: measured, kept as records, and drawn in one picture."""
+"""The front of cost and time of every environment, drawn from the records of a benchmark in one picture."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,64 +7,8 @@ from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem
 from filtergym.evaluation.front_figure import Panel, draw_panel, legend_of, name_points
 from filtergym.evaluation.metrics import Record
-from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import figure_with_pairs, in_print
-from filtergym.evaluation.rollout import Progress
-from filtergym.evaluation.store import Store
-from filtergym.evaluation.summary import EvaluationRequest, Summary, combine_summaries, summaries
-from filtergym.evaluation.times import METRIC, front, points_of_records
-
-from filtergym.names import evaluation_requests
-from filtergym.reports.benchmark import affordable_episodes, ranked_names
-from filtergym.reports.work import work_of
-
-METRICS = ("relative_cost_difference", METRIC)
-"""Of the records that are kept."""
-
-
-def front_requests(problem: Problem, episodes: int, seed: int) -> list[EvaluationRequest]:
-    """Return what is measured of an environment's training distribution: all that is ranked, and the reference."""
-    count = affordable_episodes(problem, problem.task.default_scenario, episodes)
-    experiment = problem.experiment(None, count, seed, timed=True)
-    names = [*ranked_names(problem), problem.baselines.score_reference]
-    return evaluation_requests(problem, experiment, [name for name in names if name])
-
-
-def measure_fronts(
-    problems: Sequence[Problem],
-    episodes: int,
-    seed: int,
-    workers: Workers,
-    store: Store,
-    start: Any,
-) -> list[Record]:
-    """Measure cost and time of every competitor of some environments, going on after an interruption.
-
-    Args:
-        problems: the environments.
-        episodes: at most, of each competitor.
-        seed: number of the experiment.
-        workers: who does the work.
-        store: keeps what is done.
-        start: told the number of measurements; returns what is told of those done.
-
-    Returns:
-        Tidy records of :data:`METRICS`.
-    """
-    asked = [
-        (i, one) for i, problem in enumerate(problems) for one in front_requests(problem, episodes, seed)
-    ]
-    tick: Progress = start(sum(one.measurements for _, one in asked))
-    work = [work_of(problems[i], one) for i, one in asked]
-    found: list[dict[str, Summary]] = [{} for _ in problems]
-    for k, summary in summaries([one for _, one in asked], workers, tick, store, work):
-        i, one = asked[k]
-        found[i][one.name] = summary
-    records: list[Record] = []
-    for i, own in enumerate(found):
-        names = [one.name for j, one in asked if j == i]
-        records += [r for r in combine_summaries([own[name] for name in names])[0] if r.metric in METRICS]
-    return records
+from filtergym.evaluation.times import front, points_of_records
 
 
 def panels_of(problems: Sequence[Problem], records: Sequence[Record]) -> list[Panel]:

@@ -52,7 +52,7 @@ numbers: tuned trained shipped evaluated
 tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
-evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/comparison $(ENVIRONMENTS:%=$(DONE)/room-%) \
+evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/comparison $(DONE)/front $(ENVIRONMENTS:%=$(DONE)/room-%) \
   $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
@@ -94,9 +94,12 @@ $(DONE)/comparison: $(shipped)
 	$(BIN)/python docs/make comparison results/full/results.json --into docs/comparison.md
 	$(finish)
 
-$(DONE)/room-%: $(DONE)/ship-%
-	$(BIN)/python docs/make room filtergym/$*-v0 --episodes $(call episodes,$*) --seed 0 \
-	  --into docs/environments/$(room_$*).md
+$(DONE)/front: $(DONE)/comparison
+	$(BIN)/python docs/make front results/full/results.json
+	$(finish)
+
+$(DONE)/room-%: $(DONE)/comparison
+	$(BIN)/python docs/make room filtergym/$*-v0 results/full/results.json --into docs/environments/$(room_$*).md
 	$(BIN)/python docs/make page filtergym/$*-v0 --into docs/environments/$(room_$*).md
 	$(finish)
 

@@ -1,14 +1,13 @@
 """The room table: who is best on an environment's training distribution, and how much there is to win."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
-from filtergym.agents.named_policies import pretrained_agents
+from comparison import BenchmarkRecords
 from filtergym.baselines.problem import Problem
-from filtergym.evaluation.metrics import Record, tidy_records
+from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.times import TIME_NOTE, TIME_TITLE, column_of_times
 from filtergym.papers.grid import markdown_table
 
-from filtergym.names import competitors_of
 from filtergym.reports.ranking import ranking_sentence
 from filtergym.reports.tables import (
     INCONSISTENT,
@@ -24,16 +23,28 @@ MARKER = "room table"
 """What the markers of a page are called, between which the table stands."""
 
 
-def room_policies(problem: Problem) -> list[str]:
-    """Names in the room table: everything that has a name, but random actions."""
-    return [name for name in (*problem.names, *pretrained_agents(problem.id)) if name != "random"]
+def room_records(found: Sequence[BenchmarkRecords], problem: Problem) -> list[Record]:
+    """Return what a benchmark has measured in the training distribution of an environment, of all but random actions.
 
+    Args:
+        found: what :func:`.comparison.read_benchmark` has read.
+        problem: the environment.
 
-def measure_room(problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
-    """Evaluate everything that the room table shows, on the test split of the default scenario."""
-    makers = competitors_of(problem, room_policies(problem))
-    dataset = problem.evaluate(makers, None, episodes, seed, progress=progress, timed=True)
-    return tidy_records(dataset, problem.baselines.metrics)
+    Raises:
+        ValueError: if there is nothing.
+    """
+    records = [
+        record
+        for own in found
+        for record in own.records
+        if (own.problem.id, record.scenario) == (problem.id, problem.task.default_scenario)
+        and record.policy != "random"
+    ]
+    if not records:
+        raise ValueError(
+            f"no records of {problem.id} in its training distribution: make them by filtergym benchmark --full"
+        )
+    return records
 
 
 def room_markdown(records: list[Record], paper: str, command: str) -> str:
