@@ -118,7 +118,7 @@ def front(
     ),
     columns: Columns = 2,
 ) -> None:
-    """Draw cost against time of every competitor in the training distribution of each environment, and the front of both.
+    """Draw cost against time, and the front of both, of all competitors in each training distribution.
 
     Example: python docs/make front results/results.json
     """
