@@ -6,6 +6,7 @@ those of the task.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy
@@ -13,10 +14,10 @@ import numpy
 from ...envs.model import Model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
+from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
-from .fault_hypotheses import VAGUE, FaultHypotheses
+from .fault_hypotheses import TRAINING, VAGUE, FaultHypotheses, FaultPrior
 from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 
@@ -182,6 +183,30 @@ def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any]
     return {"transition": chain(1.0 - 10.0 ** values["log10_leave"])}, MultiHypothesis
 
 
+HYPOTHESES_ON_FAULTS = {
+    "fault-hypotheses": Variant(
+        FaultHypotheses,
+        "Bank over motion and faults: legs, errors of pseudoranges that last and jump, noise levels of rates; the "
+        "prior of the training distribution.",
+    ),
+    "fault-hypotheses-vague": Variant(
+        FaultHypotheses, "The same with one vague prior for everything that may come.", prior=VAGUE
+    ),
+}
+
+
+def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
+    """Each candidate runs alone: values make tables."""
+    found = tunable(
+        HYPOTHESES_ON_FAULTS[name],
+        leg=(1.0, prior.leg, 10.0),
+        acceleration=(3.0, prior.acceleration, 40.0),
+        log10_noisy_rate=(-3.0, math.log10(prior.noisy_rate), -0.5),
+        coloured=(0.3, prior.coloured, 5.0),
+    )
+    return replace(found, in_lanes=False)
+
+
 TUNABLE = {
     "fixed-gain": tunable(
         FixedGain, _make_fixed_gain, rates=(-0.2, 0.0, 0.3), accelerometers=(0.0, 0.8, 1.0)
@@ -200,6 +225,8 @@ TUNABLE = {
     ),
     "huber-stuck-check": tunable(HuberStuckCheck, rates=(0.5, EFFICIENT, 6.0), manoeuvre=(1.0, 4.0, 20.0)),
     "sticky": tunable(Sticky, _sticky, log10_leave=(-6.0, -4.0, -0.5)),
+    "fault-hypotheses": _tunable_hypotheses("fault-hypotheses", TRAINING),
+    "fault-hypotheses-vague": _tunable_hypotheses("fault-hypotheses-vague", VAGUE),
 }
 
 BASELINES = Baselines(
@@ -224,14 +251,7 @@ BASELINES = Baselines(
     estimators={
         "huber": Huber,
         "huber-stuck-check": HuberStuckCheck,
-        "fault-hypotheses": Variant(
-            FaultHypotheses,
-            "Bank over motion and faults: legs, errors of pseudoranges that last and jump, noise levels of rates; the "
-            "prior of the training distribution.",
-        ),
-        "fault-hypotheses-vague": Variant(
-            FaultHypotheses, "The same with one vague prior for everything that may come.", prior=VAGUE
-        ),
+        **HYPOTHESES_ON_FAULTS,
     },
     references={"known-mode": KnownMode},
     bounds={"known-mode-bound": KnownModeBound},

@@ -3,7 +3,9 @@
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy
@@ -11,10 +13,10 @@ import numpy
 from ...envs.model import Model
 from ...envs.uav_autopilot.banks import MODES
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ..table import Baselines, ConstantMode, Variant, tunable
+from ..table import Baselines, ConstantMode, Tunable, Variant, tunable
 from .alarm import AutopilotAlarm
 from .estimators import ESTIMATORS, GustInteractingMultipleModel
-from .level_bank import VAGUE, LevelBank
+from .level_bank import TRAINING, VAGUE, LevelBank, LevelPrior
 from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 
@@ -98,6 +100,28 @@ def _make_tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], C
 
 _MEMORY = (20.0, 100.0, 400.0)
 _WEIGHT = (-3.0, 1.0 / 3.0, 3.0)
+BANKS: dict[str, Any] = {
+    "level-bank": LevelBank,
+    "level-bank-vague": Variant(
+        LevelBank,
+        "The level bank with one vague prior for all flights: wider levels, outliers, a biased rate sensor, a slow "
+        "actuator.",
+        prior=VAGUE,
+    ),
+}
+
+
+def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
+    """Each candidate runs alone: values make tables."""
+    found = tunable(
+        BANKS[name],
+        log10_gust_change=(-3.5, math.log10(prior.gust_change), -1.0),
+        log10_sensor_change=(-4.0, math.log10(prior.sensor_change), -1.0),
+        nominal=(0.02, prior.nominal, 0.5),
+        kept=(0.1, prior.kept, 0.9),
+    )
+    return replace(found, in_lanes=False)
+
 
 TUNABLE = {
     "fixed-best": tunable(
@@ -125,6 +149,8 @@ TUNABLE = {
         low=(0.1, 0.5, 0.9),
         high=(1.2, 2.0, 4.0),
     ),
+    "level-bank": _tunable_bank("level-bank", TRAINING),
+    "level-bank-vague": _tunable_bank("level-bank-vague", VAGUE),
 }
 
 BASELINES = Baselines(
@@ -152,13 +178,7 @@ BASELINES = Baselines(
     },
     estimators={
         **ESTIMATORS,
-        "level-bank": LevelBank,
-        "level-bank-vague": Variant(
-            LevelBank,
-            "The level bank with one vague prior for all flights: wider levels, outliers, a biased rate sensor, a slow "
-            "actuator.",
-            prior=VAGUE,
-        ),
+        **BANKS,
     },
     references={"true-state": TrueState, "matched": Matched},
     bounds={"known-noise-bound": KnownNoiseBound},

@@ -108,6 +108,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
                 lambda f, _: f.mean_innovation,
                 "short average of the innovation over its sigma",
                 sensors,
+                SIGNED_LOG,
             ),
             Block(
                 "log_mean_square",
