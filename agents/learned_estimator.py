@@ -19,19 +19,20 @@ from ..evaluation.steered_filter import Steered, steer
 
 
 class LearnedEstimator:
-    """A trained bank with its network, see :class:`~..evaluation.competitors.Estimator`.
+    """A bank with the policy that closes it, see :class:`~..evaluation.competitors.Estimator`.
 
     Args:
         model: with the bank.
         network: a policy made for the bank, on NumPy.
+        interval: measurements for which an action holds.
     """
 
     kind: ClassVar[Kind] = "estimator"
     traceable: ClassVar[bool] = True
 
-    def __init__(self, model: Model, network: Policy) -> None:
+    def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
         self.network = network
-        self.filter = steer(model, network, interval=1)
+        self.filter = steer(model, network, interval)
 
     def start(self, initial: Any, N: int) -> Steered:
         """Start the filter where everyone starts."""

@@ -161,6 +161,9 @@ class Baselines:
     metrics: "OwnMetrics | None" = None
     """The environment's own."""
 
+    fallback: str = ""
+    """Policy or estimator that answers where an agent behind a gate is not trusted: the best classical filter that takes
+    about as long as an agent, by the cost on the validation split of the training distribution. Empty: the paper's."""
     alarm: Callable[[Any], Alarm] | None = None
     """Class that says from observations that something is wrong, for any control; None: the general one."""
 
