@@ -2,7 +2,7 @@
 
 Where filters and sensors are as modelled a classical filter is hard to beat and easy to harm, and what a network
 answers to what it never saw nobody knows. So an agent is trusted while an alarm (:mod:`..baselines.alarm`) has spoken
-within the last decisions, and what it is shown lies within what it saw in training (:mod:`.envelope`). Whoever is not
+within the last decisions, and what it is shown lies within what it saw in training (:mod:`.envelope`). Who is not
 trusted goes on all the same, so that it remembers the whole episode when its time comes.
 
 There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and answers with the
@@ -28,6 +28,7 @@ from ..envs.task import Task
 from ..evaluation.competitors import (
     ConstantPolicy,
     Kind,
+    Likelihood,
     Policy,
     RandomPolicy,
     check_competitor,
@@ -44,6 +45,8 @@ from .residual import ResidualPolicy, policy_to_correct
 
 CHECKED_EPISODES = 128
 """Of the validation split on which a fallback is compared with the paper's algorithm."""
+MOST_ODDS = math.log(100.0)
+"""Log-odds of one filter to another beyond which nothing is remembered (ours: decisive by Jeffreys' scale)."""
 SIGNIFICANT = 3.0
 """Standard errors by which a fallback that is refused costs more."""
 
@@ -284,10 +287,16 @@ class GatedMemory(NamedTuple):
     """State of the agent's filter."""
     fallback: Any
     """Memory of the other."""
+    odds: Array
+    """Log-odds of the fallback to the agent's filter by how well they have predicted the measurements, ``(N,)``."""
 
 
 class GatedEstimator:
     """An agent's filter and a fallback side by side, see :class:`~..evaluation.competitors.Estimator`.
+
+    Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
+    measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
+    forgotten as soon as new ones speak against them.
 
     Args:
         agent: a filter whose policy is a :class:`ListeningPolicy`.
@@ -297,35 +306,38 @@ class GatedEstimator:
     kind: ClassVar[Kind] = "estimator"
 
     def __init__(self, agent: LearnedEstimator, fallback: Any) -> None:
-        self.agent, self.fallback = agent, fallback
-        inner = agent.network.policy
-        self.traceable = says_traceable(inner) and getattr(fallback, "traceable", False)
-
-    @property
-    def network(self) -> Policy:
-        """What is asked."""
-        return self.agent.network
-
-    @property
-    def filter(self) -> Any:
-        """The agent's."""
-        return self.agent.filter
+        self.agent, self.fallback, self.xp = agent, fallback, agent.filter.xp
+        self.network, self.filter = agent.network, agent.filter
+        policy: Any = agent.network
+        self.traceable = says_traceable(policy.policy) and getattr(fallback, "traceable", False)
 
     def start(self, initial: Any, N: int) -> GatedMemory:
         """Start both where everyone starts."""
-        return GatedMemory(self.agent.start(initial, N), self.fallback.start(initial, N))
+        return GatedMemory(
+            self.agent.start(initial, N), self.fallback.start(initial, N), 0.0 * initial.mean[0]
+        )
 
     def update(self, measurement: Any, memory: GatedMemory) -> tuple[Array, Array, GatedMemory]:
         """Let both take the measurement in, and answer with the estimate of the one that is trusted."""
-        xp = self.filter.xp
+        xp = self.xp
         mean, covariance, agent = self.agent.update(measurement, memory.agent)
-        other_mean, other_covariance, fallback, *_ = self.fallback.update(measurement, memory.fallback)
-        # An agent whose track is lost altogether is not asked either.
-        trusted = (agent.policy.memory.trusted[0] > 0.5) & xp.all(xp.isfinite(mean), axis=0)
+        other_mean, other_covariance, fallback, *told = self.fallback.update(measurement, memory.fallback)
+        own = self.agent.log_likelihood(agent, measurement)
+        if isinstance(self.fallback, LearnedEstimator):
+            other = self.fallback.log_likelihood(fallback, measurement)
+        else:
+            other = Likelihood.of(*told).log_likelihood if told else None
+        odds = memory.odds
+        if own is not None and other is not None:
+            ratio = other - own
+            odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
+        # A track that is lost altogether, so that its estimate is no number, is no answer either.
+        sound = xp.all(xp.isfinite(mean), axis=0)
+        trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
         return (
             xp.where(trusted, mean, other_mean),
             xp.where(trusted, covariance, other_covariance),
-            GatedMemory(agent, fallback),
+            GatedMemory(agent, fallback, odds),
         )
 
 
