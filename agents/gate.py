@@ -341,6 +341,11 @@ class GatedEstimator:
         )
 
 
+def is_gateable(maker: Any) -> bool:
+    """Whether a competitor has actions that follow from what is measured, so that alarms have something to listen to."""
+    return kind_of(maker) == "policy" and maker is not RandomPolicy
+
+
 class GatedMaker:
     """Makes an agent behind a gate for a task; what an evaluation calls.
 
@@ -369,7 +374,7 @@ class GatedMaker:
         alarm: Any = None,
         window: int | None = None,
     ) -> None:
-        if kind_of(maker) != "policy" or maker is RandomPolicy:
+        if not is_gateable(maker):
             raise ValueError(
                 f"{name!r} is of kind {kind_of(maker)} and has no actions that follow from what is measured: an alarm "
                 "has nothing to listen to"
@@ -401,11 +406,18 @@ class GatedMaker:
                 "on it would do harm; choose another fallback"
             )
 
-    def __call__(self, task: Task) -> GatedEstimator:
-        """Make it."""
+    def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
+        """Make it.
+
+        Args:
+            task: that it is made for.
+            replace: from the agent's policy to what stands in its place.
+        """
         model = Model(task, self.control)
         shown = model.on_numpy()
         policy = check_competitor(self.name, make_competitor(self.maker, shown), "policy")
+        if replace is not None:
+            policy = replace(policy)
         trust = Trust(shown, self.alarm, self.window, self.envelope)
         agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), task.decision_interval)
         return GatedEstimator(agent, self._make_fallback(task))
