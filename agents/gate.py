@@ -40,7 +40,7 @@ from ..evaluation.competitors import (
 from ..evaluation.evaluate import control_of
 from ..evaluation.metrics import mean_cost
 from .envelope import EnvelopeAlarm, TrainingRange, training_range
-from .learned_estimator import LearnedEstimator
+from .learned_estimator import EstimatorMaker, LearnedEstimator
 from .residual import ResidualPolicy, policy_to_correct
 
 CHECKED_EPISODES = 128
@@ -343,7 +343,7 @@ class GatedEstimator:
 
 def is_gateable(maker: Any) -> bool:
     """Whether a competitor has actions that follow from what is measured, so that alarms have something to listen to."""
-    return kind_of(maker) == "policy" and maker is not RandomPolicy
+    return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
 
 
 class GatedMaker:
@@ -382,7 +382,10 @@ class GatedMaker:
         self.problem, self.name, self.maker = problem, name, maker
         self.fallback = fallback or problem.baselines.fallback or problem.paper
         self.alarm, self.window = alarm, window
-        self.control = control_of(maker, "policy", None, problem.task, name)
+        learned = isinstance(maker, EstimatorMaker)
+        self._policy = maker.policy if learned else maker
+        self._is_asked_always = learned
+        self.control = maker.bank if learned else control_of(maker, "policy", None, problem.task, name)
         self.task_keywords = getattr(maker, "task_keywords", {})
         self._fallback = problem.competitor(self.fallback)
         self._check_fallback()
@@ -415,11 +418,12 @@ class GatedMaker:
         """
         model = Model(task, self.control)
         shown = model.on_numpy()
-        policy = check_competitor(self.name, make_competitor(self.maker, shown), "policy")
+        policy = check_competitor(self.name, make_competitor(self._policy, shown), "policy")
         if replace is not None:
             policy = replace(policy)
         trust = Trust(shown, self.alarm, self.window, self.envelope)
-        agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), task.decision_interval)
+        interval = 1 if self._is_asked_always else task.decision_interval
+        agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
         return GatedEstimator(agent, self._make_fallback(task))
 
     def _make_fallback(self, task: Task) -> Any:
