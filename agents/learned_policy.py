@@ -185,7 +185,10 @@ def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
         header = dict(file.metadata())
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     # To float32 outwards: the ends themselves were seen.
-    ends = (numpy.nextafter(numpy.float32(end), numpy.float32(away)) for end, away in ((low, -numpy.inf), (high, numpy.inf)))
+    ends = (
+        numpy.nextafter(numpy.float32(end), numpy.float32(away))
+        for end, away in ((low, -numpy.inf), (high, numpy.inf))
+    )
     arrays |= dict(zip(ENVELOPE, ends, strict=True))
     with whole_file(path) as partial:
         partial.write_bytes(save(arrays, header))

@@ -18,9 +18,9 @@ from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import mean_cost
+from stresses import STRESSES
 
 from filtergym.names import GATED, find_competitor
-from stresses import STRESSES
 
 LOST = 10.0
 """Cost over the paper's from which on a track is lost."""

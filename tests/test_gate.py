@@ -213,14 +213,11 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
         ("UavAutopilot", "ppo"),
         ("RadarEsmTracking", "ppo"),
         pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
-        pytest.param("TightlyCoupledNavigation", "bptt", marks=pytest.mark.slow),
     ],
 )
 def test_both_filters_and_alarms_are_compiled_and_nothing_else_comes_out(name, agent):
     id = f"filtergym/{name}-v0"
     names, options = [f"gated:{agent}"], {"episodes": 3, "split": "validation", "horizon": 40}
-    if name == "TightlyCoupledNavigation":
-        options["horizon"] = 20
     compiled = evaluate(id, names, backend="compiled", timed=True, **options)
     assert compiled["compiled"].values.all()
     plain = evaluate(id, names, backend="numpy", **options)
@@ -257,9 +254,13 @@ def test_who_predicts_worse_than_the_fallback_is_not_trusted():
 
 def test_a_gate_that_falls_back_on_something_worse_than_the_paper_is_refused():
     problem = problem_of(ID)
-    with pytest.raises(ValueError, match=r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"):
+    with pytest.raises(
+        ValueError, match=r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"
+    ):
         GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="fixed-low")
-    with pytest.raises(ValueError, match="'imm-smoother' is of kind smoother and nothing that a gate can fall"):
+    with pytest.raises(
+        ValueError, match="'imm-smoother' is of kind smoother and nothing that a gate can fall"
+    ):
         GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-smoother")
     with pytest.raises(ValueError, match="'imm-tuned' has parameters of the task of its own"):
         GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-tuned")

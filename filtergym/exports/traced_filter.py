@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..agents.gate import Gated, GatedMaker, ListeningPolicy
+from ..agents.gate import Gated, GatedMaker
 from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import LearnedPolicy
 from ..agents.residual import ResidualPolicy
