@@ -125,8 +125,8 @@ class WatchedPolicy(Policy):
 
 
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
-    """Return what an agent carries of its training, or fly some episodes of it again; None where nobody knows how it was
-    trained, or on a mixture of scenarios.
+    """Return what an agent carries of its training, or fly some episodes of it again; None where nobody knows how it
+    was trained, or on a mixture of scenarios.
 
     Args:
         cls: the task.

@@ -342,7 +342,7 @@ class GatedEstimator:
 
 
 def is_gateable(maker: Any) -> bool:
-    """Whether a competitor has actions that follow from what is measured, so that alarms have something to listen to."""
+    """Whether a competitor has actions that follow from what is measured, so that there is something to hold back."""
     return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
 
 
@@ -398,8 +398,8 @@ class GatedMaker:
             raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
         if keywords:
             raise ValueError(
-                f"{self.fallback!r} has parameters of the task of its own ({', '.join(keywords)}) and cannot run beside "
-                "an agent: choose another fallback"
+                f"{self.fallback!r} has parameters of the task of its own ({', '.join(keywords)}) and cannot run "
+                "beside an agent: choose another fallback"
             )
         excess, errors = excess_cost(self.problem, self.fallback)
         if errors > SIGNIFICANT:

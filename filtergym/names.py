@@ -36,8 +36,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
-            ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with a
-            classical filter. A path is that of a file or folder, whatever else has its name.
+            ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
+            a classical filter. A path is that of a file or folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
