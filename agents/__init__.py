@@ -10,6 +10,7 @@ from typing import Any
 _HOMES = {
     "to_sb3": "adapter",
     "Gated": "gate",
+    "GatedMaker": "gate",
     "LearnedPolicy": "learned_policy",
     "ResidualActions": "residual",
     "ResidualPolicy": "residual",
@@ -18,6 +19,7 @@ _HOMES = {
 }
 __all__ = [
     "Gated",
+    "GatedMaker",
     "LearnedPolicy",
     "ResidualActions",
     "ResidualPolicy",

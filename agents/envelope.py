@@ -1,16 +1,20 @@
 """Whether an agent is shown what it was trained on.
 
-A network answers whatever it is asked. What it saw in training is flown again, a few episodes of its training
-distribution, and what it is shown now is held against that, field by field.
+A network answers whatever it is asked. Its envelope is what it saw of each field in its training: an exported agent
+carries it in its file; of others some hundred episodes of the training distribution are flown again. What an agent is
+shown now is held against that, field by field.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
 
+from ..baselines.alarm import Alarm
 from ..envs.backend import make_model
 from ..envs.catalogue import parameter_names
+from ..envs.model import Model
 from ..envs.parameters import freeze
 from ..envs.scenario_choice import find_mixture, make_task
 from ..envs.task import Task
@@ -19,8 +23,8 @@ from ..evaluation.rollout import start_lanes
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stepping import SteppingPolicy
 
-EPISODES = 64
-"""Of the training distribution that are flown."""
+EPISODES = 512
+"""Of the training distribution that are flown: of few, an episode of the same distribution would often lie outside."""
 EPISODES_NOW = 16
 """Of what is evaluated."""
 MOST_DECISIONS = 400
@@ -29,6 +33,10 @@ TOLERATED = 0.1
 """Share of a field's values outside of what was seen in training that is not spoken of."""
 
 
+USUAL = 1e-3
+"""Share of a field's values that lie outside of what was seen, in training itself."""
+OFTEN = 0.5
+"""The same where an agent is shown what it was not trained on."""
 WINDOW = 50.0
 """Decisions over which a running filter judges what it is shown."""
 
@@ -45,7 +53,29 @@ class TrainingRange(NamedTuple):
 
     def is_outside(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Which values of observations ``(n, fields)`` were not seen in training."""
-        return numpy.asarray((observation < self.low) | (observation > self.high))
+        # What is no number was not seen either.
+        return numpy.logical_not((observation >= self.low) & (observation <= self.high))
+
+
+class EnvelopeAlarm(Alarm):
+    """Speaks where what an agent is shown leaves what it saw in its training.
+
+    In training a value of a field lies outside once in ``1 / USUAL`` decisions or less, outside of it half of them do:
+    the sum of log-likelihood ratios of each field is an alarm like any other.
+
+    Args:
+        model: whose observations are shown.
+        range: of the training.
+    """
+
+    def __init__(self, model: Model, range: TrainingRange) -> None:
+        super().__init__(model)
+        self.range, self.columns = range, model.columns(range.fields)
+
+    def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
+        """Weigh every field for itself."""
+        outside = self.range.is_outside(observation[:, self.columns])
+        return numpy.where(outside, math.log(OFTEN / USUAL), math.log((1.0 - OFTEN) / (1.0 - USUAL)))
 
 
 class WatchedPolicy(Policy):
@@ -95,7 +125,8 @@ class WatchedPolicy(Policy):
 
 
 def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
-    """Fly some episodes of an agent's training again; None where nobody knows how it was trained.
+    """Return what an agent carries of its training, or fly some episodes of it again; None where nobody knows how it
+    was trained, or on a mixture of scenarios.
 
     Args:
         cls: the task.
@@ -105,6 +136,10 @@ def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
     if stored is None:
         return None
     run = stored.header["run"]
+    if stored.envelope is not None:
+        return TrainingRange(tuple(stored.header["fields"]), *stored.envelope)
+    if find_mixture(cls, run.get("scenario")) is not None:
+        return None
     seen = _observations(
         cls, stored, run.get("scenario"), _own_parameters(cls, run), episode_seeds("validation", 1, EPISODES)
     )

@@ -4,7 +4,8 @@ import shutil
 from pathlib import Path
 
 from ..evaluation.files import whole_files, writable_file
-from .learned_policy import load_policy, write_arrays
+from .envelope import training_range
+from .learned_policy import load_policy, write_arrays, write_envelope
 from .named_policies import load_zipped_model
 from .training_run import TrainingEpisodes, TrainingRun, best_agent, load_run, save_run
 
@@ -39,6 +40,9 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
             agent = load_zipped_model(run.problem.task, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
+        seen = training_range(run.problem.task, load_policy(run.problem.task, file))
+        if seen is not None:
+            write_envelope(file, seen.low, seen.high)
         costs = TrainingEpisodes(run, CHECK_EPISODES).costs(load_policy(run.problem.task, file))
         run.exported = {"episodes": CHECK_EPISODES, "cost": float(costs.mean())}
         save_run(run, file.with_suffix(".json"))

@@ -1,31 +1,54 @@
-"""Do no harm: a policy that acts only while something is wrong.
+"""Do no harm: an agent is trusted only while something is wrong that it has met in its training.
 
-Where filters and sensors are as modelled the paper's algorithm is hard to beat and easy to harm. So the gate answers
-the paper's action, or another policy's, unless an alarm (:mod:`..baselines.alarm`) has spoken within the last
-decisions. The policy inside is asked at every decision, so that it remembers the whole episode when its time comes.
+Where filters and sensors are as modelled a classical filter is hard to beat and easy to harm, and what a network
+answers to what it never saw nobody knows. So an agent is trusted while an alarm (:mod:`..baselines.alarm`) has spoken
+within the last decisions, and what it is shown lies within what it saw in training (:mod:`.envelope`). Who is not
+trusted goes on all the same, so that it remembers the whole episode when its time comes.
+
+There are two gates. ``gated:NAME`` runs two filters side by side, the agent's and a classical one, and answers with the
+estimate of the one that is trusted (:class:`GatedEstimator`): the fallback may be any policy or estimator, whatever the
+agent steers, and in a closed loop the estimate that is trusted flies. In training (``--gated``) both share one filter,
+and the gate holds back the agent's action (:class:`Gated`): the fallback is an action of the same control.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy
 
 from ..baselines.alarm import Alarm, InnovationAlarm
-from ..baselines.problem import Problem
+from ..baselines.problem import Problem, problem_of
+from ..envs.failures import explain_errors
 from ..envs.model import Model
+from ..envs.observation import Array
+from ..envs.task import Task
 from ..evaluation.competitors import (
     ConstantPolicy,
+    Kind,
+    Likelihood,
     Policy,
+    RandomPolicy,
     check_competitor,
     expose_spaces,
     kind_of,
     make_competitor,
+    says_traceable,
 )
+from ..evaluation.evaluate import control_of
+from ..evaluation.metrics import mean_cost
+from .envelope import EnvelopeAlarm, TrainingRange, training_range
+from .learned_estimator import EstimatorMaker, LearnedEstimator
 from .residual import ResidualPolicy, policy_to_correct
 
-NEVER = numpy.iinfo(numpy.int64).max // 2
-"""Decisions since an alarm that has not spoken."""
+CHECKED_EPISODES = 128
+"""Of the validation split on which a fallback is compared with the paper's algorithm."""
+MOST_ODDS = math.log(100.0)
+"""Log-odds of one filter to another beyond which nothing is remembered (ours: decisive by Jeffreys' scale)."""
+SIGNIFICANT = 3.0
+"""Standard errors by which a fallback that is refused costs more."""
 
 
 class PaperAction(ConstantPolicy):
@@ -53,24 +76,91 @@ class PaperAction(ConstantPolicy):
             )
 
 
+class TrustMemory(NamedTuple):
+    """What is remembered of alarms."""
+
+    alarm: Any
+    envelope: Any
+    """None where there is none."""
+    heeded: Array
+    """Decisions for which the alarm is still heeded, ``(N,)``."""
+    outside: Array
+    """Decisions for which the agent is not trusted because it was shown what it had not met, ``(N,)``."""
+
+
+class Trust:
+    """Decides at every decision whether an agent is trusted.
+
+    Args:
+        model: whose observations it is shown.
+        alarm: an object with a method ``hear`` (:class:`.Alarm`), or what makes one for the model; default: that of the
+            environment's baselines, or :class:`.InnovationAlarm`.
+        window: decisions for which an alarm is heeded, that at which it speaks among them; default: the alarm's.
+        envelope: of the agent's training; without it, it is trusted whatever it is shown.
+
+    Raises:
+        ValueError: if the alarm cannot serve the task, or the window is empty.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        alarm: Any = None,
+        window: int | None = None,
+        envelope: TrainingRange | None = None,
+    ) -> None:
+        alarm = alarm or Problem.of(type(model.task)).baselines.alarm or InnovationAlarm
+        self.alarm: Alarm = make_competitor(alarm, model)
+        self.window = self.alarm.window if window is None else window
+        if self.window < 1:
+            raise ValueError(f"window must be at least one decision, got {self.window!r}")
+        self.envelope = None if envelope is None else EnvelopeAlarm(model, envelope)
+
+    def listen(
+        self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
+    ) -> tuple[numpy.ndarray, TrustMemory]:
+        """Say where the agent is trusted.
+
+        Args:
+            observation: ``(N, fields)``.
+            memory: what the last call returned; None at the first.
+            start: true where an episode begins, ``(N,)``.
+
+        Returns:
+            Booleans ``(N,)``, and memory.
+        """
+        none = 0.0 * observation[:, 0]
+        alarm, envelope, heeded, outside = (None, None, none, none) if memory is None else memory
+        spoken, alarm = self.alarm.hear(observation, alarm, start)
+        heeded = self._count_down(spoken, heeded, start)
+        if self.envelope is not None:
+            left, envelope = self.envelope.hear(observation, envelope, start)
+            outside = self._count_down(left, outside, start)
+        return (heeded > 0.0) & (outside <= 0.0), TrustMemory(alarm, envelope, heeded, outside)
+
+    def _count_down(self, spoken: Array, before: Array, start: Array) -> Array:
+        left = numpy.maximum(numpy.where(start, 0.0, before) - 1.0, 0.0)
+        return numpy.where(spoken, float(self.window), left)
+
+
+# --- two actions of one filter
+
+
 class GateMemory(NamedTuple):
     """What a gate remembers."""
 
-    alarm: Any
+    trust: TrustMemory | None
     fallback: Any
-    since: numpy.ndarray
-    """Decisions since the alarm spoke, ``(N,)``."""
 
 
 class Gate:
-    """Decides between an action and the fallback's.
+    """Decides between an action and the fallback's, in training.
 
     Args:
         model: whose observations it is shown.
         fallback: a policy, or what makes one for the model; default: :class:`PaperAction`.
-        alarm: an object with a method ``hear`` (:class:`.Alarm`), or what makes one for the model; default: that of the
-            environment's baselines, or :class:`.InnovationAlarm`.
-        window: decisions for which an alarm opens the gate, that at which it speaks among them; default: the alarm's.
+        alarm: as of :class:`Trust`.
+        window: likewise.
 
     Raises:
         ValueError: if a default cannot serve the task, the fallback has another control, or the window is empty.
@@ -79,22 +169,17 @@ class Gate:
     def __init__(
         self, model: Model, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
-        alarm = alarm or Problem.of(type(model.task)).baselines.alarm or InnovationAlarm
-        self.alarm: Alarm = make_competitor(alarm, model)
+        self.trust = Trust(model, alarm, window)
         self.fallback: Any = check_competitor(
             "fallback", make_competitor(fallback or PaperAction, model), "policy"
         )
         own = getattr(self.fallback, "control", model.control)
         if own != model.control:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
-        self.window = self.alarm.window if window is None else window
-        if self.window < 1:
-            raise ValueError(f"window must be at least one decision, got {self.window!r}")
 
     def begin(self, seeds: Sequence[int]) -> GateMemory:
         """Memory at the start of the episodes with these seeds."""
-        fallback = self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None
-        return GateMemory(None, fallback, numpy.full(len(seeds), NEVER))
+        return GateMemory(None, self.fallback.begin(seeds) if isinstance(self.fallback, Policy) else None)
 
     def choose(
         self,
@@ -115,16 +200,14 @@ class Gate:
             Actions, where the gate is open, ``(N,)``, and memory.
         """
         memory = self.begin(range(len(observation))) if memory is None else memory
-        spoken, alarm = self.alarm.hear(observation, memory.alarm, start)
+        opened, trust = self.trust.listen(observation, memory.trust, start)
         other, fallback = self.fallback.predict(observation, memory.fallback, start, deterministic=True)
-        since = numpy.where(spoken, 0, numpy.where(start, NEVER, memory.since + 1))
-        opened = since < self.window
         aligned = opened.reshape(-1, *[1] * (numpy.ndim(action) - 1))
-        return numpy.where(aligned, action, other), opened, GateMemory(alarm, fallback, since)
+        return numpy.where(aligned, action, other), opened, GateMemory(trust, fallback)
 
 
 class Gated(Policy):
-    """A policy behind a :class:`Gate`.
+    """A policy behind a :class:`Gate`, as it acts in its training.
 
     Args:
         model: of all of them.
@@ -161,6 +244,225 @@ class Gated(Policy):
         return action, (memory, gate_memory)
 
 
+# --- two filters
+
+
+class ListeningMemory(NamedTuple):
+    """What a policy remembers, and its alarms."""
+
+    policy: Any
+    trust: TrustMemory
+    trusted: Array
+    """Whether it is trusted, booleans ``(N,)``."""
+
+
+class ListeningPolicy(Policy):
+    """A policy that acts as it would alone, and keeps whether it is trusted.
+
+    Args:
+        policy: anything with Stable-Baselines3's ``predict``.
+        trust: that decides about it.
+        model: of both.
+    """
+
+    def __init__(self, policy: Any, trust: Trust, model: Model) -> None:
+        super().__init__(model)
+        self.control = model.control  # type: ignore[misc]  # made for it
+        self.policy, self.trust = policy, trust
+
+    def act(
+        self, observation: numpy.ndarray, state: ListeningMemory | None, start: numpy.ndarray
+    ) -> tuple[numpy.ndarray, ListeningMemory]:
+        """Ask the policy, then the alarms."""
+        memory, trust = (None, None) if state is None else state[:2]
+        action, memory = self.policy.predict(observation, memory, start, deterministic=True)
+        trusted, trust = self.trust.listen(observation, trust, start)
+        return action, ListeningMemory(memory, trust, trusted)
+
+
+class GatedMemory(NamedTuple):
+    """What a gated estimator remembers."""
+
+    agent: Any
+    """State of the agent's filter."""
+    fallback: Any
+    """Memory of the other."""
+    odds: Array
+    """Log-odds of the fallback to the agent's filter by how well they have predicted the measurements, ``(N,)``."""
+
+
+class GatedEstimator:
+    """An agent's filter and a fallback side by side, see :class:`~..evaluation.competitors.Estimator`.
+
+    Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
+    measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
+    forgotten as soon as new ones speak against them.
+
+    Args:
+        agent: a filter whose policy is a :class:`ListeningPolicy`.
+        fallback: an estimator.
+    """
+
+    kind: ClassVar[Kind] = "estimator"
+
+    def __init__(self, agent: LearnedEstimator, fallback: Any) -> None:
+        self.agent, self.fallback, self.xp = agent, fallback, agent.filter.xp
+        self.network, self.filter = agent.network, agent.filter
+        policy: Any = agent.network
+        self.traceable = says_traceable(policy.policy) and getattr(fallback, "traceable", False)
+
+    def start(self, initial: Any, N: int) -> GatedMemory:
+        """Start both where everyone starts."""
+        return GatedMemory(
+            self.agent.start(initial, N), self.fallback.start(initial, N), 0.0 * initial.mean[0]
+        )
+
+    def update(self, measurement: Any, memory: GatedMemory) -> tuple[Array, Array, GatedMemory]:
+        """Let both take the measurement in, and answer with the estimate of the one that is trusted."""
+        xp = self.xp
+        mean, covariance, agent = self.agent.update(measurement, memory.agent)
+        other_mean, other_covariance, fallback, *told = self.fallback.update(measurement, memory.fallback)
+        own = self.agent.log_likelihood(agent, measurement)
+        if isinstance(self.fallback, LearnedEstimator):
+            other = self.fallback.log_likelihood(fallback, measurement)
+        else:
+            other = Likelihood.of(*told).log_likelihood if told else None
+        odds = memory.odds
+        if own is not None and other is not None:
+            ratio = other - own
+            odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
+        # A track that is lost altogether, so that its estimate is no number, is no answer either.
+        sound = xp.all(xp.isfinite(mean), axis=0)
+        trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
+        return (
+            xp.where(trusted, mean, other_mean),
+            xp.where(trusted, covariance, other_covariance),
+            GatedMemory(agent, fallback, odds),
+        )
+
+
+def is_gateable(maker: Any) -> bool:
+    """Whether a competitor has actions that follow from what is measured, so that there is something to hold back."""
+    return isinstance(maker, EstimatorMaker) or (kind_of(maker) == "policy" and maker is not RandomPolicy)
+
+
+class GatedMaker:
+    """Makes an agent behind a gate for a task; what an evaluation calls.
+
+    Args:
+        problem: of both.
+        name: of the agent, in errors.
+        maker: of it.
+        fallback: name of one of the environment's own policies or estimators; default: ``Baselines.fallback``, or the
+            paper's algorithm.
+        alarm: as of :class:`Trust`.
+        window: likewise.
+
+    Raises:
+        ValueError: if the agent has no actions, nothing is known to fall back on, or that is significantly worse than
+            the paper's algorithm.
+    """
+
+    kind: ClassVar[Kind] = "estimator"
+
+    def __init__(
+        self,
+        problem: Problem,
+        name: str,
+        maker: Any,
+        fallback: str = "",
+        alarm: Any = None,
+        window: int | None = None,
+    ) -> None:
+        if not is_gateable(maker):
+            raise ValueError(
+                f"{name!r} is of kind {kind_of(maker)} and has no actions that follow from what is measured: an alarm "
+                "has nothing to listen to"
+            )
+        self.problem, self.name, self.maker = problem, name, maker
+        self.fallback = fallback or problem.baselines.fallback or problem.paper
+        self.alarm, self.window = alarm, window
+        learned = isinstance(maker, EstimatorMaker)
+        self._policy = maker.policy if learned else maker
+        self._is_asked_always = learned
+        self.control = maker.bank if learned else control_of(maker, "policy", None, problem.task, name)
+        self.task_keywords = getattr(maker, "task_keywords", {})
+        self._fallback = problem.competitor(self.fallback)
+        self._check_fallback()
+        self.envelope = training_range(problem.task, maker)
+        """What the agent saw in its training; None where nobody knows."""
+
+    def _check_fallback(self) -> None:
+        kind, keywords = kind_of(self._fallback), getattr(self._fallback, "task_keywords", {})
+        if kind not in ("policy", "estimator") or self._fallback is RandomPolicy:
+            raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
+        if keywords:
+            raise ValueError(
+                f"{self.fallback!r} has parameters of the task of its own ({', '.join(keywords)}) and cannot run "
+                "beside an agent: choose another fallback"
+            )
+        excess, errors = excess_cost(self.problem, self.fallback)
+        if errors > SIGNIFICANT:
+            raise ValueError(
+                f"the fallback {self.fallback!r} costs {100.0 * excess:.1f} % more than the paper's algorithm "
+                f"{self.problem.paper!r} on validation episodes ({errors:.1f} standard errors): a gate that falls back "
+                "on it would do harm; choose another fallback"
+            )
+
+    def __call__(self, task: Task, replace: Callable[[Any], Any] | None = None) -> GatedEstimator:
+        """Make it.
+
+        Args:
+            task: that it is made for.
+            replace: from the agent's policy to what stands in its place.
+        """
+        model = Model(task, self.control)
+        shown = model.on_numpy()
+        policy = check_competitor(self.name, make_competitor(self._policy, shown), "policy")
+        if replace is not None:
+            policy = replace(policy)
+        trust = Trust(shown, self.alarm, self.window, self.envelope)
+        interval = 1 if self._is_asked_always else task.decision_interval
+        agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
+        return GatedEstimator(agent, self._make_fallback(task))
+
+    def _make_fallback(self, task: Task) -> Any:
+        if kind_of(self._fallback) == "estimator":
+            with explain_errors(f"fallback {self.fallback!r} cannot be made"):
+                return make_competitor(self._fallback, task)
+        control = control_of(self._fallback, "policy", None, self.problem.task, self.fallback)
+        model = Model(task, control)
+        policy = make_competitor(self._fallback, model.on_numpy())
+        return LearnedEstimator(model, policy, task.decision_interval)
+
+
+@cache
+def _excess_cost(name: str, fallback: str) -> tuple[float, float]:
+    problem = problem_of(name)
+    names = problem.paper, fallback
+    makers = {each: problem.competitor(each) for each in names}
+    found = problem.evaluate(makers, None, CHECKED_EPISODES, split="validation")
+    paper, other = (mean_cost(found, each) for each in names)
+    difference = other - paper
+    excess, deviation = float(difference.mean()), float(difference.std(ddof=1)) / math.sqrt(len(difference))
+    return excess / float(paper.mean()), excess / deviation if deviation else 0.0
+
+
+def excess_cost(problem: Problem, fallback: str) -> tuple[float, float]:
+    """How much more a competitor costs than the paper's algorithm, on validation episodes of the training distribution.
+
+    Args:
+        problem: of both.
+        fallback: name of the competitor.
+
+    Returns:
+        Difference of the mean costs over the paper's, and the difference in standard errors over paired episodes.
+    """
+    if fallback == problem.paper:
+        return 0.0, 0.0
+    return _excess_cost(problem.name, fallback)
+
+
 class PolicyMaker:
     """Makes for a model a policy with others around it.
 
@@ -181,22 +483,6 @@ class PolicyMaker:
     def __call__(self, model: Model) -> Any:
         """Make it."""
         return self.wrap(model, make_competitor(self.maker, model))
-
-
-def add_gate(name: str, maker: Any) -> PolicyMaker:
-    """Return what makes a policy behind a gate: what a name ``gated:POLICY`` stands for.
-
-    Args:
-        name: of the policy, in errors.
-        maker: of the policy, or the policy itself.
-
-    Raises:
-        ValueError: if it does not act.
-    """
-    kind = kind_of(maker)
-    if kind != "policy":
-        raise ValueError(f"{name!r} is of kind {kind} and has no actions that a gate could hold back")
-    return PolicyMaker(maker, Gated)
 
 
 def as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:

@@ -19,19 +19,20 @@ from ..evaluation.steered_filter import Steered, steer
 
 
 class LearnedEstimator:
-    """A trained bank with its network, see :class:`~..evaluation.competitors.Estimator`.
+    """A bank with the policy that closes it, see :class:`~..evaluation.competitors.Estimator`.
 
     Args:
         model: with the bank.
         network: a policy made for the bank, on NumPy.
+        interval: measurements for which an action holds.
     """
 
     kind: ClassVar[Kind] = "estimator"
     traceable: ClassVar[bool] = True
 
-    def __init__(self, model: Model, network: Policy) -> None:
+    def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
         self.network = network
-        self.filter = steer(model, network, interval=1)
+        self.filter = steer(model, network, interval)
 
     def start(self, initial: Any, N: int) -> Steered:
         """Start the filter where everyone starts."""
@@ -39,9 +40,21 @@ class LearnedEstimator:
 
     def update(self, measurement: Any, memory: Steered) -> tuple[Array, Array, Steered]:
         """Predict, show the network what comes of it, and update as it answers."""
-        measurement = map_arrays(numpy.nan_to_num, measurement)  # banks weigh values by their availability
+        measurement = fill_missing(measurement)
         state = self.filter.update(self.filter.predict(memory, measurement), Input(measurement))
         return self.filter.mean(state), self.filter.covariance(state), state
+
+    def log_likelihood(self, memory: Steered, measurement: Any) -> Array | None:
+        """Log-density of the measurement last taken in, as it was predicted; None where the bank does not tell."""
+        likelihood: Array | None = self.filter.records(memory, fill_missing(measurement)).get(
+            "log_likelihood"
+        )
+        return likelihood
+
+
+def fill_missing(measurement: Any) -> Any:
+    """Put numbers in place of what is missing: banks weigh values by their availability."""
+    return map_arrays(numpy.nan_to_num, measurement)
 
 
 class EstimatorMaker:

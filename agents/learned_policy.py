@@ -3,7 +3,8 @@
 A file is in the safetensors form: arrays, and a header of words. ``observation_mean`` and
 ``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
 (reset, update, new), ``lstm_*`` a long short-term memory (input, forget, cell, output), ``weight_i`` and
-``bias_i`` the layers after it. The header names the environment, the control and the fields of the
+``bias_i`` the layers after it, and ``envelope_low`` and ``envelope_high``, of an exported agent, what it saw of each
+field in its training. The header names the environment, the control and the fields of the
 observation: by their names an agent finds its columns, wherever they stand and whatever else is shown.
 """
 
@@ -32,6 +33,8 @@ ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
 }
 OUTPUTS = ("clip", "tanh", "argmax")
 """How the last layer becomes an action: cut to the box, squashed into it, or the largest entry's index."""
+ENVELOPE = ("envelope_low", "envelope_high")
+"""Arrays beside those of the network: least and largest value of each field in training, see :mod:`.envelope`."""
 HEADER = ("environment", "control", "interface", "fields", "output", "activation", "run")
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are cut here, as in VecNormalize."""
@@ -167,6 +170,30 @@ def write_arrays(
         partial.write_bytes(save(contiguous, header))
 
 
+def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
+    """Add to a learned policy's file what it saw of each field in its training.
+
+    Args:
+        path: of the file.
+        low: least values, ``(fields,)``.
+        high: largest values, likewise.
+    """
+    from safetensors import safe_open
+    from safetensors.numpy import save
+
+    with safe_open(path, framework="numpy") as file:
+        header = dict(file.metadata())
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    # To float32 outwards: the ends themselves were seen.
+    ends = (
+        numpy.nextafter(numpy.float32(end), numpy.float32(away))
+        for end, away in ((low, -numpy.inf), (high, numpy.inf))
+    )
+    arrays |= dict(zip(ENVELOPE, ends, strict=True))
+    with whole_file(path) as partial:
+        partial.write_bytes(save(arrays, header))
+
+
 def read_header(path: Path) -> dict[str, Any]:
     """Return the header of a learned policy's file; ``run`` and ``fields`` are parsed.
 
@@ -220,6 +247,8 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
     for i in range(max(1, sum(name.startswith("weight_") for name in arrays))):
         below, width = width, arrays[f"bias_{i}"].size if f"bias_{i}" in arrays else 0
         expected |= {f"weight_{i}": (width, below), f"bias_{i}": (width,)}
+    if arrays.keys() & set(ENVELOPE):
+        expected |= dict.fromkeys(ENVELOPE, expected["observation_mean"])
     if arrays.keys() != expected.keys():
         raise ValueError(
             f"it holds the arrays {', '.join(sorted(arrays))}, not {', '.join(sorted(expected))}"
@@ -237,6 +266,8 @@ class StoredPolicy:
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = _read(path)
+        ends = [self.arrays.pop(name) for name in ENVELOPE if name in self.arrays]
+        self.envelope = (ends[0], ends[1]) if ends else None
         self.path = path
         self.control = self.header["control"]
         self.around = self.header["run"].get("residual_to", ""), self.header["run"].get("gated", False)

@@ -50,6 +50,8 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
         raise nearest("policy as score_paper", table.score_paper, table.policies)
     if table.score_reference not in ("", *reference):
         raise nearest("reference as score_reference", table.score_reference, reference)
+    if table.fallback not in ("", *table.policies, *table.estimators):
+        raise nearest("policy or estimator as fallback", table.fallback, (*table.policies, *table.estimators))
     for name, maker in table.policies.items():
         control = getattr(maker, "control", None)
         if control is not None and control not in task.controls:

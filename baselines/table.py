@@ -161,6 +161,11 @@ class Baselines:
     metrics: "OwnMetrics | None" = None
     """The environment's own."""
 
+    fallback: str = ""
+    """Policy or estimator that answers where an agent behind a gate is not trusted. Of the classical filters that are
+    neither tuned on the training distribution nor given it as a prior, since they answer where training does not reach,
+    the one of least cost on its validation split; of those within 1 % of the paper's cost the quickest. Empty: the
+    paper's algorithm."""
     alarm: Callable[[Any], Alarm] | None = None
     """Class that says from observations that something is wrong, for any control; None: the general one."""
 

@@ -1,69 +1,135 @@
-"""What shipped agents may cost: the worst scenario of each, and the tracks that it loses and the paper keeps.
+"""What agents may cost where nobody has trained them: every scenario, and the stresses of ``stresses.py``.
 
-Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 2000 --policy bptt --policy gated:bptt
+Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 500 --policy bptt
 
-A track counts as lost where an episode costs ten times what it costs the paper's algorithm, and more than all but one
-in a hundred of the paper's episodes in that scenario.
+Each agent flies alone and behind the gate (``gated:NAME``), beside the fallback of that gate, on the test split. A cell
+is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm, over
+paired episodes, lies above +2 % as a whole. A track counts as lost where an episode costs ten times what it costs the
+paper, and more than all but one in a hundred of the paper's episodes in that cell. ``--cells`` prints every cell.
 """
 
 import argparse
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy
+from filtergym.agents.gate import GatedMaker, is_gateable
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.metrics import mean_cost
+from stresses import STRESSES
 
-import filtergym
+from filtergym.names import GATED, find_competitor
 
 LOST = 10.0
 """Cost over the paper's from which on a track is lost."""
+HARM = 0.02
+"""Cost against the paper's above which it is counted."""
+CONSISTENT = (0.5, 2.0)
+"""Limits of an ANEES that says how accurate a filter is."""
 
 
-def costs(id: str, names: list[str], scenario: str, episodes: int, split: str) -> numpy.ndarray:
-    """Mean cost of every episode, ``(policies, episodes)``."""
-    data = filtergym.evaluate(id, names, scenario, episodes, split=split)
-    return data["cost"].mean("time").values
+class Cell(NamedTuple):
+    """What a competitor did in a scenario or under a stress."""
+
+    name: str
+    """Of the scenario or stress."""
+    ratio: tuple[float, float, float]
+    """Cost against the paper's, and its 95 % interval."""
+    anees: float
+    lost: int
+    """Tracks."""
+
+    @property
+    def harms(self) -> bool:
+        """Whether it is significantly above :data:`HARM`."""
+        return self.ratio[1] > HARM
+
+    @property
+    def text(self) -> str:
+        """The ratio in per cent."""
+        return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in self.ratio))
 
 
-def rows(problem: Problem, agents: list[str], episodes: int, split: str) -> list[str]:
-    """A row for each agent."""
-    worst: dict[str, tuple[list[float], str]] = {}
-    lost, flown = dict.fromkeys(agents, 0), 0
-    scenarios = problem.task.scenarios
-    for scenario in scenarios:
-        paper, *others = costs(problem.id, [problem.paper, *agents], scenario, episodes, split)
-        bootstrap = Bootstrap(episodes)
-        beyond = numpy.quantile(paper, 0.99)
-        for name, cost in zip(agents, others, strict=True):
-            ratio = [
-                float(x) for x in bootstrap.relative_difference(bootstrap.means(cost), bootstrap.means(paper))
-            ]
-            if name not in worst or ratio[0] > worst[name][0][0]:
-                worst[name] = ratio, scenario
-            lost[name] += int(((cost > LOST * paper) & (cost > beyond)).sum())
-        flown += episodes
-    return [
-        f"| {problem.short_name.removesuffix('-v0')} | `{name}` | `{worst[name][1]}` | "
-        + "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in worst[name][0]))
-        + f" | {lost[name]} of {flown} |"
-        for name in agents
-    ]
+def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield the name of each cell, its scenario and its keywords."""
+    for scenario in problem.task.scenarios:
+        yield scenario, scenario, {}
+    if problem.id in STRESSES:
+        known = STRESSES[problem.id]
+        for name, keywords in known.each.items():
+            yield f"+{name}", known.scenario, {**known.usual, **keywords}
+
+
+def fly(
+    problem: Problem,
+    makers: dict[str, Any],
+    episodes: int,
+    split: str,
+    cell: tuple[str, str, dict[str, Any]],
+) -> dict[str, Cell]:
+    """What each competitor did in a cell."""
+    name, scenario, keywords = cell
+    run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
+    paper, bootstrap = mean_cost(run, problem.paper), Bootstrap(run.sizes["episode"])
+    beyond, found = numpy.quantile(paper, 0.99), {}
+    for policy in makers:
+        cost = mean_cost(run, policy)
+        ratio = bootstrap.relative_difference(bootstrap.means(cost), bootstrap.means(paper))
+        lost = int(((cost > LOST * paper) & (cost > beyond)).sum())
+        anees = float(run["nees"].sel(policy=policy).mean()) / run.sizes["component"]
+        low, middle, high = float(ratio[1]), float(ratio[0]), float(ratio[2])
+        found[policy] = Cell(name, (middle, low, high), anees, lost)
+    return found
+
+
+def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
+    """The paper's algorithm, the gate's fallback, and each agent alone and behind the gate."""
+    fallback = problem.baselines.fallback or problem.paper
+    makers = {name: problem.competitor(name) for name in dict.fromkeys([problem.paper, fallback])}
+    for policy in policies:
+        makers[policy] = found = find_competitor(problem, policy)
+        if is_gateable(found) and not policy.startswith(GATED):
+            makers[GATED + policy] = GatedMaker(problem, policy, found)
+    return makers
+
+
+def summary(problem: Problem, policy: str, cells: list[Cell]) -> str:
+    """One row of the table."""
+    worst = max(cells, key=lambda cell: cell.ratio[0])
+    anees = [cell.anees for cell in cells]
+    outside = sum(not CONSISTENT[0] <= value <= CONSISTENT[1] for value in anees)
+    return (
+        f"| {problem.short_name.removesuffix('-v0')} | `{policy}` | {sum(c.harms for c in cells)} of {len(cells)} | "
+        f"`{worst.name}` | {worst.text} | {min(anees):.2g} to {max(anees):.2g} | {outside} | "
+        f"{sum(c.lost for c in cells)} |"
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("environment", nargs="+")
     parser.add_argument("--policy", action="append", help="default: all shipped agents")
-    parser.add_argument("--episodes", type=int, default=2000)
+    parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--split", default="test")
+    parser.add_argument("--cells", action="store_true", help="print every cell, too")
     asked = parser.parse_args()
-    print(
-        "| environment | agent | worst scenario | cost against the paper's there, % | tracks lost |\n"
-        + "|---" * 5
-        + "|"
-    )
+    table = [
+        "| environment | competitor | cells harmed | worst cell | cost against the paper's there, % | ANEES | "
+        "outside 0.5 to 2 | tracks lost |\n" + "|---" * 8 + "|"
+    ]
     for id in asked.environment:
         problem = problem_of(id)
-        agents = asked.policy or pretrained_agents(problem.id)
-        for line in rows(problem, agents, asked.episodes, asked.split):
-            print(line, flush=True)
+        makers = competitors_of(problem, asked.policy or pretrained_agents(problem.id))
+        found: dict[str, list[Cell]] = {name: [] for name in makers}
+        for cell in cells_of(problem):
+            for name, own in fly(problem, makers, asked.episodes, asked.split, cell).items():
+                found[name].append(own)
+                if asked.cells:
+                    print(
+                        f"{problem.short_name} {own.name} {name} {own.text} ANEES {own.anees:.2f}", flush=True
+                    )
+        table += [summary(problem, name, cells) for name, cells in found.items() if name != problem.paper]
+        print("\n".join(table), flush=True)
+        table = []

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
-from .agents.learned_estimator import EstimatorMaker
 from .envs.backend import make_model
 from .envs.live_input import Feed
 from .envs.scenario_choice import find_scenario
@@ -66,7 +65,7 @@ def online(
     range = training_range(problem.task, maker)
     if range is None:
         return OnlineFilter(model, maker, kind, name, tracks)
-    if isinstance(maker, EstimatorMaker):
+    if kind == "estimator":
         estimator = maker(model.task)
         watch = WatchedPolicy(estimator.network, range)
         estimator.filter.decider.ask = watch.act

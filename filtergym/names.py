@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import xarray
 
-from .agents.gate import add_gate
+from .agents.gate import GatedMaker
 from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
 from .baselines.fitted_filters import SUFFIX, read_fitted
 from .baselines.problem import Problem, import_problem, problem_of
@@ -36,8 +36,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
-            ``gated:NAME`` of a policy: that one where something is wrong, elsewhere the paper's algorithm. A path is
-            that of a file or folder, whatever else has its name.
+            ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
+            a classical filter. A path is that of a file or folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
@@ -61,7 +61,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return read_fitted(Path(name), problem)
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return add_gate(inner, find_competitor(problem, inner, trust))
+        return GatedMaker(problem, inner, find_competitor(problem, inner, trust))
     if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned_policies):
         return problem.competitor(name)
     learned = find_learned_policy(problem.task, name, trust)

@@ -1,10 +1,20 @@
 """Agents say where what they are shown departs from what they were trained on."""
 
 import dataclasses
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
-from filtergym.agents.envelope import departure
+from filtergym.agents.envelope import EnvelopeAlarm, TrainingRange, departure, training_range
+from filtergym.agents.learned_policy import load_policy, pretrained_path, write_envelope
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.scenario_choice import make_task
+from filtergym.evaluation.rollout import start_lanes
+from filtergym.evaluation.seeds import episode_seeds
+from models import make_model
 
 import filtergym
 from filtergym.names import find_competitor
@@ -60,3 +70,112 @@ def test_the_command_says_it(command):
     )
     assert code == 0, err
     assert "ppo: trained with range_sigma 100.0, not 3" in " ".join(out.split())
+
+
+def test_an_agent_carries_its_envelope_in_its_file(tmp_path):
+    file = tmp_path / "ppo.safetensors"
+    shutil.copyfile(pretrained_path(TARGET.id, "ppo"), file)
+    flown = training_range(TARGET.task, load_policy(TARGET.task, file))
+    write_envelope(file, flown.low, flown.high)
+    stored = load_policy(TARGET.task, file)
+    carried = training_range(TARGET.task, stored)
+    assert carried.fields == flown.fields
+    np.testing.assert_allclose(carried.low, flown.low, rtol=1e-6, atol=1e-30)
+    assert (carried.low <= flown.low).all()
+    assert (carried.high >= flown.high).all()
+    names = {"carried": file, "ppo": "ppo"}
+    cost = filtergym.evaluate(TARGET.id, names, "random", 4)["cost"].values
+    np.testing.assert_array_equal(cost[0], cost[1])
+
+
+class OneField(EnvelopeAlarm):
+    """Of one field between zero and one, without a task."""
+
+    def __init__(self):
+        self.range, self.columns, self.decisions = TrainingRange(("x",), np.zeros(1), np.ones(1)), [0], 100
+
+
+def test_the_envelope_speaks_soon_and_not_for_one_value():
+    shown = np.full((40, 3), 0.5)
+    shown[10, 1] = 2.0  # once
+    shown[10:20, 2] = -2.0  # for a while
+    alarm, memory, spoken = OneField(), None, []
+    for i, row in enumerate(shown):
+        heard, memory = alarm.hear(row[:, None], memory, np.full(3, i == 0))
+        spoken.append(heard)
+    spoken = np.array(spoken)
+    assert not spoken[:, :2].any()
+    assert spoken[12:20, 2].all()
+    assert not spoken[20:, 2].any()
+
+
+def test_what_is_no_number_was_not_seen():
+    assert TrainingRange(("x",), np.zeros(1), np.ones(1)).is_outside(np.array([[np.nan]])).all()
+
+
+@pytest.mark.parametrize("agent", ["bptt", "ppo"])
+def test_an_agent_is_inside_of_its_envelope_in_training_and_outside_of_it_elsewhere(agent):
+    """Of episodes that were not flown for it; and with a deviation of the range that is a thirtieth of the usual."""
+    maker = find_competitor(TARGET, agent)
+    alarmed = []
+    for keywords in ({}, {"range_sigma": SMALL}):
+        model = make_model(TARGET.id, maker.control, **keywords)
+        alarm = EnvelopeAlarm(model, training_range(TARGET.task, maker))
+        policy, seeds = maker(model), episode_seeds("test", 0, 200)
+        lanes, state, memory, spoken = start_lanes(model, seeds), None, None, np.zeros(200, dtype=bool)
+        for step in range(lanes.decisions_per_episode):
+            shown = lanes.observe()
+            heard, memory = alarm.hear(shown, memory, np.full(200, step == 0))
+            spoken |= heard
+            action, state = policy.predict(shown, state)
+            lanes.decide(action)
+        alarmed.append(spoken.mean())
+    assert alarmed[0] < 0.1
+    assert alarmed[1] > 0.9
+
+
+# --- stresses
+
+
+def stresses():
+    file = Path(__file__).parent.parent / "benchmarks" / "stresses.py"
+    spec = importlib.util.spec_from_file_location("stresses", file)
+    sys.modules["stresses"] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.STRESSES
+
+
+def numbers(value):
+    """Least and largest number in nested tuples; None of what is none."""
+    values = np.array(value, dtype=object).ravel()
+    if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in values):
+        return None
+    return min(values), max(values)
+
+
+def is_beyond(trained, stressed):
+    """Whether nothing of a parameter's range is drawn in training."""
+    ends, own = numbers(trained), numbers(stressed)
+    if ends is None or own is None:
+        return trained != stressed
+    if isinstance(trained, float) and 0.0 < trained < 1.0:
+        return False  # a probability: what comes with one comes in training, too
+    return own[0] > ends[1] or own[1] < ends[0]
+
+
+STRESSED = [(id, name) for id, known in stresses().items() for name in known.each]
+
+
+def test_there_are_fifty_flights_that_no_training_holds():
+    assert len(STRESSED) >= 50
+    assert len({id for id, _ in STRESSED}) == 5
+
+
+@pytest.mark.parametrize(("id", "name"), STRESSED)
+def test_a_stress_lies_outside_of_training(id, name):
+    known, task = stresses()[id], problem_of(id).task
+    keywords = known.each[name]
+    trained = make_task(task, None).parameters
+    stressed = make_task(task, known.scenario, **{**known.usual, **keywords}).parameters
+    beyond = [each for each in keywords if is_beyond(getattr(trained, each), getattr(stressed, each))]
+    assert beyond

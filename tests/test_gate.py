@@ -11,7 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.agents.gate import Gate, Gated, PaperAction
+from filtergym.agents.gate import Gate, Gated, GatedMaker, PaperAction, excess_cost
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
@@ -21,7 +21,7 @@ from filtergym.evaluation.competitors import ConstantPolicy, Policy
 from models import make_model
 from scipy.stats import norm
 
-from filtergym import evaluate, make_policy
+from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -136,7 +136,7 @@ def opened(name, control, scenario, episodes, **keywords):
     class Listening(Gated):
         def act(self, observation, state, start):
             action, state = super().act(observation, state, start)
-            seen.append(state[1].since < self.gate.window)
+            seen.append(state[1].trust.heeded > 0.0)
             return action, state
 
     def make(task):
@@ -193,30 +193,97 @@ def test_every_alarm_serves_every_control(env_id, control, short):
         shown = env.step(env.action_space.sample())[0]
 
 
-def test_by_name_alone_and_stepped_it_is_the_same():
-    name = "gated:bptt"
-    data = evaluate(ID, {"gated": name}, episodes=3, scenario="glint")
-    alone = make_policy(ID, name, scenario="glint")
-    env = gymnasium.make(ID, **alone.keywords, detailed_info=True)
-    for i, seed in enumerate(data["episode_seed"].values):
-        shown, _ = env.reset(seed=int(seed))
-        state, costs, over = alone.begin([int(seed)]), [], False
-        while not over:
-            action, state = alone.predict(shown, state)
-            shown, _, _, over, info = env.step(action)
-            costs.append(info["cost"])
-        np.testing.assert_array_equal(costs, data["cost"].values[0, i])
+def test_a_gated_agent_answers_as_one_of_its_two_filters():
+    fallback = baselines_of(ID).fallback
+    names = ["bptt", fallback, "gated:bptt"]
+    data = evaluate(ID, names, episodes=16, scenario="random", tracks=True, split="validation")
+    agent, other, gated = data["estimate"].values
+    is_agent, is_other = ((gated == estimate).all(axis=-1) for estimate in (agent, other))
+    assert (is_agent | is_other).all()
+    assert 0.05 < is_agent.mean() < 0.95
+    variance = data["covariance"].values
+    assert (variance[2][is_other] == variance[1][is_other]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "agent"),
+    [
+        ("ManeuveringTarget", "ppo"),
+        ("ManeuveringTarget", "kalman-net"),
+        ("UavAutopilot", "ppo"),
+        ("RadarEsmTracking", "ppo"),
+        pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
+    ],
+)
+def test_both_filters_and_alarms_are_compiled_and_nothing_else_comes_out(name, agent):
+    id = f"filtergym/{name}-v0"
+    names, options = [f"gated:{agent}"], {"episodes": 3, "split": "validation", "horizon": 40}
+    compiled = evaluate(id, names, backend="compiled", timed=True, **options)
+    assert compiled["compiled"].values.all()
+    plain = evaluate(id, names, backend="numpy", **options)
+    np.testing.assert_allclose(compiled["cost"].values, plain["cost"].values, rtol=1e-6)
+
+
+class Lying(Policy):
+    """Whoever is asked in its place takes the wildest action."""
+
+    control = "gain"
+    traceable = True
+
+    def act(self, observation, state, start):
+        return np.ones((len(observation), 1)), state
+
+
+class Loud(Alarm):
+    """Speaks always."""
+
+    def hear(self, observation, memory, start):
+        return observation[:, 0] == observation[:, 0], None
+
+
+def test_who_predicts_worse_than_the_fallback_is_not_trusted():
+    """Under control gain of UavAutopilot the action one triples the process noise, and the alarm is always on."""
+    problem = problem_of("filtergym/UavAutopilot-v0")
+    gated = GatedMaker(problem, "lying", Lying, fallback="kalman", alarm=Loud)
+    makers = {"kalman": "kalman", "lying": Lying, "gated": gated}
+    data = evaluate(problem.id, makers, "paper-noise", 32, split="validation")
+    paper, lying, held = data["cost"].mean(["episode", "time"]).values
+    assert lying > 1.01 * paper
+    assert held - paper < 0.25 * (lying - paper)
+
+
+def test_a_gate_that_falls_back_on_something_worse_than_the_paper_is_refused():
+    problem = problem_of(ID)
+    with pytest.raises(
+        ValueError, match=r"fallback 'fixed-low' costs [\d.]+ % more than the paper's algorithm 'imm'"
+    ):
+        GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="fixed-low")
+    with pytest.raises(
+        ValueError, match="'imm-smoother' is of kind smoother and nothing that a gate can fall"
+    ):
+        GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-smoother")
+    with pytest.raises(ValueError, match="'imm-tuned' has parameters of the task of its own"):
+        GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-tuned")
+
+
+def test_every_environment_falls_back_on_something_better_than_the_paper(env_id):
+    problem = problem_of(env_id)
+    excess, errors = excess_cost(problem, problem.baselines.fallback)
+    assert excess < 0.0
+    assert errors < 0.0
 
 
 def test_gates_that_cannot_be():
-    with pytest.raises(ValueError, match="'kalman-imm' is of kind estimator and has no actions that a gate"):
+    with pytest.raises(ValueError, match="'kalman-imm' is of kind estimator and has no actions that follow"):
         competitor(ID, "gated:kalman-imm")
+    with pytest.raises(ValueError, match="'random' is of kind policy and has no actions that follow"):
+        competitor(ID, "gated:random")
     with pytest.raises(ValueError, match="unknown policy 'immm'"):
         competitor(ID, "gated:immm")
     with pytest.raises(
         ValueError, match="has no constant action that is the paper's: give the gate a fallback"
     ):
-        evaluate(ID, ["gated:hard-imm"], episodes=1)
+        Gate(make_model(ID, "mode"))
     with pytest.raises(ValueError, match="fallback is made for control 'gain', but the task has 'gains'"):
         Gate(make_model(ID, "gains"), fallback=Constant)
     with pytest.raises(ValueError, match="policy is made for control 'gain', but the task has 'gains'"):
@@ -242,11 +309,11 @@ def pendulum():
 
 def test_an_environment_of_ones_own_has_the_general_alarm_or_brings_one(pendulum):
     model = make_model(pendulum)
-    assert type(Gate(model).alarm) is InnovationAlarm
+    assert type(Gate(model).trust.alarm) is InnovationAlarm
     baselines.USER_BASELINES[pendulum] = dataclasses.replace(baselines_of(pendulum), alarm=Scripted)
-    assert type(Gate(model).alarm) is Scripted
-    assert Gate(model).window == 3
-    assert Gate(model, alarm=InnovationAlarm).window == InnovationAlarm.window
+    assert type(Gate(model).trust.alarm) is Scripted
+    assert Gate(model).trust.window == 3
+    assert Gate(model, alarm=InnovationAlarm).trust.window == InnovationAlarm.window
 
 
 # --- in training

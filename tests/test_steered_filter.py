@@ -40,10 +40,8 @@ def estimates(model, episode):
     [
         ("ManeuveringTarget", "imm", {}),
         ("ManeuveringTarget", "adaptive", {"decision_interval": 3}),
-        ("ManeuveringTarget", "gated:fixed-high", {}),
         ("ManeuveringTarget", "hard-imm", {}),
         ("RadarEsmTracking", "forgetting-joint-type", {}),
-        ("RadarEsmTracking", "gated:quasi-optimal", {}),
         ("LooselyCoupledNavigation", "augmented-gain-mehra", {}),
         ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
         ("UavAutopilot", "innovation-adaptive", {}),

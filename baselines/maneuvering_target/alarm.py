@@ -12,6 +12,7 @@ ROUNDING = 1e-6
 class RadarAlarm(Alarm):
     """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
     that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
+    Of a learned Kalman filter innovations are all that counts: it is told of such scans.
     """
 
     window = 50
@@ -19,10 +20,12 @@ class RadarAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.bank = model.control != "gain"
+        self.fixed_gains = model.control in self.task.banks
+        self.bank = self.fixed_gains and model.control != "gain"
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
         self.read = [model.reader(name) for name in names]
-        self.available, self.elapsed = model.reader("available"), model.reader("elapsed")
+        self.available = model.reader("available")
+        self.elapsed = model.reader("elapsed") if self.fixed_gains else None
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh scans, and what there is of them."""
@@ -33,5 +36,7 @@ class RadarAlarm(Alarm):
             innovation = numpy.stack([innovation[:, 0], y[:, 0]], axis=1)
             likelihood = [log_likelihood[:, 1:] - log_likelihood[:, :1]]
         weighed = innovation_evidence(innovation, numpy.broadcast_to(there, innovation.shape))
+        if self.elapsed is None:
+            return weighed
         irregular = ~there | (numpy.abs(self.elapsed(observation) - 1.0) > ROUNDING)
         return numpy.concatenate([weighed, *likelihood, certain(irregular[:, 0])], axis=1)

@@ -196,6 +196,7 @@ BASELINES = Baselines(
     score_reference="known-turn",
     log_families=log_families,
     tunable=TUNABLE,
+    fallback="semi-markov-vague",
     alarm=RadarAlarm,
     metrics=METRICS,
     best_constant="fixed-best",

@@ -272,6 +272,7 @@ BASELINES = Baselines(
     score_paper="quasi-optimal",
     score_reference="ideal",
     tunable=TUNABLE,
+    fallback="forgetting-joint-type",
     alarm=ClassAlarm,
     best_constant="fixed-weights",
     physical=("rmse", "acceleration"),

@@ -185,6 +185,7 @@ BASELINES = Baselines(
     score_paper="kalman",
     score_reference="matched",
     tunable=TUNABLE,
+    fallback="level-bank-vague",
     alarm=AutopilotAlarm,
     best_constant="fixed-best",
     physical=("tracking_rmse", ""),

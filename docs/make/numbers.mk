@@ -114,7 +114,6 @@ $(DONE)/plain:
 
 $(DONE)/harm-%: $(DONE)/ship-%
 	$(BIN)/python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*) > build/harm-$*.txt
-	$(BIN)/python benchmarks/gate.py filtergym/$*-v0 bptt > build/gate-$*.txt
 	$(finish)
 
 $(DONE)/paper-%:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..agents.gate import Gated
+from ..agents.gate import Gated, GatedMaker
 from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import LearnedPolicy
 from ..agents.residual import ResidualPolicy
@@ -29,7 +29,7 @@ from ..envs.filter import Input
 from ..envs.model import Model
 from ..envs.task import Task
 from ..evaluation.competitors import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
-from ..evaluation.steered_filter import Steered, SteeredFilter, steer
+from ..evaluation.steered_filter import Decider, Decisions, Steered, SteeredFilter, steer
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
@@ -93,6 +93,14 @@ class EstimatorSteps:
         return memory, {"mean": mean, "covariance": covariance, **known}
 
 
+class GatedSteps(EstimatorSteps):
+    """An agent's filter and another side by side."""
+
+    def due_nodes(self, state: Any, graph: Graph) -> list[int]:
+        """Expression of whether the agent is asked at a measurement."""
+        return due_nodes(self.own.filter.decider, state.agent.policy, graph)
+
+
 class SteeredSteps:
     """A bank closed by a policy.
 
@@ -119,8 +127,12 @@ class SteeredSteps:
 
     def due_nodes(self, state: Steered, graph: Graph) -> list[int]:
         """Expression of whether the policy is asked at a measurement."""
-        decider = self.steered.decider
-        return nodes_of(decider.is_due(state.policy)) if decider.interval > 1 else [graph.constant(True)]
+        return due_nodes(self.steered.decider, state.policy, graph)
+
+
+def due_nodes(decider: Decider, decisions: Decisions, graph: Graph) -> list[int]:
+    """Expression of whether a policy is asked at a measurement."""
+    return nodes_of(decider.is_due(decisions)) if decider.interval > 1 else [graph.constant(True)]
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:
@@ -179,7 +191,7 @@ def check_kind(name: str, maker: Any) -> None:
 
 def steps_of(
     task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
-) -> tuple[EstimatorSteps | SteeredSteps, "AskedNetwork | None"]:
+) -> tuple[EstimatorSteps | GatedSteps | SteeredSteps, "AskedNetwork | None"]:
     """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
 
     Args:
@@ -193,6 +205,15 @@ def steps_of(
     if isinstance(maker, EstimatorMaker):
         policy, network = with_asked_network(maker(plain.task).network, graph)
         return SteeredSteps(steer(Model(traced, maker.bank), policy, 1), masked=True), network
+    if isinstance(maker, GatedMaker):
+        inside: list[AskedNetwork | None] = []
+
+        def replace(policy: Any) -> Any:
+            replaced, network = with_asked_network(policy, graph)
+            inside.append(network)
+            return replaced
+
+        return GatedSteps(traced, maker(traced, replace)), inside[0]
     if kind_of(maker) == "estimator":
         own = make_competitor(maker, traced)
         if not getattr(own, "traceable", False):
@@ -378,7 +399,7 @@ def trace_filter(
 
 
 def _trace(
-    steps: EstimatorSteps | SteeredSteps,
+    steps: EstimatorSteps | GatedSteps | SteeredSteps,
     asked: "AskedNetwork | None",
     template: tuple[Any, Any],
     graph: Graph,
@@ -400,7 +421,7 @@ def _trace(
         if not classes.split(after):
             break
     shown = []
-    if asked is not None and asked.shown and isinstance(steps, SteeredSteps):
+    if asked is not None and asked.shown and isinstance(steps, GatedSteps | SteeredSteps):
         shown = [*steps.due_nodes(before, graph), *asked.shown]
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])
