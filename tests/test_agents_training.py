@@ -24,7 +24,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from filtergym.agents import training_run
 from filtergym.agents.adapter import to_sb3
-from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_header
 from filtergym.agents.network_arrays import network_arrays
@@ -235,7 +235,7 @@ def test_an_exported_estimator_is_what_was_validated(tmp_path):
 def test_exported_recurrent_policy_acts_like_the_network(tmp_path):
     model = make_model(ID, "weights")
     torch.manual_seed(0)
-    network = RecurrentPolicy(len(model.fields), model.action_space, 5)
+    network = NetworkPolicy(len(model.fields), model.action_space, 5)
     network.head.weight.data.mul_(20.0)
     network.mean.fill_(0.3)
     network.scale.fill_(2.0)
@@ -257,7 +257,7 @@ def gradient_of_bias(truncation, horizon=6):
     env = TaskVectorEnv(ID, 3, "gain", horizon=horizon, backend="torch", autoreset_mode="Disabled")
     env.reset(seed=1)
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(env.model.fields), env.model.action_space, 4).double()
+    policy = NetworkPolicy(len(env.model.fields), env.model.action_space, 4).double()
     # Observations are cut to float32 by the policy; here in double, for differences.
     policy.forward = lambda shown, hidden: double_forward(policy, shown, hidden)
 
@@ -596,11 +596,11 @@ def test_a_run_begins_at_the_first_action():
     space = gymnasium.spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, 4.0], np.float32))
     for asked, answered in ((None, [0.0, 2.0]), ([0.5, 1.0], [0.5, 1.0]), ([1.0, 0.0], [0.9, 0.2])):
         torch.manual_seed(0)
-        policy = RecurrentPolicy(3, space, 8, asked)
+        policy = NetworkPolicy(3, space, 8, asked)
         with torch.no_grad():
             policy.head.weight.zero_()
             action, _ = policy(torch.randn(5, 3), torch.zeros(5, 8))
         np.testing.assert_allclose(action, np.tile(answered, (5, 1)), atol=1e-6)
     for wrong in ([0.0], [0.0, 5.0]):
         with pytest.raises(ValueError, match="first_action must be an action of Box"):
-            RecurrentPolicy(3, space, 8, wrong)
+            NetworkPolicy(3, space, 8, wrong)

@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 import array_api_compat.torch as torch_namespace
 import torch
 from filtergym.agents import bptt
-from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.training_run import RunOptions, Session, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.compiler import namespace
@@ -104,7 +104,7 @@ def test_nothing_flows_back_to_a_place_in_a_table():
 
 def random_policy(env, dtype):
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(env.model.fields), env.model.action_space, 6).to(dtype)
+    policy = NetworkPolicy(len(env.model.fields), env.model.action_space, 6).to(dtype)
     with torch.no_grad():
         policy.head.weight.mul_(10.0)
         policy.head.bias.normal_(0.0, 0.3)
