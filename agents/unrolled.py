@@ -44,7 +44,8 @@ class UnrolledPolicy:
         """Take the parameters as they are now."""
         policy = self._policy
         self._mean, self._scale, self._used, self._low, high = (
-            part.numpy()[:, None] for part in (policy.mean, policy.scale, policy.used, policy.low, policy.high)
+            part.numpy()[:, None]
+            for part in (policy.mean, policy.scale, policy.used, policy.low, policy.high)
         )
         self._half = (high - self._low) * 0.5
         self._layers.read()
