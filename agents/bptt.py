@@ -53,6 +53,8 @@ from .unrolled import Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")
 """A linear rule; one hidden layer; a gated recurrent unit, which remembers."""
+ACTIVATION = "relu"
+"""Of the hidden layer: sixteen rectifiers take as long as four tanh."""
 PRUNED = 0.5
 """Share of a run after which no field is read beside those that are kept."""
 NEAREST = 0.9
@@ -116,7 +118,7 @@ class NetworkPolicy(torch.nn.Module):
 
     @property
     def layers(self) -> list[torch.nn.Linear]:
-        """Layers in order, each followed by tanh; the memory, if there is one, comes before them."""
+        """Layers in order, after the memory if there is one; tanh follows the last, the rectifier those before."""
         return [*self.hidden, self.head]  # type: ignore[list-item]  # of Linear
 
     @property
@@ -133,9 +135,9 @@ class NetworkPolicy(torch.nn.Module):
         features = ((observation.to(self.mean.dtype) - self.mean) / self.scale).clamp(-10.0, 10.0) * self.used
         if self.gru is not None:
             features = memory = self.gru(features, memory)
-        for layer in self.layers:
-            features = torch.tanh(layer(features))
-        return self.low + (self.high - self.low) * 0.5 * (1.0 + features), memory
+        for layer in self.hidden:
+            features = torch.relu(layer(features))
+        return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(features))), memory
 
     def strongest_fields(self, count: int) -> numpy.ndarray:
         """Return the places of the fields of the largest weights among those in use, in ascending order.
@@ -284,7 +286,7 @@ def _reward_to_descend(run: TrainingRun) -> str:
 
 def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     """Return the agent that a network in training is by now."""
-    network = LearnedPolicy(model, policy.arrays(), "tanh", fields=policy.fields(model))
+    network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
     return as_trained(model, network, gated=gated)
 
 
@@ -358,7 +360,7 @@ class Descent:
 
         def save_agent(place: Path) -> None:
             path = place / "agent.safetensors"
-            write_arrays(path, policy.arrays(), run, "tanh", fields=policy.fields(self.env.model))
+            write_arrays(path, policy.arrays(), run, "tanh", ACTIVATION, policy.fields(self.env.model))
 
         steered = EstimatorMaker(run.control, agent) if run.algorithm in ESTIMATORS else agent
         return Trainee(steered, self.save_checkpoint, save_agent)

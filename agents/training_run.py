@@ -279,8 +279,8 @@ def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
         )
     if residual_to and algorithm in THROUGH_THE_FILTER:
         raise ValueError(
-            f"algorithm {algorithm!r} has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or "
-            "sac"
+            f"algorithm {algorithm!r} has no gradient of the policy that would be corrected: "
+            "choose ppo, recurrent-ppo or sac"
         )
     corrected = policy_to_correct(models[0], residual_to) if residual_to else None
     if options.gated:

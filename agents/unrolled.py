@@ -88,7 +88,7 @@ class UnrolledPolicy:
 
 
 class UnrolledLayers:
-    """Linear layers, each followed by tanh: ``features' = tanh([weights, bias] @ [features, 1])``.
+    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them.
 
     Args:
         layers: of torch.
@@ -112,15 +112,19 @@ class UnrolledLayers:
     def forward(self, decision: int, features: numpy.ndarray) -> numpy.ndarray:
         """Answer features, 1 below them; they are kept and must not be changed until they were differentiated."""
         self._inputs[0][decision] = features
-        for matrix, input, output in zip(self._matrices, self._inputs, self._outputs, strict=True):
-            numpy.tanh(matrix @ input[decision], out=output[decision, :-1])
-        return self._outputs[-1][decision, :-1]
+        last = len(self._layers) - 1
+        for i, matrix in enumerate(self._matrices):
+            sums, output = matrix @ self._inputs[i][decision], self._outputs[i][decision, :-1]
+            numpy.tanh(sums, out=output) if i == last else numpy.maximum(sums, 0.0, out=output)
+        return output
 
     def backward(self, decision: int, gradient: numpy.ndarray) -> numpy.ndarray:
         """Turn the gradient with respect to the answer into that with respect to the features."""
+        last = len(self._layers) - 1
         for i in reversed(range(len(self._layers))):
             answer = self._outputs[i][decision, :-1]
-            gradient = (gradient * (1.0 - answer * answer)).astype(answer.dtype, copy=False)
+            slope = 1.0 - answer * answer if i == last else answer > 0.0
+            gradient = (gradient * slope).astype(answer.dtype, copy=False)
             # Products of what has nearly vanished fall below the smallest normal number, where processors are slow.
             gradient *= numpy.abs(gradient) > self._vanished
             self._of_matrices[i] += gradient @ self._inputs[i][decision].T

@@ -251,7 +251,7 @@ def test_exported_network_acts_like_the_trained_one(network, kept, tmp_path):
     assert int(trained.used.sum()) == (len(model.fields) if kept is None else kept)
     path = tmp_path / "agent.safetensors"
     run = new_run(problem_of(ID), RunOptions("bptt", "weights"))
-    write_arrays(path, trained.arrays(), run, "tanh", fields=trained.fields(model))
+    write_arrays(path, trained.arrays(), run, "tanh", "relu", trained.fields(model))
     assert read_header(path)["fields"] == [
         field.name for field, used in zip(model.fields, trained.used, strict=True) if used
     ]
