@@ -19,8 +19,8 @@ OPTIONS = ("control", "scenario", "backend")
 """Keywords of an environment that a run has options for."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training takes."""
-ESTIMATORS = {"kalman-net": "kalman-net", "kalman-net-small": "kalman-net"}
-"""Algorithms that make a learned estimator, and the filters of their own that they steer (``Task.trained_banks``)."""
+ESTIMATORS = ("kalman-net",)
+"""Algorithms that make a learned estimator: they steer a filter of their own (``Task.trained_banks``)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
 OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}

@@ -60,7 +60,6 @@ FILES = {
     "bptt-linear": "bptt_linear",
     "bptt-small": "bptt_small",
     "kalman-net": "kalman_net",
-    "kalman-net-small": "kalman_net_small",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 VALIDATION_EPISODES = 512
@@ -296,13 +295,12 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     """
     if algorithm not in ESTIMATORS:
         return cls.controls
-    bank = ESTIMATORS[algorithm]
-    if bank not in cls.trained_banks:
-        having = [other.id for other in catalogue().values() if bank in other.trained_banks]
+    if algorithm not in cls.trained_banks:
+        having = [other.id for other in catalogue().values() if algorithm in other.trained_banks]
         raise ValueError(
             f"{cls.id} has no filter for {algorithm!r} to steer: choose another algorithm, or {', '.join(having)}"
         )
-    return (bank,)
+    return (algorithm,)
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:

@@ -22,7 +22,7 @@ from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
-from filtergym.agents.settings import ESTIMATORS, merge_settings, parse_settings, read_config
+from filtergym.agents.settings import merge_settings, parse_settings, read_config
 from filtergym.agents.training_run import (
     RunOptions,
     Session,
@@ -198,7 +198,7 @@ def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
 def test_shipped_hyperparameters_pass_the_check_of_settings():
     for algorithm in training_run.FILES:
         # A learned estimator steers a filter of its own, and no control.
-        control = {"dqn": "mode", **ESTIMATORS}.get(algorithm, "gain")
+        control = {"dqn": "mode", "kalman-net": "kalman-net"}.get(algorithm, "gain")
         new_run(problem_of(ID), RunOptions(algorithm, control, overrides={"learning_rate": 1e-4}))
 
 
