@@ -119,7 +119,7 @@ class NetworkPolicy(torch.nn.Module):
     @property
     def layers(self) -> list[torch.nn.Linear]:
         """Layers in order, after the memory if there is one; tanh follows the last, the rectifier those before."""
-        return [*self.hidden, self.head]  # type: ignore[list-item]  # of Linear
+        return [*self.hidden, self.head]
 
     @property
     def memory_size(self) -> int:
