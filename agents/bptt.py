@@ -1,4 +1,4 @@
-"""Learning through the filter: a small recurrent policy trained on the gradient of the episode's cost.
+"""Learning through the filter: a small network trained on the gradient of the episode's cost.
 
 A task is differentiable from the action to the reward of every later measurement. So no value function and no
 exploration are needed: the mean cost of a batch of episodes is differentiated through filter and policy
@@ -8,12 +8,16 @@ descended every ``truncation`` decisions (truncated back-propagation): values go
 Compiled episodes are differentiated by the code of :mod:`.unrolled`, with the same gradients as torch's and several
 times as fast; a task that cannot be compiled runs on torch tensors.
 
+The network is a linear rule, has one hidden layer, or a memory (``network``); one that is to be quick reads few fields
+of the observation in the end (``fields_kept``), those of the largest weights.
+
 A learned estimator (``kalman-net``) is trained by the same descent: its network steers a filter of its own.
 """
 
 import functools
 import io
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,8 +27,10 @@ import numpy
 import torch
 
 from ..envs.backend import host_array
+from ..envs.catalogue import nearest
 from ..envs.environment import TaskVectorEnv
 from ..envs.model import Model
+from ..envs.parameters import check_integer
 from ..envs.scenario_choice import find_mixture
 from ..evaluation.competitors import Policy
 from ..evaluation.seeds import episode_seeds
@@ -45,27 +51,37 @@ from .training_run import (
 )
 from .unrolled import Unrolled
 
+NETWORKS = ("linear", "feedforward", "recurrent")
+"""A linear rule; one hidden layer; a gated recurrent unit, which remembers."""
+ACTIVATION = "relu"
+"""Of the hidden layer: sixteen rectifiers take as long as four tanh."""
+PRUNED = 0.5
+"""Share of a run after which no field is read beside those that are kept."""
 NEAREST = 0.9
 """How far towards the edge of the box the first actions may be, where its middle is 0: nearer there is no gradient."""
 
 
-class RecurrentPolicy(torch.nn.Module):
-    """Observation, normalised -> GRU -> tanh -> box of the actions.
+class NetworkPolicy(torch.nn.Module):
+    """Observation, normalised -> network -> tanh -> box of the actions.
 
     Args:
         observations: fields of the observation.
         space: of the actions.
-        hidden_size: of the memory.
+        hidden_size: of the memory or of the hidden layer; a linear rule has neither.
         first_action: about what is answered before anything is learned; default: the middle of the box.
+        network: one of ``NETWORKS``.
+        fields_kept: how many fields of the observation the agent reads that is saved; None: all.
 
     Raises:
-        ValueError: if that is no action.
+        ValueError: if that is no action or no network, or for fewer than one field.
     """
 
     low: torch.Tensor
     high: torch.Tensor
     mean: torch.Tensor
     scale: torch.Tensor
+    used: torch.Tensor
+    """1 of a field that is read in training, 0 of one that is not any more."""
 
     def __init__(
         self,
@@ -73,15 +89,23 @@ class RecurrentPolicy(torch.nn.Module):
         space: gymnasium.spaces.Box,
         hidden_size: int,
         first_action: Sequence[float] | None = None,
+        network: str = "recurrent",
+        fields_kept: int | None = None,
     ) -> None:
         super().__init__()
+        if network not in NETWORKS:
+            raise nearest("network", network, NETWORKS)
         middle, half = 0.5 * (space.high + space.low), 0.5 * (space.high - space.low)
         first = middle if first_action is None else numpy.asarray(first_action, dtype=float)
         if first.shape != space.shape or not space.contains(first.astype(space.dtype)):
             raise ValueError(f"first_action must be an action of {space}, got {first_action!r}")
         inside = numpy.clip((first - middle) / half, -NEAREST, NEAREST)
-        self.gru = torch.nn.GRUCell(observations, hidden_size)
-        self.head = torch.nn.Linear(hidden_size, space.shape[0])
+        kept = observations if fields_kept is None else check_integer("fields_kept", fields_kept, 1)
+        self.fields_kept = min(observations, kept)
+        self.gru = torch.nn.GRUCell(observations, hidden_size) if network == "recurrent" else None
+        hidden = [torch.nn.Linear(observations, hidden_size)] if network == "feedforward" else []
+        self.hidden = torch.nn.ModuleList(hidden)
+        self.head = torch.nn.Linear(observations if network == "linear" else hidden_size, space.shape[0])
         with torch.no_grad():
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
@@ -90,31 +114,70 @@ class RecurrentPolicy(torch.nn.Module):
         self.register_buffer("high", torch.as_tensor(space.high))
         self.register_buffer("mean", torch.zeros(observations))
         self.register_buffer("scale", torch.ones(observations))
+        self.register_buffer("used", torch.ones(observations))
 
-    def forward(self, observation: torch.Tensor, hidden: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Answer observations ``(N, fields)`` and memory ``(N, hidden)`` with actions and memory."""
-        shown = ((observation.to(self.mean.dtype) - self.mean) / self.scale).clamp(-10.0, 10.0)
-        hidden = self.gru(shown, hidden)
-        return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(hidden))), hidden
+    @property
+    def layers(self) -> list[torch.nn.Linear]:
+        """Layers in order, after the memory if there is one; tanh follows the last, the rectifier those before."""
+        return [*self.hidden, self.head]
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that are remembered from one decision to the next."""
+        return 0 if self.gru is None else self.gru.hidden_size
+
+    def new_memory(self, envs: int) -> torch.Tensor:
+        """Return what is remembered at the start of so many episodes, ``(envs, memory_size)``."""
+        return self.mean.new_zeros(envs, self.memory_size)
+
+    def forward(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Answer observations ``(N, fields)`` and memory ``(N, memory_size)`` with actions and memory."""
+        features = ((observation.to(self.mean.dtype) - self.mean) / self.scale).clamp(-10.0, 10.0) * self.used
+        if self.gru is not None:
+            features = memory = self.gru(features, memory)
+        for layer in self.hidden:
+            features = torch.relu(layer(features))
+        return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(features))), memory
+
+    def strongest_fields(self, count: int) -> numpy.ndarray:
+        """Return the places of the fields of the largest weights among those in use, in ascending order.
+
+        Observations are normalised, so that a small weight is a small influence (magnitude pruning).
+        """
+        first = self.layers[0].weight if self.gru is None else self.gru.weight_ih
+        # A field that is not in use comes after all others, whatever its weight once was.
+        strength = torch.where(self.used > 0.0, first.detach().norm(dim=0), -1.0).numpy()
+        return numpy.sort(numpy.argsort(-strength, kind="stable")[:count])
+
+    def use_fields(self, count: int) -> None:
+        """Read from now on only so many of the fields in use, those with the largest weights."""
+        self.used[numpy.setdiff1d(numpy.arange(len(self.used)), self.strongest_fields(count))] = 0.0
 
     def arrays(self) -> dict[str, numpy.ndarray]:
-        """Return the policy as a :class:`~.learned_policy.LearnedPolicy` takes it."""
-        named = {
-            "observation_mean": self.mean,
-            "observation_scale": self.scale,
-            "gru_input_weight": self.gru.weight_ih,
-            "gru_input_bias": self.gru.bias_ih,
-            "gru_memory_weight": self.gru.weight_hh,
-            "gru_memory_bias": self.gru.bias_hh,
-            "weight_0": self.head.weight,
-            "bias_0": self.head.bias,
-        }
+        """Return the policy as a :class:`~.learned_policy.LearnedPolicy` takes it, of its strongest fields only."""
+        columns = self.strongest_fields(self.fields_kept)
+        named = {"observation_mean": self.mean[columns], "observation_scale": self.scale[columns]}
+        if self.gru is not None:
+            named |= {
+                "gru_input_weight": self.gru.weight_ih[:, columns],
+                "gru_input_bias": self.gru.bias_ih,
+                "gru_memory_weight": self.gru.weight_hh,
+                "gru_memory_bias": self.gru.bias_hh,
+            }
+        for i, layer in enumerate(self.layers):
+            of_fields = i == 0 and self.gru is None
+            named[f"weight_{i}"] = layer.weight[:, columns] if of_fields else layer.weight
+            named[f"bias_{i}"] = layer.bias
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
+
+    def fields(self, model: Model) -> list[str]:
+        """Names of what :meth:`arrays` take of an observation."""
+        return [model.fields[i].name for i in self.strongest_fields(self.fields_kept)]
 
 
 def descend_episodes(
     env: TaskVectorEnv,
-    policy: RecurrentPolicy,
+    policy: NetworkPolicy,
     truncation: int,
     descend: Callable[[], None],
     gate: Gate | None = None,
@@ -137,7 +200,7 @@ def descend_episodes(
         Mean cost of a measurement, in the unit of the reward and compressed as there.
     """
     observation, _ = env.reset()
-    hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)
+    hidden = policy.new_memory(env.num_envs)
     total, pending = 0.0, torch.zeros(())
     memory, start = None, numpy.ones(env.num_envs, dtype=bool)
 
@@ -168,10 +231,10 @@ def descend_episodes(
     return total / env.last_decision
 
 
-def measure_normalisation(env: TaskVectorEnv, policy: RecurrentPolicy) -> None:
+def measure_normalisation(env: TaskVectorEnv, policy: NetworkPolicy) -> None:
     """Set the policy's normalisation to the observations that its first actions bring about."""
     observation, _ = env.reset()
-    hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)
+    hidden = policy.new_memory(env.num_envs)
     seen = []
     with torch.no_grad():
         for _ in range(env.last_decision):
@@ -221,9 +284,10 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
-def _agent_of(policy: RecurrentPolicy, gated: bool, model: Model) -> Policy:
+def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     """Return the agent that a network in training is by now."""
-    return as_trained(model, LearnedPolicy(model, policy.arrays(), "tanh"), gated=gated)
+    network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
+    return as_trained(model, network, gated=gated)
 
 
 class Descent:
@@ -248,9 +312,14 @@ class Descent:
         self.env = _environment(run)
         run.backend = self.env.backend
         self.env.reset(seed=episode_seeds("train", run.seed, run.envs))
-        first_action = self.values.get("first_action")
-        self.policy = RecurrentPolicy(
-            len(self.env.model.fields), space, self.values["hidden_size"], first_action
+        values = self.values
+        self.policy = NetworkPolicy(
+            len(self.env.model.fields),
+            space,
+            values["hidden_size"],
+            values.get("first_action"),
+            values.get("network", "recurrent"),
+            values.get("fields_kept"),
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()
@@ -275,10 +344,14 @@ class Descent:
         self.optimiser.zero_grad()
         return float(norm)
 
-    def slow_down(self) -> None:
-        """Set the learning rate to that of the share of the run that is done."""
+    def follow_schedule(self) -> None:
+        """Set the learning rate, and the fields that are read, to those of the share of the run that is done."""
+        done, policy = self.steps_done / self.run.steps, self.policy
         for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(1.0 - self.steps_done / self.run.steps)
+            group["lr"] = self.learning_rate(1.0 - done)
+        # Geometrically fewer: each time the rest has about as long to learn without what is left out.
+        every = len(policy.used)
+        policy.use_fields(math.ceil(every * (policy.fields_kept / every) ** min(1.0, done / PRUNED)))
 
     def trainee(self) -> Trainee:
         """Return the agent as the bookkeeping takes it."""
@@ -286,7 +359,8 @@ class Descent:
         agent = functools.partial(_agent_of, policy, run.gated)
 
         def save_agent(place: Path) -> None:
-            write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
+            path = place / "agent.safetensors"
+            write_arrays(path, policy.arrays(), run, "tanh", ACTIVATION, policy.fields(self.env.model))
 
         steered = EstimatorMaker(run.control, agent) if run.algorithm in ESTIMATORS else agent
         return Trainee(steered, self.save_checkpoint, save_agent)
@@ -351,7 +425,7 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
         books = Bookkeeping(run, session, descent.trainee(), stop, curves_beside(logger), began)
         stopping = False
         while descent.steps_done < run.steps and not stopping:
-            descent.slow_down()
+            descent.follow_schedule()
             cost = fly(descend)
             descent.steps_done += per_iteration
             logger.record("train/cost", cost)

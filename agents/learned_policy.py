@@ -150,9 +150,14 @@ class LearnedPolicy(Policy):
 
 
 def write_arrays(
-    path: Path, arrays: Mapping[str, numpy.ndarray], run: TrainingRun, output: str, activation: str = "tanh"
+    path: Path,
+    arrays: Mapping[str, numpy.ndarray],
+    run: TrainingRun,
+    output: str,
+    activation: str = "tanh",
+    fields: Sequence[str] | None = None,
 ) -> None:
-    """Write a learned policy and the record of the run that it comes from."""
+    """Write a learned policy and the record of the run that it comes from; arguments as of a learned policy."""
     from safetensors.numpy import save
 
     model = run.make_model()
@@ -160,7 +165,7 @@ def write_arrays(
         "environment": model.task.id,
         "control": run.control,
         "interface": str(model.task.interface),
-        "fields": json.dumps([field.name for field in model.fields]),
+        "fields": json.dumps([field.name for field in model.fields] if fields is None else list(fields)),
         "output": output,
         "activation": activation,
         "run": json.dumps(asdict(run)),

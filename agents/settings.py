@@ -21,7 +21,7 @@ SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training takes."""
 ESTIMATORS = ("kalman-net",)
 """Algorithms that make a learned estimator: they steer a filter of their own (``Task.trained_banks``)."""
-THROUGH_THE_FILTER = ("bptt", *ESTIMATORS)
+THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
 OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run gives itself."""
@@ -166,7 +166,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"first_action", "max_action_grad"}
+        known |= {"first_action", "max_action_grad", "network", "fields_kept"}
     else:
         from .sb3_training import ALGORITHMS
 

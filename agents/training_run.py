@@ -41,7 +41,15 @@ from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import read_json, restore
 from .gate import Gate
 from .residual import policy_to_correct
-from .settings import ESTIMATORS, OPTIONS, check_hyperparameters, check_keywords, merge_settings, read_config
+from .settings import (
+    ESTIMATORS,
+    OPTIONS,
+    THROUGH_THE_FILTER,
+    check_hyperparameters,
+    check_keywords,
+    merge_settings,
+    read_config,
+)
 
 FILES = {
     "ppo": "ppo",
@@ -49,6 +57,8 @@ FILES = {
     "sac": "sac",
     "dqn": "dqn",
     "bptt": "bptt",
+    "bptt-linear": "bptt_linear",
+    "bptt-small": "bptt_small",
     "kalman-net": "kalman_net",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
@@ -267,9 +277,10 @@ def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
         raise ValueError(
             f"algorithm {algorithm!r} trains an estimator, which corrects no policy and has no gate"
         )
-    if residual_to and algorithm == "bptt":
+    if residual_to and algorithm in THROUGH_THE_FILTER:
         raise ValueError(
-            "algorithm 'bptt' has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or sac"
+            f"algorithm {algorithm!r} has no gradient of the policy that would be corrected: "
+            "choose ppo, recurrent-ppo or sac"
         )
     corrected = policy_to_correct(models[0], residual_to) if residual_to else None
     if options.gated:
@@ -317,12 +328,18 @@ def in_words(weights: Mapping[str, float]) -> str:
 
 
 def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
-    """Return the hyperparameters of an algorithm for an environment; default ones where it has none."""
+    """Return the hyperparameters of an algorithm for an environment; default ones where it has none.
+
+    A file that is ``based_on`` another algorithm's says only what is different, everywhere and in an environment.
+    """
     import yaml
 
     file: Any = files(__package__).joinpath("hyperparameters", f"{FILES[algorithm]}.yml")
     table = yaml.safe_load(file.read_text(encoding="utf-8"))
-    return dict(table.get(id, table["default"]))
+    if "based_on" not in table:
+        return dict(table.get(id, table["default"]))
+    based = merge_settings(read_hyperparameters(id, table["based_on"]), table["default"])
+    return merge_settings(based, table.get(id, {}))
 
 
 def schedule(name: str, value: float | str) -> Callable[[float], float]:

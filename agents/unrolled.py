@@ -1,11 +1,11 @@
-"""Back-propagation through compiled episodes and a recurrent policy, written out step by step.
+"""Back-propagation through compiled episodes and a small network, written out step by step.
 
 On small arrays nearly all the time of automatic differentiation goes into keeping its own record. Here the episodes'
 part is compiled (:class:`~..envs.rollout.Rollout`), and the policy's is the chain rule by hand; the gradients are
 those that torch finds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy
@@ -20,7 +20,126 @@ LIMIT = 10.0
 
 
 class UnrolledPolicy:
-    """Answers of a :class:`~.bptt.RecurrentPolicy` to N episodes, kept to be differentiated.
+    """Answers of a :class:`~.bptt.NetworkPolicy` to N episodes, kept to be differentiated.
+
+    Args:
+        policy: whose parameters are used, and whose gradients are added to.
+        envs: episodes.
+        decisions: that are kept at once.
+    """
+
+    def __init__(self, policy: Any, envs: int, decisions: int) -> None:
+        self._policy, self._fields = policy, len(policy.mean)
+        dtype = policy.mean.numpy().dtype
+        # What is shown, memory, and 1, which the biases are multiplied with.
+        self._seen = numpy.ones((decisions + 1, self._fields + policy.memory_size + 1, envs), dtype)
+        self._memory = None if policy.gru is None else UnrolledMemory(policy.gru, self._seen)
+        self._layers = UnrolledLayers(policy.layers, envs, decisions)
+
+    def begin(self) -> None:
+        """Forget everything."""
+        self._seen[0, self._fields : -1] = 0.0
+
+    def read(self) -> None:
+        """Take the parameters as they are now."""
+        policy = self._policy
+        self._mean, self._scale, self._used, self._low, high = (
+            part.numpy()[:, None]
+            for part in (policy.mean, policy.scale, policy.used, policy.low, policy.high)
+        )
+        self._half = (high - self._low) * 0.5
+        self._layers.read()
+        if self._memory is not None:
+            self._memory.read()
+
+    def forward(self, decision: int, observation: numpy.ndarray) -> numpy.ndarray:
+        """Answer observations ``(fields, N)`` with actions ``(A, N)``."""
+        seen = self._seen[decision]
+        shown = seen[: self._fields]
+        numpy.subtract(observation, self._mean, out=shown, casting="same_kind")
+        shown /= self._scale
+        numpy.clip(shown, -LIMIT, LIMIT, out=shown)
+        shown *= self._used
+        features = seen if self._memory is None else self._memory.forward(decision)
+        return self._low + self._half * (1.0 + self._layers.forward(decision, features))
+
+    def backward_from_here(self) -> None:
+        """Let the gradient with respect to the memory as it is now be zero."""
+        if self._memory is not None:
+            self._memory.backward_from_here()
+
+    def backward(self, decision: int, of_action: numpy.ndarray) -> numpy.ndarray:
+        """Turn the gradient with respect to actions ``(A, N)`` into that with respect to observations.
+
+        The last decision comes first.
+        """
+        of_features = self._layers.backward(decision, of_action * self._half)
+        of_shown = of_features if self._memory is None else self._memory.backward(decision, of_features)
+        of_shown *= numpy.abs(self._seen[decision, : self._fields]) < LIMIT
+        of_shown *= self._used / self._scale
+        return of_shown
+
+    def add_gradients(self, decisions: int) -> None:
+        """Add the gradients of the parameters, and go on from the memory after so many decisions."""
+        self._layers.add_gradients()
+        if self._memory is not None:
+            self._memory.add_gradients()
+        self._seen[0, self._fields : -1] = self._seen[decisions, self._fields : -1]
+
+
+class UnrolledLayers:
+    """Linear layers, ``f([weights, bias] @ [features, 1])``; f is the rectifier, and tanh after the last of them.
+
+    Args:
+        layers: of torch.
+        envs: episodes.
+        decisions: that are kept at once.
+    """
+
+    def __init__(self, layers: Sequence[Any], envs: int, decisions: int) -> None:
+        self._layers = layers
+        dtype = layers[0].weight.detach().numpy().dtype
+        self._outputs = [numpy.ones((decisions, len(layer.bias) + 1, envs), dtype) for layer in layers]
+        self._inputs: list[Any] = [[None] * decisions, *self._outputs[:-1]]
+        self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
+
+    def read(self) -> None:
+        """Take the parameters as they are now."""
+        pairs = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in self._layers]
+        self._matrices = [numpy.concatenate([weight, bias[:, None]], axis=1) for weight, bias in pairs]
+        self._of_matrices = [numpy.zeros_like(matrix) for matrix in self._matrices]
+
+    def forward(self, decision: int, features: numpy.ndarray) -> numpy.ndarray:
+        """Answer features, 1 below them; they are kept and must not be changed until they were differentiated."""
+        self._inputs[0][decision] = features
+        last = len(self._layers) - 1
+        for i, matrix in enumerate(self._matrices):
+            sums, output = matrix @ self._inputs[i][decision], self._outputs[i][decision, :-1]
+            numpy.tanh(sums, out=output) if i == last else numpy.maximum(sums, 0.0, out=output)
+        return output
+
+    def backward(self, decision: int, gradient: numpy.ndarray) -> numpy.ndarray:
+        """Turn the gradient with respect to the answer into that with respect to the features."""
+        last = len(self._layers) - 1
+        for i in reversed(range(len(self._layers))):
+            answer = self._outputs[i][decision, :-1]
+            slope = 1.0 - answer * answer if i == last else answer > 0.0
+            gradient = (gradient * slope).astype(answer.dtype, copy=False)
+            # Products of what has nearly vanished fall below the smallest normal number, where processors are slow.
+            gradient *= numpy.abs(gradient) > self._vanished
+            self._of_matrices[i] += gradient @ self._inputs[i][decision].T
+            gradient = self._matrices[i][:, :-1].T @ gradient
+        return gradient
+
+    def add_gradients(self) -> None:
+        """Add the gradients of the parameters."""
+        for layer, of_matrix in zip(self._layers, self._of_matrices, strict=True):
+            _add_gradient(layer.weight, of_matrix[:, :-1])
+            _add_gradient(layer.bias, of_matrix[:, -1])
+
+
+class UnrolledMemory:
+    """The recurrent unit of a policy.
 
     All that a GRU multiplies with its parameters is one matrix times one vector of what is shown, memory, and 1::
 
@@ -32,52 +151,37 @@ class UnrolledPolicy:
         memory' = candidate + update (memory - candidate),  candidate = tanh(candidate + reset recalled)
 
     Args:
-        policy: whose parameters are used, and whose gradients are added to.
-        envs: episodes.
-        decisions: that are kept at once.
+        gru: of torch.
+        seen: what is shown, memory, and 1, ``(decisions + 1, fields + memory + 1, N)``; the memory is written there.
     """
 
-    def __init__(self, policy: Any, envs: int, decisions: int) -> None:
-        self._policy = policy
-        self._fields, self._size = len(policy.mean), policy.gru.hidden_size
-        dtype = policy.mean.numpy().dtype
-        self._seen = numpy.ones((decisions + 1, self._fields + self._size + 1, envs), dtype)
-        self._gates = numpy.zeros((decisions, 4 * self._size, envs), dtype)
-        self._answer = numpy.zeros((decisions, len(policy.low), envs), dtype)
-        self._of_gates = numpy.zeros((4 * self._size, envs), dtype)
-        self._of_seen = numpy.zeros((self._fields + self._size, envs), dtype)
-        self._of_hidden = numpy.zeros((self._size, envs), dtype)
-        self._room = numpy.zeros((2 * self._size, envs), dtype)
+    def __init__(self, gru: Any, seen: numpy.ndarray) -> None:
+        self._gru, self._seen = gru, seen
+        size, dtype = gru.hidden_size, seen.dtype
+        decisions, width, envs = seen.shape
+        self._fields, self._size = width - size - 1, size
+        self._gates = numpy.zeros((decisions - 1, 4 * size, envs), dtype)
+        self._of_gates = numpy.zeros((4 * size, envs), dtype)
+        self._of_seen = numpy.zeros((width - 1, envs), dtype)
+        self._of_hidden = numpy.zeros((size, envs), dtype)
+        self._room = numpy.zeros((2 * size, envs), dtype)
         self._vanished = numpy.sqrt(numpy.finfo(dtype).tiny)
-
-    def begin(self) -> None:
-        """Forget everything."""
-        self._seen[0, self._fields : -1] = 0.0
 
     def read(self) -> None:
         """Take the parameters as they are now."""
-        policy, fields, size = self._policy, self._fields, self._size
-        input, memory, input_bias, memory_bias = (part.detach().numpy() for part in policy.gru.parameters())
+        fields, size = self._fields, self._size
+        input, memory, input_bias, memory_bias = (part.detach().numpy() for part in self._gru.parameters())
         self._matrix = matrix = numpy.zeros((4 * size, fields + size + 1), input.dtype)
         matrix[: 3 * size, :fields], matrix[: 3 * size, -1] = input, input_bias
         both = numpy.r_[: 2 * size, 3 * size : 4 * size]
         matrix[both, fields:-1] = memory
         matrix[both, -1] += memory_bias
-        weight, bias = (part.detach().numpy() for part in policy.head.parameters())
-        self._head = numpy.concatenate([weight, bias[:, None]], axis=1)
-        mean, scale, low, high = (
-            part.numpy()[:, None] for part in (policy.mean, policy.scale, policy.low, policy.high)
-        )
-        self._mean, self._scale, self._low, self._half = mean, scale, low, (high - low) * 0.5
-        self._of_matrix, self._of_head = numpy.zeros_like(matrix), numpy.zeros_like(self._head)
+        self._of_matrix = numpy.zeros_like(matrix)
 
-    def forward(self, decision: int, observation: numpy.ndarray) -> numpy.ndarray:
-        """Answer observations ``(fields, N)`` with actions ``(A, N)``."""
-        fields, size, seen, gates = self._fields, self._size, self._seen[decision], self._gates[decision]
-        shown, hidden, after = seen[:fields], seen[fields:-1], self._seen[decision + 1, fields:]
-        numpy.subtract(observation, self._mean, out=shown, casting="same_kind")
-        shown /= self._scale
-        numpy.clip(shown, -LIMIT, LIMIT, out=shown)
+    def forward(self, decision: int) -> numpy.ndarray:
+        """Return the memory after a decision, 1 below it."""
+        size, seen, gates = self._size, self._seen[decision], self._gates[decision]
+        hidden, after = seen[self._fields : -1], self._seen[decision + 1, self._fields :]
         numpy.matmul(self._matrix, seen, out=gates)
         opened, candidate, recalled = gates[: 2 * size], gates[2 * size : 3 * size], gates[3 * size :]
         # The logistic function of x is (1 + tanh(x / 2)) / 2, and overflows nowhere.
@@ -90,31 +194,26 @@ class UnrolledPolicy:
         numpy.subtract(hidden, candidate, out=after[:-1])
         after[:-1] *= opened[size:]
         after[:-1] += candidate
-        answer = self._answer[decision]
-        numpy.tanh(self._head @ after, out=answer)
-        return self._low + self._half * (1.0 + answer)
+        return after
 
     def backward_from_here(self) -> None:
         """Let the gradient with respect to the memory as it is now be zero."""
         self._of_hidden[...] = 0.0
 
-    def backward(self, decision: int, of_action: numpy.ndarray) -> numpy.ndarray:
-        """Turn the gradient with respect to actions ``(A, N)`` into that with respect to observations.
+    def backward(self, decision: int, of_after: numpy.ndarray) -> numpy.ndarray:
+        """Turn the gradient with respect to the memory after a decision into that with respect to what was shown.
 
-        The last decision comes first.
+        Args:
+            decision: the last one comes first.
+            of_after: the gradient as far as it does not flow through later decisions.
         """
         fields, size, seen, gates = self._fields, self._size, self._seen[decision], self._gates[decision]
-        hidden, after = seen[fields:-1], self._seen[decision + 1, fields:]
+        hidden = seen[fields:-1]
         opened, candidate, recalled = gates[: 2 * size], gates[2 * size : 3 * size], gates[3 * size :]
         reset, update = opened[:size], opened[size:]
-        of_gates, answer = self._of_gates, self._answer[decision]
+        of_gates, of_hidden, room = self._of_gates, self._of_hidden, self._room
         of_opened, of_candidate = of_gates[: 2 * size], of_gates[2 * size : 3 * size]
-        of_answer = (of_action * self._half * (1.0 - answer * answer)).astype(answer.dtype, copy=False)
-        # Products of what has nearly vanished would fall below the smallest normal number, where processors are slow.
-        of_answer *= numpy.abs(of_answer) > self._vanished
-        self._of_head += of_answer @ after.T
-        of_hidden, room = self._of_hidden, self._room
-        of_hidden += numpy.matmul(self._head[:, :-1].T, of_answer, out=room[:size])
+        of_hidden += of_after
         of_hidden *= numpy.abs(of_hidden, out=room[:size]) > self._vanished
         numpy.subtract(1.0, update, out=of_candidate)
         of_candidate *= of_hidden
@@ -130,25 +229,24 @@ class UnrolledPolicy:
         of_seen = numpy.matmul(self._matrix[:, :-1].T, of_gates, out=self._of_seen)
         of_hidden *= update
         of_hidden += of_seen[fields:]
-        of_shown = of_seen[:fields]
-        of_shown *= numpy.abs(seen[:fields]) < LIMIT
-        of_shown /= self._scale
-        return of_shown
+        return of_seen[:fields]
 
-    def add_gradients(self, decisions: int) -> None:
-        """Add the gradients of the parameters, and go on from the memory after so many decisions."""
+    def add_gradients(self) -> None:
+        """Add the gradients of the parameters."""
         fields, size, of_matrix = self._fields, self._size, self._of_matrix
         both = numpy.r_[: 2 * size, 3 * size : 4 * size]
         gradients = (
             *(of_matrix[: 3 * size, :fields], of_matrix[both, fields:-1]),
             *(of_matrix[: 3 * size, -1], of_matrix[both, -1]),
-            *(self._of_head[:, :-1], self._of_head[:, -1]),
         )
-        parameters = (*self._policy.gru.parameters(), *self._policy.head.parameters())
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            added = torch.from_numpy(gradient.copy())
-            parameter.grad = added if parameter.grad is None else parameter.grad + added
-        self._seen[0, fields:-1] = self._seen[decisions, fields:-1]
+        for parameter, gradient in zip(self._gru.parameters(), gradients, strict=True):
+            _add_gradient(parameter, gradient)
+
+
+def _add_gradient(parameter: Any, gradient: numpy.ndarray) -> None:
+    """Add to the gradient of a parameter of torch."""
+    added = torch.from_numpy(gradient.copy())
+    parameter.grad = added if parameter.grad is None else parameter.grad + added
 
 
 class Unrolled:
@@ -157,7 +255,7 @@ class Unrolled:
     Args:
         env: with compiled backend, continuous actions and autoreset mode "Disabled"; it gives the episodes and their
             noise.
-        policy: a :class:`~.bptt.RecurrentPolicy`.
+        policy: a :class:`~.bptt.NetworkPolicy`.
         truncation: most decisions of a window.
         reward: that is ascended, as in :mod:`~..envs.reward`: the agent's own part of it.
         gate: that decides whether the policy acts; a decision in which it does not, has no gradient.

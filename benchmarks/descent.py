@@ -19,7 +19,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import torch
-from filtergym.agents.bptt import RecurrentPolicy, descend_episodes
+from filtergym.agents.bptt import NetworkPolicy, descend_episodes
 from filtergym.agents.training_run import RunOptions, TrainingRun, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.baselines.problem import problem_of
@@ -33,7 +33,7 @@ FEWER = 8
 """Episodes whose gradients are compared."""
 
 
-def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, RecurrentPolicy]:
+def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple[Any, NetworkPolicy]:
     """What flies an episode and calls for a descent after each window, and its policy."""
     truncation = run.hyperparameters["truncation"]
     env = TaskVectorEnv(
@@ -43,7 +43,7 @@ def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple
     observation = torch.as_tensor(env.reset(seed=0)[0])
     torch.manual_seed(0)
     space: Any = env.model.action_space
-    policy = RecurrentPolicy(len(env.model.fields), space, run.hyperparameters["hidden_size"]).to(dtype)
+    policy = NetworkPolicy(len(env.model.fields), space, run.hyperparameters["hidden_size"]).to(dtype)
     policy.mean.copy_(observation.mean(0))
     policy.scale.copy_(observation.std(0).clamp_min(0.3))
     if backend == "compiled":

@@ -28,6 +28,8 @@ QUICK = [
     ("filtergym/TightlyCoupledNavigation-v0", "nis-adaptive"),
     ("filtergym/UavAutopilot-v0", "gust-imm"),
     ("filtergym/UavAutopilot-v0", "bptt"),
+    ("filtergym/UavAutopilot-v0", "bptt-small"),
+    ("filtergym/LooselyCoupledNavigation-v0", "bptt-linear"),
 ]
 ENVIRONMENTS = list(dict.fromkeys(env for env, _ in QUICK))
 ALONE = """

@@ -50,6 +50,8 @@ def replayed(environment, name, keywords=None, scenario=None, **options):
         ("UavAutopilot", "raw-sensors", {}),
         ("UavAutopilot", "innovation-adaptive", {"decision_interval": 4}),
         ("UavAutopilot", "ppo", {"decision_interval": 3}),
+        ("UavAutopilot", "bptt-small", {}),
+        ("LooselyCoupledNavigation", "bptt-linear", {}),
         ("RadarEsmTracking", "forgetting-joint-type", {}),
     ],
 )

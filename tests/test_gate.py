@@ -446,14 +446,14 @@ def test_training_around_what_cannot_be(algorithm, around, message):
 def test_gradient_through_the_gate_is_that_of_torch():
     torch = pytest.importorskip("torch")
     pytest.importorskip("llvmlite")
-    from filtergym.agents.bptt import RecurrentPolicy, descend_episodes
+    from filtergym.agents.bptt import NetworkPolicy, descend_episodes
     from filtergym.agents.unrolled import Unrolled
     from filtergym.envs.environment import TaskVectorEnv
 
     keywords = {"control": "gain", "horizon": 12, "reward": "cost", "autoreset_mode": "Disabled"}
     envs = [TaskVectorEnv(ID, 6, backend=backend, **keywords) for backend in ("torch", "compiled")]
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(envs[0].model.fields), envs[0].model.action_space, 4).double()
+    policy = NetworkPolicy(len(envs[0].model.fields), envs[0].model.action_space, 4).double()
     policy.low, policy.high = policy.low.double(), policy.high.double()
     found = []
 

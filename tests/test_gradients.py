@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 import array_api_compat.torch as torch_namespace
 import torch
 from filtergym.agents import bptt
-from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.training_run import RunOptions, Session, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.compiler import namespace
@@ -102,44 +102,52 @@ def test_nothing_flows_back_to_a_place_in_a_table():
     np.testing.assert_array_equal(of_x, table[[0, 2, 1, 0]] * np.arange(1.0, 5.0))
 
 
-def random_policy(env, dtype):
+def random_policy(env, dtype, network="recurrent"):
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(env.model.fields), env.model.action_space, 6).to(dtype)
+    policy = NetworkPolicy(len(env.model.fields), env.model.action_space, 6, network=network).to(dtype)
     with torch.no_grad():
         policy.head.weight.mul_(10.0)
         policy.head.bias.normal_(0.0, 0.3)
         policy.mean.normal_()
         # So small that some observations are cut at the limit.
         policy.scale.uniform_(0.1, 0.5)
+        policy.use_fields(len(env.model.fields) - 2)
     return policy
 
 
 @pytest.mark.processors
 @pytest.mark.parametrize(
-    ("name", "control", "keywords", "largest"),
+    ("name", "control", "keywords", "largest", "network"),
     [
-        ("ManeuveringTarget", "gain", {}, None),
-        ("ManeuveringTarget", "gain", {}, 0.01),
-        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None),
-        ("ManeuveringTarget", "kalman-net", {}, 0.01),
-        ("LooselyCoupledNavigation", "kalman-net", {}, None),
-        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01),
-        ("UavAutopilot", "gain", {}, None),
-        ("RadarEsmTracking", "evidence", {}, 0.01),
+        ("ManeuveringTarget", "gain", {}, None, "recurrent"),
+        ("ManeuveringTarget", "gain", {}, 0.01, "recurrent"),
+        ("ManeuveringTarget", "gain", {}, 0.01, "feedforward"),
+        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "linear"),
+        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "recurrent"),
+        ("ManeuveringTarget", "kalman-net", {}, 0.01, "recurrent"),
+        ("LooselyCoupledNavigation", "kalman-net", {}, None, "recurrent"),
+        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
+        ("UavAutopilot", "gain", {}, None, "recurrent"),
+        ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
         # Of ten measurements each; its gradient takes longest to compile.
         pytest.param(
-            "TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, None, marks=pytest.mark.slow
+            "TightlyCoupledNavigation",
+            "evidence",
+            {"max_episode_steps": 2},
+            None,
+            "recurrent",
+            marks=pytest.mark.slow,
         ),
     ],
 )
-def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, largest):
+def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, largest, network):
     def descended(backend, repetition=None):
         """Mean cost, and gradients by window: of three decisions, three and one; five episodes in eight lanes."""
         env = TaskVectorEnv(
             f"filtergym/{name}-v0", 5, control=control, backend=backend, reward="cost",
             autoreset_mode="Disabled", **{"max_episode_steps": 7, **keywords},
         )  # fmt: skip
-        policy, found = random_policy(env, torch.float64), []
+        policy, found = random_policy(env, torch.float64, network), []
 
         def descend():
             found.append(torch.cat([part.grad.ravel() for part in policy.parameters()]))

@@ -153,7 +153,8 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     deviation = numpy.where(usable, size / numpy.sqrt(numpy.where(usable, nees, 1.0)), math.nan)
     found["protection_level"] = math.sqrt(quantile) * deviation
     found["beyond_protection_level"] = numpy.where(numpy.isnan(nees), math.nan, nees > quantile)
-    if VARIABLE in run and not numpy.isnan(run["nis"].values).all():
+    # A learned estimator says nothing of its innovations.
+    if VARIABLE in run and "nis" in run and not numpy.isnan(run["nis"].values).all():
         causes = dict(held_causes(run))
         wrong = [causes[name] for name in run["cause"].values.tolist() if name not in ("spoofing", "outlier")]
         spoofed = detection(

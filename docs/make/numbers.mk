@@ -19,17 +19,17 @@ room_RadarEsmTracking := radar_esm_tracking
 room_LooselyCoupledNavigation := loosely_coupled_navigation
 room_TightlyCoupledNavigation := tightly_coupled_navigation
 
-agents_ManeuveringTarget := bptt ppo recurrent-ppo sac dqn kalman-net
-agents_UavAutopilot := bptt ppo sac
-agents_RadarEsmTracking := bptt ppo sac
-agents_LooselyCoupledNavigation := bptt ppo sac kalman-net
-agents_TightlyCoupledNavigation := bptt
+agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dqn kalman-net
+agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac
+agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac
+agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
+agents_TightlyCoupledNavigation := bptt bptt-small bptt-linear
 
-shipped_ManeuveringTarget := bptt ppo kalman-net
-shipped_UavAutopilot := bptt ppo
-shipped_RadarEsmTracking := bptt ppo
-shipped_LooselyCoupledNavigation := bptt ppo kalman-net
-shipped_TightlyCoupledNavigation := bptt
+shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
+shipped_UavAutopilot := bptt bptt-small bptt-linear ppo
+shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo
+shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
+shipped_TightlyCoupledNavigation := bptt bptt-small bptt-linear
 
 # Its filters have 17 states, and one wrong step loses a track: fewer episodes, and agents behind the gate.
 training_TightlyCoupledNavigation := --gated

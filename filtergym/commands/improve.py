@@ -96,7 +96,10 @@ def tune_policy(
 def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
-    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt or kalman-net.")] = "ppo",
+    algo: Annotated[
+        str,
+        typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear or kalman-net."),
+    ] = "ppo",
     control: TrainedControl = None,
     scenario: TrainingScenario = None,
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
@@ -199,7 +202,9 @@ def train(
 def search(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the search: journal, runs, best.yml.")],
-    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    algo: Annotated[
+        str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small or bptt-linear.")
+    ] = "ppo",
     trials: Annotated[int, typer.Option(help="In all, those before an interruption included.")] = 50,
     steps: Annotated[int, typer.Option(help="Environment steps of each run.")] = 100_000,
     seeds: Annotated[str, typer.Option(help="Training seeds of every trial, such as 0-2.")] = "0",
