@@ -258,7 +258,6 @@ BASELINES = Baselines(
     score_paper="multi-hypothesis",
     score_reference="known-mode",
     tunable=TUNABLE,
-    fallback="fault-hypotheses-vague",
     alarm=SensorAlarm,
     best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
