@@ -103,7 +103,7 @@ class ManeuveringTarget(Task):
     log_format = LOG_FORMAT
     live_input = PlotInput
     actions = {
-        "evidence": "times 1 nat (`evidence_scale`), added to the log-posterior of each mode; **0 is the paper's IMM**",
+        "evidence": "times 2 nats (`evidence_scale`), added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
         "the beta that belongs to it; **0 is the paper's IMM**",
         "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
