@@ -104,14 +104,14 @@ class TightlyCoupledNavigation(Task):
     World = NavigationWorld
     live_input = ReceiverInput
     actions = {
+        "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
+        "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "
+        "positive action; and Huber's robust update of pseudoranges and of rates, beyond 1.345 standard deviations over a "
+        "positive action; **0 is the paper's algorithm**",
         "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
         "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
         "positive action, 3 to that of a negative one; under the paper's probabilities, for "
         "faults that no weight can cure; **0 is the paper's algorithm**",
-        "robust": "noise as under `gain`, and what is done with single readings: how noisy accelerometers are taken to be "
-        "while they repeat their last reading exactly, 300 to the power of a positive action; and Huber's robust update "
-        "of pseudoranges and of rates, beyond 1.345 standard deviations over a positive action; **0 is the paper's "
-        "algorithm**",
         "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
         "paper's algorithm**",
         "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
@@ -119,12 +119,13 @@ class TightlyCoupledNavigation(Task):
         "weights": "weights of the three filters, normalised; all zero is uniform",
     }
     banks = {
-        "gain": NoiseBank,
         "robust": RobustBank,
+        "gain": NoiseBank,
         "evidence": HypothesisBank,
         "mode": HypothesisBank,
         "weights": HypothesisBank,
     }
+    reach = {"robust": ("noise_reach", "noise_scale", "noise_reduction"), "gain": ("noise_scale", "noise_reduction")}
     scenarios = SCENARIOS
     components = (
         *(Component(f"position_{axis}", "m") for axis in ("east", "north", "up")),
@@ -149,6 +150,8 @@ class TightlyCoupledNavigation(Task):
         "a single-epoch fix"
     )
     reward_unit = 10.0
+    # A few lost tracks rule the mean, and who does nothing pays for them, too.
+    reward = "log-relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: TightlyCoupledNavigationParameters
