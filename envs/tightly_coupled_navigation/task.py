@@ -69,9 +69,10 @@ class TightlyCoupledNavigation(Task):
 
     ## Rewards
 
-    ``-30 log(1 + x / 30)``, x the cost over 10: the squared error of position (unit 7.4 m) plus that of velocity (unit
-    0.25 m/s), the errors of a fix from one epoch alone. 10 is between the median, 0.1, and the mean, 60, of what the paper's
-    algorithm costs in an episode of `random`: the mean is a few lost tracks'.
+    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the cost over 0.1, the median of what the paper's algorithm
+    costs in an episode of `random`, and x0 that of the action zero on the same flight and noise. The cost is the squared
+    error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s), the errors of a fix from one epoch alone. The
+    unit of the other rewards is 10, between that median and the mean, 60, which is a few lost tracks'.
 
     ## Starting State
 
@@ -150,6 +151,7 @@ class TightlyCoupledNavigation(Task):
         "a single-epoch fix"
     )
     reward_unit = 10.0
+    log_reward_unit = 0.1
     # A few lost tracks rule the mean, and who does nothing pays for them, too.
     reward = "log-relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
