@@ -34,10 +34,7 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
     for _ in range(5):
         ours, theirs = (
             np.mean(
-                [
-                    [-beyond * math.log1p(x / unit / beyond) for x in t.charge(s)]
-                    for s in states
-                ],
+                [[-beyond * math.log1p(x / unit / beyond) for x in t.charge(s)] for s in states],
                 axis=0,
             )
             for t, states in zip(

@@ -382,7 +382,9 @@ def test_robust_is_between_the_paper_and_hubers_update():
 
 def test_fixed_robust_is_the_same_under_every_reach():
     costs = [
-        evaluate(ID, ["fixed-robust-tuned"], episodes=8, horizon=60, backend="numpy", noise_reach=reach)["cost"]
+        evaluate(ID, ["fixed-robust-tuned"], episodes=8, horizon=60, backend="numpy", noise_reach=reach)[
+            "cost"
+        ]
         for reach in (0.3, 1.0)
     ]
     numpy.testing.assert_allclose(*costs, rtol=1e-9)

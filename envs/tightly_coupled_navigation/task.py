@@ -126,7 +126,10 @@ class TightlyCoupledNavigation(Task):
         "mode": HypothesisBank,
         "weights": HypothesisBank,
     }
-    reach = {"robust": ("noise_reach", "noise_scale", "noise_reduction"), "gain": ("noise_scale", "noise_reduction")}
+    reach = {
+        "robust": ("noise_reach", "noise_scale", "noise_reduction"),
+        "gain": ("noise_scale", "noise_reduction"),
+    }
     scenarios = SCENARIOS
     components = (
         *(Component(f"position_{axis}", "m") for axis in ("east", "north", "up")),
