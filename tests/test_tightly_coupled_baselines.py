@@ -350,8 +350,8 @@ def constant(values):
 
 
 def test_robust_is_between_the_paper_and_hubers_update():
-    """Zero is the paper; full strength is Huber's update of ranges and rates; noise is that of the control gain, 0.3 times
-    as far.
+    """Zero is the paper; full strength is Huber's update of ranges and rates; noise is that of the control gain, 0.3
+    times as far.
     """
 
     class RangesAndRates(estimators.Huber):
