@@ -29,6 +29,8 @@ LONG = {"filtergym/TightlyCoupledNavigation-v0"}
 
 POLICIES = {"ppo": "MlpPolicy", "recurrent-ppo": "MlpLstmPolicy", "sac": "MlpPolicy"}
 """Algorithms, and the kind of their networks."""
+ROLLOUT = {"ppo": 2048, "recurrent-ppo": 128}
+"""Decisions of a rollout by default, in one environment."""
 
 
 def arguments() -> argparse.Namespace:
@@ -64,19 +66,19 @@ def run(algo: str, id: str, seed: int, steps: int, episodes: int, envs: int) -> 
     settings = {}
     if envs > 1:
         env = to_sb3(gymnasium.make_vec(id, num_envs=envs, autoreset_mode="SameStep"))
-        settings = {"n_steps": 2048 // envs} if algo == "ppo" else {}
+        settings = {"n_steps": ROLLOUT[algo] // envs} if algo in ROLLOUT else {}
     begun = time.perf_counter()
     model: Any = ALGORITHMS[algo](POLICIES[algo], env, seed=seed, device="cpu", **settings).learn(steps)
     seconds = time.perf_counter() - begun
     paper = baselines_of(id).score_paper
-    nothing = numpy.zeros(env.action_space.shape)
-    zero = filtergym.FunctionPolicy(lambda observation: numpy.tile(nothing, (len(observation), 1)))
+    nothing = filtergym.FunctionPolicy(lambda shown: numpy.zeros((len(shown), *env.action_space.shape)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
         results = filtergym.evaluate(
-            id, {"plain": model, paper: paper, "zero": zero}, episodes=episodes, seed=0
+            id, {"plain": model, paper: paper, "nothing": nothing}, episodes=episodes, seed=0
         )
-    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("plain", paper, "zero")}
+    names = ("plain", paper, "nothing")
+    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
     return {
         "algorithm": algo,
         "environment": id,
@@ -86,9 +88,9 @@ def run(algo: str, id: str, seed: int, steps: int, episodes: int, envs: int) -> 
         "control": str(results["control"].sel(policy="plain").values),
         "difference": float(cost["plain"].mean() / cost[paper].mean() - 1.0),
         "median_difference": float(numpy.median(cost["plain"] / cost[paper]) - 1.0),
-        "zero_difference": float(cost["zero"].mean() / cost[paper].mean() - 1.0),
-        "zero_median_difference": float(numpy.median(cost["zero"] / cost[paper]) - 1.0),
-        "median_difference_to_zero": float(numpy.median(cost["plain"] / cost["zero"]) - 1.0),
+        "zero_difference": float(cost["nothing"].mean() / cost[paper].mean() - 1.0),
+        "zero_median_difference": float(numpy.median(cost["nothing"] / cost[paper]) - 1.0),
+        "median_difference_to_zero": float(numpy.median(cost["plain"] / cost["nothing"]) - 1.0),
     }
 
 

@@ -11,9 +11,10 @@
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
-  action of the same control is charged on the same noise, both in units of the paper's average. It is zero where the
-  agent does nothing, the difference of small charges, and the logarithm of the ratio of large ones. So a few wild
-  episodes, which rule the mean of the charge, do not hide what an action changes in all others.
+  action of the same control is charged on the same noise, both in units of the paper's average, or where few lost
+  tracks rule that, of an ordinary episode (``Task.log_reward_unit``). It is zero where the agent does nothing, the
+  difference of small charges, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
+  of the charge, do not hide what an action changes in all others.
 
 :attr:`.Task.reward` says which is the default.
 
@@ -44,8 +45,9 @@ def cost_reward(model: Model, state: Any) -> Array:
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Minus ``log(1 + x)`` of the charge x in units of the paper's average, ``(N,)``."""
-    return -model.task.xp.log1p(model.charge(state) * (1.0 / model.task.reward_unit))
+    """Minus ``log(1 + x)`` of the charge x in units of an ordinary one, ``(N,)``."""
+    unit = model.task.log_reward_unit or model.task.reward_unit
+    return -model.task.xp.log1p(model.charge(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:

@@ -151,6 +151,9 @@ class Task(ABC):
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
+    log_reward_unit: float | None = None
+    """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below
+    ``reward_unit``; None where it is the same."""
     causes: tuple[Cause, ...] = (MISSED,)
     """Circumstances by which an evaluation splits what estimates cost, see :mod:`.causes`; each instance may have its
     own."""

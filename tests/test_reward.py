@@ -21,6 +21,7 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
     -log(1 + x), less that of the zero action.
     """
     model = make_model(env_id)
+    unit = (kind == "log-relative" and model.task.log_reward_unit) or model.task.reward_unit
     beside = reference(kind, model)
     watched, plain, relative = (Lanes(model, 8, each) for each in (beside, None, beside))
     for lanes in (watched, plain, relative):
@@ -33,10 +34,7 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
     for _ in range(5):
         ours, theirs = (
             np.mean(
-                [
-                    [-beyond * math.log1p(x / model.task.reward_unit / beyond) for x in t.charge(s)]
-                    for s in states
-                ],
+                [[-beyond * math.log1p(x / unit / beyond) for x in t.charge(s)] for s in states],
                 axis=0,
             )
             for t, states in zip(

@@ -350,7 +350,9 @@ def constant(values):
 
 
 def test_robust_is_between_the_paper_and_hubers_update():
-    """Zero is the paper; full strength is Huber's update of ranges and rates; noise is that of the control gain."""
+    """Zero is the paper; full strength is Huber's update of ranges and rates; noise is that of the control gain, 0.3
+    times as far.
+    """
 
     class RangesAndRates(estimators.Huber):
         def __init__(self, task):
@@ -363,7 +365,7 @@ def test_robust_is_between_the_paper_and_hubers_update():
         "robust": constant((0.0,) * 5 + (1.0, 1.0)),
         "ranges and rates": RangesAndRates,
         "noisy": constant((0.2, -0.3, 0.5, 0.1, 0.0, 0.0, 0.0)),
-        "gain": lambda task: policies.FixedGain(task, (0.2, -0.3, 0.5, 0.1)),
+        "gain": lambda task: policies.FixedGain(task, (0.06, -0.09, 0.15, 0.03)),
     }
     others["gain"].control = "gain"
     error = evaluate(ID, others, episodes=8, horizon=100, backend="numpy", **OPEN_LOOP)["error"]
@@ -378,6 +380,16 @@ def test_robust_is_between_the_paper_and_hubers_update():
     assert abs(error.sel(policy="robust") - error.sel(policy="paper")).max() > 1e-3
 
 
+def test_fixed_robust_is_the_same_under_every_reach():
+    costs = [
+        evaluate(ID, ["fixed-robust-tuned"], episodes=8, horizon=60, backend="numpy", noise_reach=reach)[
+            "cost"
+        ]
+        for reach in (0.3, 1.0)
+    ]
+    numpy.testing.assert_allclose(*costs, rtol=1e-9)
+
+
 def test_accelerometers_are_noisier_while_they_repeat_themselves():
     model = make_model(ID, "robust", scenario="accelerometer-failure")
     state = model.filter.start(Initial(numpy.zeros((17, 2)), numpy.stack([numpy.eye(17)] * 2, axis=2)))
@@ -386,8 +398,8 @@ def test_accelerometers_are_noisier_while_they_repeat_themselves():
     variance = numpy.stack(model.filter._variance(action, state))
     nominal = numpy.array(model.task.sensor_variance)[:, None]
     exponent = numpy.zeros((14, 2))
-    exponent[:4] = 0.1
-    exponent[8:11] = [0.2, 0.7]
+    exponent[:4] = 0.3 * 0.1
+    exponent[8:11] = [0.3 * 0.2, 0.3 * 0.2 + 0.5]
     numpy.testing.assert_allclose(variance, nominal * 300.0 ** (2.0 * exponent), rtol=1e-12)
     assert [float(k[0]) for k in model.filter._thresholds(action)] == [1.345] * 4 + [2.69] * 4 + [
         math.inf

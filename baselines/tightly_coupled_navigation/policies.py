@@ -67,7 +67,7 @@ class FixedRobust(ConstantPolicy):
 
     Args:
         model: in which it acts.
-        accelerometers: action that makes them noisier throughout.
+        accelerometers: action that makes them noisier throughout, at the whole reach (`noise_reach` of one).
         pseudoranges: strength of the robust update of these, 0 to 1.
         rates: likewise of their rates.
     """
@@ -78,7 +78,8 @@ class FixedRobust(ConstantPolicy):
         self, model: Model, accelerometers: float = 0.0, pseudoranges: float = 1.0, rates: float = 1.0
     ) -> None:
         super().__init__(model)
-        self.action = (0.0, 0.0, accelerometers, 0.0, 1.0, pseudoranges, rates)
+        throughout = min(accelerometers / self.task.parameters.noise_reach, 1.0)
+        self.action = (0.0, 0.0, throughout, 0.0, 1.0, pseudoranges, rates)
 
 
 class NisAdaptive(Policy):

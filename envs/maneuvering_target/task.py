@@ -60,9 +60,9 @@ class ManeuveringTarget(Task):
 
     ## Rewards
 
-    By default ("relative") what the paper's IMM is charged on the same flight and noise less what the agent is
-    charged: `30 log(1 + x / 30)` each, x the squared position error over `range_sigma` squared in units of 8.0,
-    what the IMM is charged on average. "cost" is the agent's own part, below zero.
+    By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the squared position error over `range_sigma` squared in
+    units of 8.0, what the paper's IMM is charged on average, and x0 that of the action zero on the same flight and noise.
+    "relative" compares with the IMM under every control, and compresses nothing but lost tracks.
 
     ## Starting State
 
@@ -103,7 +103,7 @@ class ManeuveringTarget(Task):
     log_format = LOG_FORMAT
     live_input = PlotInput
     actions = {
-        "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
+        "evidence": "times 2 nats (`evidence_scale`), added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
         "the beta that belongs to it; **0 is the paper's IMM**",
         "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
@@ -119,6 +119,7 @@ class ManeuveringTarget(Task):
         "weights": FilterBank,
     }
     trained_banks = {"kalman-net": KalmanNetBank}
+    reach = {"evidence": ("evidence_scale",)}
     scenarios = SCENARIOS
     components = (
         Component("position_x", "m"),
@@ -130,8 +131,9 @@ class ManeuveringTarget(Task):
     causes = CAUSES
     cost_description = "squared position error over the squared range sigma"
     reward_unit = 8.0
-    # What a turn costs rules the noise of the reward, and the paper pays for it too.
-    reward = "relative"
+    # What a turn costs rules the noise of the reward, and who does nothing pays for it too; a logarithm, because a few
+    # hard turns would hide what an action changes on all other flights.
+    reward = "log-relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))
 
     parameters: ManeuveringTargetParameters

@@ -421,7 +421,7 @@ class RobustBank(NoiseBank):
         """As under ``gain``; accelerometers that repeat their last reading are noisier by an action of their own."""
         xp, forces = self.xp, self.task.sensors[2].readings
         groups = len(self.task.sensors)
-        variance = super()._variance(exponent[:groups], state)
+        variance = super()._variance(self.parameters.noise_reach * exponent[:groups], state)
         own = 2.0 * math.log(self.parameters.noise_scale) * xp.clip(exponent[groups], 0.0, None)
         factor = xp.exp(own * state.repeated)
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]

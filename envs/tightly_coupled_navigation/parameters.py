@@ -215,6 +215,10 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     noise_reduction: float = parameter(3.0, above=1.0)
     """Largest divisor of it. Ours: a filter that trusts its sensors far too much is never right, and
     amplifies rounding from one backend to another."""
+    noise_reach: float = parameter(0.3, above=0.0, at_most=1.0)
+    """Share of the logarithms of these two that an action of one has under control "robust". Ours: a policy that has
+    just been made explores with a standard deviation of about one, and at the whole reach it learns to survive its own
+    noise, at the cost of most episodes. Who explores less may ask for more."""
     averaging_measurements: float = parameter(10.0, at_least=1.0)
     """Time constant n of the short averages in the observation, measurements: the newest has the weight 1/n.
     Ours."""

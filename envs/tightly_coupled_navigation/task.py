@@ -69,9 +69,10 @@ class TightlyCoupledNavigation(Task):
 
     ## Rewards
 
-    ``-30 log(1 + x / 30)``, x the cost over 10: the squared error of position (unit 7.4 m) plus that of velocity (unit
-    0.25 m/s), the errors of a fix from one epoch alone. 10 is between the median, 0.1, and the mean, 60, of what the paper's
-    algorithm costs in an episode of `random`: the mean is a few lost tracks'.
+    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the cost over 0.1, the median of what the paper's algorithm
+    costs in an episode of `random`, and x0 that of the action zero on the same flight and noise. The cost is the squared
+    error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s), the errors of a fix from one epoch alone. The
+    unit of the other rewards is 10, between that median and the mean, 60, which is a few lost tracks'.
 
     ## Starting State
 
@@ -104,14 +105,14 @@ class TightlyCoupledNavigation(Task):
     World = NavigationWorld
     live_input = ReceiverInput
     actions = {
+        "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
+        "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "
+        "positive action; and Huber's robust update of pseudoranges and of rates, beyond 1.345 standard deviations over a "
+        "positive action; **0 is the paper's algorithm**",
         "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
         "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
         "positive action, 3 to that of a negative one; under the paper's probabilities, for "
         "faults that no weight can cure; **0 is the paper's algorithm**",
-        "robust": "noise as under `gain`, and what is done with single readings: how noisy accelerometers are taken to be "
-        "while they repeat their last reading exactly, 300 to the power of a positive action; and Huber's robust update "
-        "of pseudoranges and of rates, beyond 1.345 standard deviations over a positive action; **0 is the paper's "
-        "algorithm**",
         "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
         "paper's algorithm**",
         "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
@@ -119,11 +120,15 @@ class TightlyCoupledNavigation(Task):
         "weights": "weights of the three filters, normalised; all zero is uniform",
     }
     banks = {
-        "gain": NoiseBank,
         "robust": RobustBank,
+        "gain": NoiseBank,
         "evidence": HypothesisBank,
         "mode": HypothesisBank,
         "weights": HypothesisBank,
+    }
+    reach = {
+        "robust": ("noise_reach", "noise_scale", "noise_reduction"),
+        "gain": ("noise_scale", "noise_reduction"),
     }
     scenarios = SCENARIOS
     components = (
@@ -149,6 +154,9 @@ class TightlyCoupledNavigation(Task):
         "a single-epoch fix"
     )
     reward_unit = 10.0
+    log_reward_unit = 0.1
+    # A few lost tracks rule the mean, and who does nothing pays for them, too.
+    reward = "log-relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: TightlyCoupledNavigationParameters
