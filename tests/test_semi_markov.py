@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR, SemiMarkov
+from filtergym.baselines.maneuvering_target.semi_markov import SemiMarkov
+from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
@@ -233,3 +234,41 @@ def test_is_compiled_with_the_world():
     # What cannot be traced runs as Python code, and a warning says so.
     assert SemiMarkov.traceable
     evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
+
+
+class Constant:
+    """A policy that always answers the same."""
+
+    kind = "policy"
+
+    def __init__(self, model, *action):
+        self.action = np.array(action)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.tile(self.action, (len(observation), 1)), state
+
+
+IRREGULAR = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
+
+
+def steered_states(action, **keywords):
+    steered = make_model(ID, "hypotheses", "random", horizon=30, **keywords)
+    for state, _ in rollout(steered, Constant(None, *action), episode_seeds("train", 3, LANES)):
+        yield steered, state
+
+
+@pytest.mark.parametrize("keywords", [{}, IRREGULAR], ids=["regular", "irregular"])
+def test_zero_hypotheses_is_the_estimator_bit_for_bit(keywords):
+    model = make_model(ID, None, "random", horizon=30, **keywords)
+    filter = SemiMarkov(model.task)
+    _, _, answers = answers_of(model, filter, 30)
+    compared = 0
+    for (mean, covariance, log_likelihood), (steered, state) in zip(
+        answers, steered_states([0.0] * 6, **keywords), strict=True
+    ):
+        np.testing.assert_array_equal(steered.mean(state)[:, :LANES], mean)
+        np.testing.assert_array_equal(steered.covariance(state)[..., :LANES], covariance)
+        kept = steered.filter.records(state.filter, state.measurement)
+        np.testing.assert_array_equal(kept["log_likelihood"][:LANES], log_likelihood)
+        compared += 1
+    assert compared == 30
