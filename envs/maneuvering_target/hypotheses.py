@@ -3,15 +3,15 @@ r"""Control ``hypotheses``: the estimator ``semi-markov``, whose prior and noise
 The filter stands in ``semi_markov.py``; H hypotheses of kind and age predict to the scan with weights p', means x' and
 covariances P'. The action a in [-1, 1]^6 then changes what the measurement is weighed with, this once:
 
-    p'(h) <- p'(h) reach^(a1 begun(h) + a2 ended(h) + a3 turning(h))                         renormalised by Bayes' rule
-    P'(h) <- P'(h) reach^(a5 manoeuvring(h) + a4 (1 - manoeuvring(h))),   R <- R reach^a6
+    p'(h) <- p'(h) r1^(a1 begun(h)) r2^(a2 ended(h)) r3^(a3 turning(h))                     renormalised by Bayes' rule
+    P'(h) <- P'(h) r4^a4 in straight flight, P'(h) r5^a5 in manoeuvres,    R <- R r6^a6
 
-begun: a manoeuvre of the first age; ended: straight flight of the first age; turning, manoeuvring: of any age. a1 and
-a2 scale the odds that a manoeuvre has just begun, or ended, as other hazards would; a3 those of a turn against thrust;
-a4 and a5 say that the prediction is worse or better than the filter believes, as in a filter of fading memory (H. W.
-Sorenson and J. E. Sacks, Recursive fading memory filtering, Information Sciences 3, 1971, 101-119). All zero is the
-estimator itself, bit for bit: nothing is left out of it, and an agent can only add. A scan that missed the target is
-prediction only, whatever the action.
+begun: a manoeuvre of the first age; ended: straight flight of the first age; turning: a turn of any age. So a1 and a2
+multiply the odds that a manoeuvre has just begun, or ended, as other hazards would; a3 those of a turn against all
+else; a4 and a5 say that the prediction is worse or better than the filter believes, as in a filter of fading memory (H.
+W. Sorenson and J. E. Sacks, Recursive fading memory filtering, Information Sciences 3, 1971, 101-119). All zero is the
+estimator itself, bit for bit: an agent begins where the strongest classical filter ends. A scan that missed the target
+is prediction only, whatever the action.
 """
 
 import math
@@ -35,10 +35,9 @@ from .world import Measurement
 if TYPE_CHECKING:
     from .task import ManeuveringTarget
 
-REACH = 3.0
-"""Factor by which an action of one multiplies. White noise of deviation one, with which a new policy explores, then
-costs little."""
-ANSWERS = 6
+REACH = (3.0, 9.0, 1.5, 1.25, 1.25, 1.25)
+"""Factors by which actions of one multiply: so small that white noise of deviation one, with which a new policy
+explores, costs a twentieth; what learns through the filter rarely comes to their edge."""
 
 
 class Steered(NamedTuple):
@@ -69,7 +68,7 @@ class Steered(NamedTuple):
 class HypothesesBank(RadarBank):
     """The semi-Markov Gaussian sum, steered by factors of its weights, covariances and measurement noise."""
 
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(REACH),), numpy.float32)
 
     def __init__(self, task: "ManeuveringTarget", control: str) -> None:
         super().__init__(task, control)
@@ -94,8 +93,10 @@ class HypothesesBank(RadarBank):
         """Hypotheses of each group that is shown."""
         every = range(tables[-1][-1] + 1)
         turning = [h for table in tables[1:] for h in table]
-        rows = [[math.log(REACH) * (h in members) for h in every] for members in (begun, [0], turning)]
-        self.log_weights = task.constant(rows)[:, :, None]
+        members = begun, [0], turning
+        self.log_reach = task.constant([math.log(factor) for factor in REACH])[:, None]
+        self.raised = task.constant([[float(h in those) for h in every] for those in members])[:, :, None]
+        """Whose weights each of the first three actions multiplies, ``(3, H, 1)``."""
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -199,9 +200,9 @@ class HypothesesBank(RadarBank):
     def act(self, state: Steered, measurement: Measurement, action: Array) -> Steered:
         """Update as the estimator does, by the weights and noises that the action sets."""
         xp = self.xp
-        a = measurement.available * xp.clip(action, -1.0, 1.0)
-        factors = xp.exp(math.log(REACH) * a[3:])
-        straight, thrust, turns = self.reweigh([table.unpack() for table in state.track], a[:3])
+        logarithms = measurement.available * self.log_reach * xp.clip(action, -1.0, 1.0)
+        factors = xp.exp(logarithms[3:])
+        straight, thrust, turns = self.reweigh([table.unpack() for table in state.track], logarithms[:3])
         tables = (
             _scaled(straight, factors[0]),
             _scaled(thrust, factors[1]),
@@ -211,9 +212,9 @@ class HypothesesBank(RadarBank):
         found = self.filter.update_track(tables, measured)
         return state._replace(mean=found.mean, covariance=found.covariance, track=found.track)
 
-    def reweigh(self, tables: Iterable[Hypotheses], a: Array) -> Tables:
-        """Tables with the odds of what has begun, what has ended, and turns scaled by the action ``(3, N)``."""
-        factors = self.xp.exp(ordered_sum(self.log_weights * a[:, None]))
+    def reweigh(self, tables: Iterable[Hypotheses], logarithms: Array) -> Tables:
+        """Tables with the odds of what has begun, what has ended, and turns multiplied; of logarithms ``(3, N)``."""
+        factors = self.xp.exp(ordered_sum(self.raised * logarithms[:, None]))
         weighed, first = [], 0
         for table in tables:
             last = first + table.probability.shape[0]
