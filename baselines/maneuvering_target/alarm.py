@@ -12,6 +12,7 @@ ROUNDING = 1e-6
 class RadarAlarm(Alarm):
     """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
     that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
+    Under control ``hypotheses`` they are those of all hypotheses together.
     """
 
     window = 50
@@ -19,7 +20,7 @@ class RadarAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.bank = model.control != "gain"
+        self.bank = model.control not in ("gain", "hypotheses")
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
         self.read = [model.reader(name) for name in names]
         self.available, self.elapsed = model.reader("available"), model.reader("elapsed")

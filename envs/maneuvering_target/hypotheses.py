@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 REACH = (3.0, 9.0, 1.5, 1.25, 1.25, 1.25)
 """Factors by which actions of one multiply: so small that white noise of deviation one, with which a new policy
 explores, costs a twentieth; what learns through the filter rarely comes to their edge."""
+GROUPS = ("straight", "ended", "begun", "thrust", "left", "right", "old_thrust", "old_left", "old_right")
+"""Of hypotheses whose probabilities are shown: straight flight older than the first age and of the first age,
+manoeuvres of the first age, kinds of manoeuvres of the ages between, and of the last age."""
 
 
 class Steered(NamedTuple):
@@ -78,30 +81,29 @@ class HypothesesBank(RadarBank):
             range(straight + i * ages, straight + (i + 1) * ages) for i in range(1 + len(self.filter.turns))
         ]
         begun = [table[0] for table in tables]
-        kinds = {
-            "thrust": tables[:1],
-            "left": [table for turn, table in zip(self.filter.turns, tables[1:], strict=True) if turn > 0.0],
-            "right": [table for turn, table in zip(self.filter.turns, tables[1:], strict=True) if turn < 0.0],
-        }
-        self.groups: dict[str, list[int]] = {
-            "straight": list(range(1, straight)),
-            "ended": [0],
-            "begun": begun,
-            **{kind: [h for table in members for h in table[1:-1]] for kind, members in kinds.items()},
-            **{f"old_{kind}": [table[-1] for table in members] for kind, members in kinds.items()},
-        }
-        """Hypotheses of each group that is shown."""
+        turns = list(zip(self.filter.turns, tables[1:], strict=True))
+        sides = ([table for turn, table in turns if side * turn > 0.0] for side in (1.0, -1.0))
+        kinds = (tables[:1], *sides)
+        members = (
+            list(range(1, straight)),
+            [0],
+            begun,
+            *([h for table in kind for h in table[1:-1]] for kind in kinds),
+            *([table[-1] for table in kind] for kind in kinds),
+        )
+        self.groups = dict(zip(GROUPS, members, strict=True))
         every = range(tables[-1][-1] + 1)
         turning = [h for table in tables[1:] for h in table]
-        members = begun, [0], turning
         self.log_reach = task.constant([math.log(factor) for factor in REACH])[:, None]
-        self.raised = task.constant([[float(h in those) for h in every] for those in members])[:, :, None]
+        self.raised = task.constant([[float(h in those) for h in every] for those in (begun, [0], turning)])[
+            :, :, None
+        ]
         """Whose weights each of the first three actions multiplies, ``(3, H, 1)``."""
 
     @property
     def blocks(self) -> Sequence[Block]:
         """The innovation, how well the filter has predicted it, and what it believes."""
-        xp, groups = self.xp, tuple(self.groups)
+        xp = self.xp
         area = 2.0 * math.pi * self.parameters.range_sigma**2
         return (
             Block(
@@ -134,14 +136,14 @@ class HypothesesBank(RadarBank):
                 "log_predicted",
                 lambda f, _: imm.log_probabilities(f.predicted),
                 "the logarithm of the probability before the measurement",
-                groups,
+                GROUPS,
                 SIGNED_LOG,
             ),
             Block(
                 "probability",
                 lambda f, _: xp.clip(f.probabilities, 0.0, 1.0),
                 "probability after the measurement if the action is zero",
-                groups,
+                GROUPS,
                 SHARE,
             ),
             Block(
