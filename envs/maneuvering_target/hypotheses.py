@@ -95,9 +95,8 @@ class HypothesesBank(RadarBank):
         every = range(tables[-1][-1] + 1)
         turning = [h for table in tables[1:] for h in table]
         self.log_reach = task.constant([math.log(factor) for factor in REACH])[:, None]
-        self.raised = task.constant([[float(h in those) for h in every] for those in (begun, [0], turning)])[
-            :, :, None
-        ]
+        raised = [[float(h in those) for h in every] for those in (begun, [0], turning)]
+        self.raised = task.constant(raised)[:, :, None]
         """Whose weights each of the first three actions multiplies, ``(3, H, 1)``."""
 
     @property
