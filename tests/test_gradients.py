@@ -121,6 +121,7 @@ def random_policy(env, dtype):
         ("ManeuveringTarget", "gain", {}, None),
         ("ManeuveringTarget", "gain", {}, 0.01),
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None),
+        ("ManeuveringTarget", "hypotheses", {}, None),
         ("ManeuveringTarget", "kalman-net", {}, 0.01),
         ("LooselyCoupledNavigation", "kalman-net", {}, None),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01),
