@@ -124,6 +124,7 @@ def random_policy(env, dtype, network="recurrent"):
         ("ManeuveringTarget", "gain", {}, 0.01, "feedforward"),
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "linear"),
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "recurrent"),
+        ("ManeuveringTarget", "hypotheses", {}, None, "recurrent"),
         ("ManeuveringTarget", "kalman-net", {}, 0.01, "recurrent"),
         ("LooselyCoupledNavigation", "kalman-net", {}, None, "recurrent"),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),

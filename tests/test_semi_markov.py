@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR, SemiMarkov
+from filtergym.baselines.maneuvering_target.semi_markov import SemiMarkov
+from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
@@ -233,3 +234,70 @@ def test_is_compiled_with_the_world():
     # What cannot be traced runs as Python code, and a warning says so.
     assert SemiMarkov.traceable
     evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
+
+
+@pytest.fixture(scope="module")
+def steered(model):
+    """The bank of control hypotheses, and for every scan its state as predicted and the measurement."""
+    bank = make_model(model.task.id, "hypotheses", "random").filter
+    initial, measurements, answers = answers_of(model, SemiMarkov(model.task), 30)
+    state, scans = bank.start(initial), []
+    for measurement in measurements:
+        # A bank is given zero where the scan missed the target, an estimator NaN.
+        given = measurement._replace(position=np.nan_to_num(measurement.position))
+        state = bank.predict(state, given)
+        scans.append((state, given))
+        state = bank.act(state, given, np.zeros((6, LANES)))
+    return bank, scans, answers
+
+
+def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
+    bank, scans, answers = steered
+    for (state, measurement), (mean, covariance, log_likelihood) in zip(scans, answers, strict=True):
+        after = bank.act(state, measurement, np.zeros((6, LANES)))
+        np.testing.assert_array_equal(bank.mean(after), mean)
+        np.testing.assert_array_equal(bank.covariance(after), covariance)
+        np.testing.assert_array_equal(bank.records(after, measurement)["log_likelihood"], log_likelihood)
+
+
+def probabilities_after(bank, state, measurement, action):
+    after = bank.act(state, measurement, np.array(action)[:, None] + np.zeros(LANES))
+    return np.concatenate([table.probability for table in after.track])
+
+
+@pytest.mark.parametrize(("index", "factor"), [(0, 3.0), (1, 9.0), (2, 1.5)])
+def test_hypotheses_multiplies_odds(steered, index, factor):
+    bank, scans, _ = steered
+    ages, straight = bank.filter.ages, bank.filter.straight_ages
+    end = straight + ages * (1 + len(bank.filter.turns))
+    raised = [range(straight, end, ages), [0], range(straight + ages, end)][index]
+    for state, measurement in scans[:6]:
+        action = 0.7 * np.eye(6)[index]
+        ratio = probabilities_after(bank, state, measurement, action)
+        ratio = ratio / probabilities_after(bank, state, measurement, np.zeros(6))
+        rest = np.delete(ratio, raised, axis=0)
+        np.testing.assert_allclose(rest, np.broadcast_to(rest[:1], rest.shape), rtol=1e-9)
+        there = measurement.available > 0.0
+        expected = np.where(there, factor**0.7, 1.0) + np.zeros((len(raised), 1))
+        np.testing.assert_allclose(ratio[raised] / rest[0], expected, rtol=1e-9)
+
+
+def test_hypotheses_scales_what_is_weighed(steered):
+    bank, scans, _ = steered
+    action = np.array([0.0, 0.0, 0.0, 0.5, -0.4, 0.8])[:, None] + np.zeros(LANES)
+    for state, measurement in scans[::7]:
+        after = bank.act(state, measurement, action)
+        there = measurement.available > 0.0
+        for i, exponent in enumerate((0.5, -0.4, -0.4)):
+            before, found = state.track[i].unpack(), after.track[i].unpack()
+            result = contaminated_normal.update_position(
+                before.mean,
+                1.25**exponent * before.covariance,
+                measurement.position[:, None],
+                1.25**0.8 * measurement.variance[:, None],
+                bank.filter.outliers,
+                bank.filter.outlier_factor,
+            )
+            np.testing.assert_allclose(found.mean, np.where(there, result.mean, before.mean), rtol=1e-12)
+            expected = np.where(there, result.covariance, before.covariance)
+            np.testing.assert_allclose(found.covariance, expected, rtol=1e-8, atol=1e-8)

@@ -12,7 +12,8 @@ ROUNDING = 1e-6
 class RadarAlarm(Alarm):
     """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
     that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
-    Of a learned Kalman filter innovations are all that counts: it is told of such scans.
+    Of a learned Kalman filter, and of all hypotheses together under control ``hypotheses``, innovations are all that
+    counts: these filters are told of such scans.
     """
 
     window = 50
@@ -20,7 +21,7 @@ class RadarAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.fixed_gains = model.control in self.task.banks
+        self.fixed_gains = model.control in self.task.banks and model.control != "hypotheses"
         self.bank = self.fixed_gains and model.control != "gain"
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
         self.read = [model.reader(name) for name in names]

@@ -5,51 +5,24 @@ They predict over the time between two scans, whatever it is, and a scan that mi
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ...envs.filter import Initial
+from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
 from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters import coordinated_turn, imm, kalman, unscented
 from ...filters.ordered_sums import weighted_sum
-from ...filters.small_matrices import outer
 
 DEGREE = math.pi / 180.0
 
 
-class KalmanModel:
-    """The constant-velocity model in x and y."""
+class KalmanModel(ConstantVelocityModel):
+    """The constant-velocity model with what estimators share."""
 
     traceable = True
-
-    def __init__(self, task: ManeuveringTarget) -> None:
-        self.task, self.xp = task, task.xp
-        moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
-        self.unmoved = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
-        self.moved = task.constant(moved)[:, :, None] - self.unmoved
-        self.correlated = task.constant([[float(entry > 0.0) for entry in row] for row in noise])[:, :, None]
-        self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-        self.identity = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
-
-    def motion(self, T: Array) -> tuple[Array, Array]:
-        """Transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over intervals.
-
-        Args:
-            T: s, ``(N,)``.
-
-        Returns:
-            :func:`.kalman.white_acceleration` of each, ``(4, 4, N)``.
-        """
-        by_acceleration = self.xp.stack([0.5 * T**2, 0.5 * T**2, T, T])
-        return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
-
-    def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two tuples of arrays where the scan saw the target, the other where it missed it."""
-        there = measurement.available > 0.0
-        parts = zip(then, otherwise, strict=True)
-        return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
     def update_estimate(
         self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None

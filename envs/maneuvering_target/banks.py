@@ -98,7 +98,7 @@ class Filters(NamedTuple):
     """Position gains used last, ``(M, N)``."""
 
 
-class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
+class RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
     """What both banks share: the averages that are shown, and the end of the observation."""
 
     parameters: ManeuveringTargetParameters
@@ -171,7 +171,7 @@ class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
         )
 
 
-class GainBank(_RadarBank):
+class GainBank(RadarBank):
     """Control ``gain``: one filter, whose position gain the action sets."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
@@ -340,7 +340,7 @@ class GainBank(_RadarBank):
         }
 
 
-class FilterBank(_RadarBank):
+class FilterBank(RadarBank):
     """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
 
     def __init__(self, task: "ManeuveringTarget", control: str) -> None:

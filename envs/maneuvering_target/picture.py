@@ -25,6 +25,8 @@ from ..rendering import (
     grown,
 )
 from .banks import AlphaBeta, Filters
+from .hypotheses import GROUPS, Steered
+from .kalman_net import FRAME
 from .task import ManeuveringTarget
 
 ELLIPSE_SIGMAS = 2.0
@@ -36,6 +38,12 @@ CLOSE_UP_SIGMAS = 4.0
 TRACK = (0.06, 0.475, 0.43, 0.425)
 CLOSE_UP = (0.06, 0.075, 0.19, 0.19 * FIGURE_SIZE[0] / FIGURE_SIZE[1])
 """Left, bottom, width, height of the panels as shares of the figure; the close-up is square."""
+KINDS = {
+    "straight": ("straight", "ended"),
+    "begun": ("begun",),
+    **{kind: (kind, f"old_{kind}") for kind in ("thrust", "left", "right")},
+}
+"""Groups of hypotheses that are drawn as one."""
 
 
 def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
@@ -94,6 +102,10 @@ class ManeuveringTargetPicture(Picture):
             innovation = estimator.innovation[:, 0]
             variance = estimator.innovation_variance[:, 0]
             values["alpha"] = estimator.alpha[0]
+        elif isinstance(estimator, Steered):
+            innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
+            groups = dict(zip(GROUPS, estimator.probabilities[:, 0], strict=True))
+            values |= {f"kind.{kind}": sum(groups[group] for group in those) for kind, those in KINDS.items()}
         else:
             assert isinstance(estimator, Filters)
             predicted = numpy.exp(estimator.log_predicted)
@@ -125,11 +137,15 @@ class ManeuveringTargetPicture(Picture):
 
     def strips(self) -> Sequence[Strip]:
         """Innovation, what is steered, error."""
+        axes: Sequence[str] = "xy"
         if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
         elif self.model.control == "gains":
             each = {f"filter {j + 1}": f"alpha.{j}" for j in range(len(self.task.parameters.gains))}
             steered = Strip("position gain alpha", each, (0.0, 1.0))
+        elif self.model.control == "hypotheses":
+            axes = FRAME
+            steered = Strip("probabilities", {kind: f"kind.{kind}" for kind in KINDS}, (-0.04, 1.04))
         else:
             gains = self.task.parameters.gains
             named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}
@@ -137,7 +153,7 @@ class ManeuveringTargetPicture(Picture):
         return [
             Strip(
                 "innovation over predicted σ",
-                {"x": "innovation_x", "y": "innovation_y"},
+                dict(zip(axes, ("innovation_x", "innovation_y"), strict=True)),
                 (-4.0, 4.0),
                 guides=(-2.0, 0.0, 2.0),
             ),

@@ -20,6 +20,7 @@ from . import ID
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .causes import CAUSES
 from .clutter import Track
+from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .live import PlotInput
 from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
@@ -108,6 +109,9 @@ class ManeuveringTarget(Task):
         "the beta that belongs to it; **0 is the paper's IMM**",
         "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
         "beta = alpha^2 / (2 - alpha)",
+        "hypotheses": "factors r^a in the semi-Markov Gaussian sum at this scan: odds that a manoeuvre has begun (r = 3), "
+        "has ended (9), is a turn (1.5); predicted covariances in straight flight and in manoeuvres (1.25 each); variance "
+        "of the measurement (1.25); **0 is the estimator `semi-markov`**",
         "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
         "weights": "weights of the bank, normalised; all zero is uniform",
     }
@@ -115,6 +119,7 @@ class ManeuveringTarget(Task):
         "evidence": FilterBank,
         "gains": SteeredFilterBank,
         "gain": GainBank,
+        "hypotheses": HypothesesBank,
         "mode": FilterBank,
         "weights": FilterBank,
     }

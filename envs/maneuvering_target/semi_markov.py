@@ -1,0 +1,272 @@
+"""The semi-Markov Gaussian sum of ManeuveringTarget: straight flight, thrust and turns, each with its age.
+
+Equations: ``filters/semi_markov.py``. Constant thrust and coordinated turns are what the target flies in the training
+distribution; the filter's parameters are its prior of them. It is the estimator ``semi-markov`` of the baselines, and
+what the control ``hypotheses`` steers.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
+from ...filters.ordered_sums import weighted_sum
+from ...filters.semi_markov import Hypotheses
+from ...filters.small_matrices import mirror_lower
+from ..filter import Initial
+from ..observation import Array
+from .constant_velocity import ConstantVelocityModel
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import ManeuveringTarget
+
+SLOWEST = 30.0
+"""m/s: turns of what is slower are no sharper, as in the training distribution."""
+
+
+TRAINING_PRIOR: dict[str, Any] = {
+    "begin": 0.0157,
+    "turning": 0.5,
+    "hazards": tuple(semi_markov.hazards([0.0] * 2 + [1.0] * 10, 4)),
+    "thrust": 2.56,
+    "turns": (1.875, 4.625),
+    "turn_spread": 0.8,
+    "noise": 0.01,
+    "change": 0.01,
+    "outliers": 1e-4,
+}
+"""Of the flights of ``random``: on average 1.5 manoeuvres of 3 to 12 scans, all durations alike, in 100 scans; half of
+them turns; accelerations uniform from 0.5 to 6 m/s^2, whose halves have these means and deviations, and whose mean
+square on each axis is that of the thrust. Nothing disturbs them, and there are no outliers: numbers for these are
+small, so that what is impossible there can still be survived."""
+VAGUE_PRIOR: dict[str, Any] = {
+    "begin": 0.03,
+    "turning": 0.5,
+    "hazards": (0.1, 0.1, 0.1, 0.1),
+    "thrust": 3.0,
+    "turns": (1.5, 4.5),
+    "turn_spread": 1.2,
+    "noise": 0.05,
+    "change": 0.1,
+    "outliers": 0.02,
+}
+"""Ours, for flights of which little is known: a manoeuvre every few minutes, of any duration, ten scans on average."""
+
+
+class SemiMarkovTrack(NamedTuple):
+    """Memory of the semi-Markov filter; covariances are packed."""
+
+    straight: Hypotheses
+    """By the time since the last manoeuvre; state of position and velocity."""
+    thrust: Hypotheses
+    """By age; with the acceleration along x and y."""
+    turns: Hypotheses
+    """By age, one kind of turn after another; with the turn rate."""
+
+
+Tables = tuple[Hypotheses, Hypotheses, Hypotheses]
+"""Of straight flight, thrust and turns, with whole covariances."""
+
+
+class Posterior(NamedTuple):
+    """What a measurement leaves of the hypotheses."""
+
+    mean: Array
+    """Of all together, ``(4, N)``."""
+    covariance: Array
+    """``(4, 4, N)``."""
+    track: SemiMarkovTrack
+    probabilities: Array
+    """Of all hypotheses, those of straight flight, of thrust, of turns, ``(H, N)``."""
+    log_likelihood: Array
+    """Of the measurement, or zero where there is none, ``(N,)``."""
+    nis: Array
+    """Likewise its normalised innovation squared."""
+
+
+class SemiMarkovFilter(ConstantVelocityModel):
+    """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
+
+    Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
+    distribution says, not geometrically. Turns to the left and to the right are kinds of their own, and so are gentle
+    and steep ones: about a turn rate of zero the extended filter would linearise where no turn is.
+
+    Args:
+        task: the problem.
+        begin: probability that a manoeuvre begins before a scan.
+        turning: share of turns among manoeuvres.
+        hazards: probability that a manoeuvre ends after each age in scans; the last one for all ages beyond.
+        thrust: standard deviation of the acceleration of thrust along x and y, m/s^2.
+        turns: mean acceleration in gentle, steep, ... turns, m/s^2.
+        turn_spread: its standard deviation in each, m/s^2.
+        noise: standard deviation of what disturbs all flight, an acceleration that changes from scan to scan, m/s^2.
+        change: of the change of a manoeuvre's acceleration in a scan period, m/s^2.
+        outliers: probability that a measurement is one.
+        outlier_factor: standard deviation of its errors over the stated one.
+    """
+
+    straight_ages = 12
+    """Straight flights after different manoeuvres stay apart so long; with one, what has hardly been a manoeuvre
+    spoils the long memory of straight flight in every scan."""
+
+    def __init__(
+        self,
+        task: "ManeuveringTarget",
+        begin: float = TRAINING_PRIOR["begin"],
+        turning: float = TRAINING_PRIOR["turning"],
+        hazards: Sequence[float] = TRAINING_PRIOR["hazards"],
+        thrust: float = TRAINING_PRIOR["thrust"],
+        turns: Sequence[float] = TRAINING_PRIOR["turns"],
+        turn_spread: float = TRAINING_PRIOR["turn_spread"],
+        noise: float = TRAINING_PRIOR["noise"],
+        change: float = TRAINING_PRIOR["change"],
+        outliers: float = TRAINING_PRIOR["outliers"],
+        outlier_factor: float = 5.0,
+    ) -> None:
+        super().__init__(task)
+        self.ages, self.hazard = len(hazards), task.constant(hazards)[:, None]
+        self.begin, self.turning = begin, turning
+        self.thrust, self.turn_spread = thrust, turn_spread
+        self.turns = [side * size for size in turns for side in (1.0, -1.0)]
+        """Mean acceleration of each kind of turn, to the left positive, m/s^2."""
+        self.noise, self.change = noise, change
+        self.outliers, self.outlier_factor = outliers, outlier_factor
+
+    def start_track(self, initial: Initial) -> SemiMarkovTrack:
+        """Start where everyone starts, long in straight flight."""
+        xp, least = self.xp, semi_markov.LEAST_PROBABILITY
+        none = 0.0 * initial.mean[0]
+
+        def repeat(state: tuple[Array, Array], probabilities: list[float]) -> Hypotheses:
+            return Hypotheses(
+                xp.stack([state[0]] * len(probabilities), axis=1),
+                xp.stack([state[1]] * len(probabilities), axis=2),
+                xp.stack([probability + none for probability in probabilities]),
+            )
+
+        others = [least] * self.ages
+        turns = [repeat(self.begin_turn(*initial, turn), others) for turn in self.turns]
+        return SemiMarkovTrack(
+            repeat(initial, [least] * (self.straight_ages - 1) + [1.0]).pack(),
+            repeat(self.begin_thrust(*initial), others).pack(),
+            semi_markov.join(turns).pack(),
+        )
+
+    def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """State with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
+        none = 0.0 * mean[:2]
+        variance = self.thrust**2 + none[0]
+        return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
+
+    def begin_turn(self, mean: Array, covariance: Array, acceleration: float) -> tuple[Array, Array]:
+        """State with the turn rate of a turn with a mean acceleration, ``(5, N)`` and ``(5, 5, N)``."""
+        pace = self.xp.sqrt(self.squared_pace(mean))
+        rate = acceleration / pace
+        return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(self.turn_spread / pace) ** 2])
+
+    def squared_pace(self, mean: Array) -> Array:
+        """Square of the speed that divides accelerations of turns, (m/s)^2."""
+        return self.xp.clip(mean[2] ** 2 + mean[3] ** 2, SLOWEST**2, None)
+
+    def augment(self, covariance: Array, variances: list[Array]) -> Array:
+        """Covariance of a state and further components that are independent of it and of each other."""
+        n, none = covariance.shape[0], 0.0 * variances[0]
+        size = range(n + len(variances))
+        return self.xp.stack(
+            [
+                self.xp.stack(
+                    [
+                        covariance[i, j] if max(i, j) < n else variances[i - n] if i == j else none
+                        for j in size
+                    ]
+                )
+                for i in size
+            ]
+        )
+
+    def switch(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses) -> Tables:
+        """Let manoeuvres end and begin."""
+        ages, each = self.ages, self.turning * self.begin / len(self.turns)
+        thrusting = semi_markov.Mode(
+            thrust, self.hazard, (1.0 - self.turning) * self.begin, self.begin_thrust
+        )
+        turning = [
+            semi_markov.Mode(
+                turns.take(slice(ages * i, ages * (i + 1))),
+                self.hazard,
+                each,
+                functools.partial(self.begin_turn, acceleration=acceleration),
+            )
+            for i, acceleration in enumerate(self.turns)
+        ]
+        straight, (thrust, *kinds) = semi_markov.switch(straight, [thrusting, *turning])
+        return straight, thrust, semi_markov.join(kinds)
+
+    def predict(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses, T: Array) -> Tables:
+        """Fly on for an interval (s) in the mode of each hypothesis."""
+        F, unit = (matrix[:, :, None] for matrix in self.motion(T))
+        Q = self.noise**2 * unit
+        change = self.change**2 * T[None] / self.task.parameters.sampling_interval
+        accelerated = kalman.constant_acceleration(T, axes=2)[:, :, None]
+        square = self.squared_pace(turns.mean)
+        return (
+            _moved(straight, *kalman.predict(straight.mean, straight.covariance, F, Q)),
+            _moved(
+                thrust,
+                *kalman.predict(
+                    thrust.mean, thrust.covariance, accelerated, self.augment(Q, [change, change])
+                ),
+            ),
+            _moved(
+                turns,
+                *coordinated_turn.predict(
+                    turns.mean, turns.covariance, T, self.augment(Q + 0.0 * square, [change / square])
+                ),
+            ),
+        )
+
+    def predict_track(self, memory: SemiMarkovTrack, T: Array) -> Tables:
+        """Let manoeuvres end and begin, and fly on for an interval, s: the tables that a measurement updates."""
+        return self.predict(*self.switch(*(table.unpack() for table in memory)), T)
+
+    def update_track(self, tables: Tables, measurement: Measurement) -> Posterior:
+        """Take in a measurement. Its normalised innovation squared is the mean of the filters' by their posterior
+        weights.
+        """
+        xp = self.xp
+        results = [self.update_table(table, measurement) for table in tables]
+        logarithms = xp.concat(
+            [xp.log(table.probability) + r.log_likelihood for table, r in zip(tables, results, strict=True)]
+        )
+        probabilities = imm.softmax(logarithms)
+        mean, covariance = imm.combine(
+            xp.concat([r.mean[:4] for r in results], axis=1),
+            xp.concat([r.covariance[:4, :4] for r in results], axis=2),
+            probabilities,
+        )
+        nis = weighted_sum(probabilities, xp.concat([r.squared_distance for r in results]))
+        ends = [0, self.straight_ages, self.straight_ages + self.ages, probabilities.shape[0]]
+        parts = [probabilities[i:j] for i, j in itertools.pairwise(ends)]
+        track = SemiMarkovTrack(
+            *(Hypotheses(r.mean, r.covariance, p).pack() for r, p in zip(results, parts, strict=True))
+        )
+        return Posterior(mean, covariance, track, probabilities, imm.log_sum(logarithms), nis)
+
+    def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:
+        """Update every hypothesis with the measured position, or leave it as predicted."""
+        result = contaminated_normal.update_position(
+            table.mean,
+            table.covariance,
+            measurement.position[:, None],
+            measurement.variance[:, None],
+            self.outliers,
+            self.outlier_factor,
+        )
+        return self.where_detected(measurement, result, kalman.Update(table.mean, table.covariance, 0.0, 0.0))
+
+
+def _moved(table: Hypotheses, mean: Array, covariance: Array) -> Hypotheses:
+    """Hypotheses after the time update."""
+    return table._replace(mean=mean, covariance=mirror_lower(covariance))
