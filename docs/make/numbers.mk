@@ -23,16 +23,17 @@ agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dq
 agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac
 agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
-agents_TightlyCoupledNavigation := bptt bptt-small bptt-linear
+agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear
 
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
 shipped_UavAutopilot := bptt bptt-small bptt-linear ppo
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
-shipped_TightlyCoupledNavigation := bptt bptt-small bptt-linear
+shipped_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear
 
 # Its filters have 17 states, and one wrong step loses a track: fewer episodes, and agents behind the gate.
 training_TightlyCoupledNavigation := --gated
+training_TightlyCoupledNavigation-ppo := --residual-to fixed-robust-tuned
 episodes_TightlyCoupledNavigation := 400
 
 PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-esm-class-fusion uav-autopilot-kalman
@@ -68,7 +69,7 @@ $(DONE)/tune-%:
 
 define training
 $(DONE)/train-$(1)-$(2): $(DONE)/tune-$(1)
-	$(BIN)/filtergym train filtergym/$(1)-v0 --algo $(2) $(training_$(1)) --seeds $(SEEDS) --jobs $(JOBS) --trust \
+	$(BIN)/filtergym train filtergym/$(1)-v0 --algo $(2) $$(or $$(training_$(1)-$(2)),$$(training_$(1))) --seeds $(SEEDS) --jobs $(JOBS) --trust \
 	  --out runs/$(1)/$(2)
 	$$(finish)
 endef
