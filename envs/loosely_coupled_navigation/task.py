@@ -73,9 +73,9 @@ class LooselyCoupledNavigation(Task):
     ### Rewards
 
     By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes, over
-    the nominal variance of a measurement (``N / sampling_interval``), in units of 0.15, what the paper's plain scheme is
-    charged on average, and x0 that of the action zero on the same noise. Outages and jamming rule the mean of x and are
-    nobody's merit. "cost" is ``-30 log(1 + x / 30)``.
+    the nominal variance of a measurement (``N / sampling_interval``), in units of 0.02, its median under the action zero,
+    and x0 that of the action zero on the same noise. Outages and jamming rule the mean of x and are nobody's merit. "cost"
+    is ``-30 log(1 + x / 30)`` in units of 0.16, what the paper's plain scheme is charged on average.
 
     ### Starting State
 
@@ -133,6 +133,7 @@ class LooselyCoupledNavigation(Task):
     reward_unit = 0.16
     # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
     reward = "log-relative"
+    log_reward_unit = 0.02
     paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: LooselyCoupledNavigationParameters
