@@ -46,8 +46,8 @@ class Decider:
     Args:
         model: whose observations it is shown.
         act: asks the policy.
-        memory: that the policy returns, arrays of one track; their values do not matter. Where one is not batch first,
-            the filter is for one track: N is 1, or the arrays are traced.
+        memory: that the policy returns, arrays of one track; their values do not matter. The batch is the first axis
+            or else the last. Where one has neither, the filter is for one track: N is 1, or the arrays are traced.
         interval: measurements for which an action holds; default: the task's decision interval.
     """
 
@@ -102,13 +102,19 @@ class Decider:
 
         def restore(array: Array) -> Array:
             shape, kind = next(shapes)
-            several = shape[:1] == (1,)
-            number = self.xp.reshape(array.T, (-1, *shape[1:])) if several else self.xp.reshape(array, shape)
+            if shape[:1] == (1,):
+                number = self.xp.reshape(array.T, (-1, *shape[1:]))
+            else:
+                number = self.xp.reshape(array, (*shape[:-1], N) if shape[-1:] == (1,) else shape)
             return number > 0.5 if kind == "b" else number
 
-        def flatten(array: Array, several: bool = True) -> Array:
-            rows = self.xp.reshape(self.xp.asarray(array), (N, -1) if several else (1, -1))
-            return self.xp.astype(rows.T, self.xp.float64)
+        def flatten(array: Array, shape: tuple[int, ...] = (1,)) -> Array:
+            array = self.xp.asarray(array)
+            if shape[:1] != (1,) and shape[-1:] == (1,):
+                rows = self.xp.reshape(array, (-1, N))
+            else:
+                rows = self.xp.reshape(array, (N if shape[:1] == (1,) else 1, -1)).T
+            return self.xp.astype(rows, self.xp.float64)
 
         answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
         answer = self.xp.asarray(answer)
@@ -116,8 +122,8 @@ class Decider:
             raise ValueError(
                 f"expected an action of {self.space}, got {answer.dtype} of shape {answer.shape}"
             )
-        batched = iter(shape[:1] == (1,) for shape, _ in self._shapes)
-        return flatten(answer), map_arrays(lambda array: flatten(array, next(batched)), memory)
+        remembered = iter(shape for shape, _ in self._shapes)
+        return flatten(answer), map_arrays(lambda array: flatten(array, next(remembered)), memory)
 
 
 class Steered(NamedTuple):

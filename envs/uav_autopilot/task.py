@@ -100,7 +100,7 @@ class UavAutopilot(Task):
     """
 
     id = ID
-    interface = 4
+    interface = 5
     paper_source = (
         "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
         "unmanned aircraft using optimal Kalman filter"
