@@ -75,7 +75,9 @@ def record(
             data = benchmark_data(problem_of(id), records)
             made = ResultRecord(settings.command, today(), settings.versions, note, data)
             name = f"{BENCHMARK}/{short_name(id)}"
-            console.print(f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True)
+            console.print(
+                f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
+            )
 
 
 def table(
@@ -91,7 +93,9 @@ def table(
     """
     tables = markdown_tables(text.read_text(encoding="utf-8")) if text.is_file() else []
     if len(tables) != len(name):
-        raise ValueError(f"{text} holds {len(tables)} tables, and there are {len(name)} names: say --name for each")
+        raise ValueError(
+            f"{text} holds {len(tables)} tables, and there are {len(name)} names: say --name for each"
+        )
     for own, data in zip(name, tables, strict=True):
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
         console.print(f"{write_record(own, made, into)}: {len(data['rows'])} rows", soft_wrap=True)
@@ -99,9 +103,9 @@ def table(
 
 def readme(
     page: Annotated[Path, typer.Argument(help="Page whose table is replaced.")] = Path("README.md"),
-    picture: Annotated[Path, typer.Option(help="PNG, SVG or PDF file for the fronts of cost and time.")] = Path(
-        "docs/images/front.png"
-    ),
+    picture: Annotated[
+        Path, typer.Option(help="PNG, SVG or PDF file for the fronts of cost and time.")
+    ] = Path("docs/images/front.png"),
     columns: Columns = 2,
 ) -> None:
     """Put the table of results into README, which nobody renders, and draw its picture, both from the records.

@@ -17,7 +17,9 @@ def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
-            panels.append(Panel(short_name(problem.id), points, known.score_paper, known.score_reference, learned))
+            panels.append(
+                Panel(short_name(problem.id), points, known.score_paper, known.score_reference, learned)
+            )
     return panels
 
 

@@ -107,7 +107,9 @@ class ResultsTable(_Rendered):
         """Return one table."""
         names = self.name_given.split() or recorded_benchmarks()
         scenario = self.options.get("scenario", "")
-        policies, columns = (_words(self.options[key]) if key in self.options else () for key in ("policies", "columns"))
+        policies, columns = (
+            _words(self.options[key]) if key in self.options else () for key in ("policies", "columns")
+        )
         if len(names) == 1 and not policies and not columns:
             return results_markdown(*self.benchmark(names[0]), scenario)
         return chosen_markdown({name: self.benchmark(name) for name in names}, scenario, policies, columns)
@@ -160,14 +162,18 @@ class SeedsTables(_Rendered):
 
 
 class RecordTable(_Rendered):
-    """``{record-table} NAME``: a table of text."""
+    """``{record-table} NAME``: a table of text, or some of its columns."""
 
     option_spec: ClassVar[Any] = {"columns": directives.unchanged, "bare": directives.flag}
 
     def markdown(self) -> str:
         """Return the table, and unless it is bare who made it."""
         record = self.record(self.name_given)
-        table = markdown_table(record.data["columns"], record.data["rows"])
+        titles, rows = record.data["columns"], record.data["rows"]
+        if "columns" in self.options:
+            places = [titles.index(title) for title in _words(self.options["columns"])]
+            titles, rows = [titles[i] for i in places], [[row[i] for i in places] for row in rows]
+        table = markdown_table(titles, rows)
         return "\n".join([*table, *(["", record.origin] if "bare" not in self.options else [])])
 
 
@@ -201,7 +207,9 @@ class NumberRole(SphinxRole):
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
         """Render one number."""
-        return _in_sentence(self, lambda: [nodes.Text(number_text(self.text, self.interval))], record_of(self.text))
+        return _in_sentence(
+            self, lambda: [nodes.Text(number_text(self.text, self.interval))], record_of(self.text)
+        )
 
 
 class RecordRole(SphinxRole):
@@ -212,8 +220,8 @@ class RecordRole(SphinxRole):
         return _in_sentence(self, self._link, self.text)
 
     def _link(self) -> Sequence[nodes.Node]:
-        record, file = read_record(self.text), record_file(self.text)
-        target = "/" + file.relative_to(self.env.srcdir).as_posix()
+        record = read_record(self.text)
+        target = os.path.relpath(record_file(self.text), Path(self.env.doc2path(self.env.docname)).parent)
         link = download_reference(
             "", "", reftarget=target, refdoc=self.env.docname, refdomain="", reftype="download", refexplicit=True,
             refwarn=True,

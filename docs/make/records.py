@@ -1,8 +1,8 @@
 """Records: what commands have measured, committed once as small files, from which pages are rendered.
 
-A record is JSON: the command that made it, the day, the versions of the libraries, a note, and the data. There are three
-kinds of data: ``benchmark/ENVIRONMENT`` holds what pages show of ``filtergym benchmark --full``, ``seeds/ENVIRONMENT``
-what ``python docs/make seeds`` has computed, and every other record is a table of text.
+A record is JSON: the command that made it, the day, the versions of the libraries, a note, and the data. There are
+three kinds of data: ``benchmark/ENVIRONMENT`` holds what pages show of ``filtergym benchmark --full``,
+``seeds/ENVIRONMENT`` what ``python docs/make seeds`` has computed, and every other record is a table of text.
 """
 
 import datetime
@@ -24,7 +24,15 @@ FOLDER = Path(__file__).parent.parent / "records"
 BENCHMARK, SEEDS = "benchmark", "seeds"
 """Folders of the records of an environment."""
 METRICS = (
-    *("cost", "relative_cost_difference", "median_cost_ratio", "win_rate", "behind_best", "score", "nanoseconds"),
+    *(
+        "cost",
+        "relative_cost_difference",
+        "median_cost_ratio",
+        "win_rate",
+        "behind_best",
+        "score",
+        "nanoseconds",
+    ),
     "lost_episodes",
 )
 """Of a benchmark that pages show, beside the ANEES of the whole state and the errors of the main components."""
@@ -136,7 +144,7 @@ def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
 
 
 def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any]:
-    """Return what pages show of a benchmark in one environment: numbers over whole episodes, by scenario and competitor.
+    """Return what pages show of a benchmark in one environment: over whole episodes, by scenario and competitor.
 
     Raises:
         ValueError: if scenarios are unknown, or the records are of several experiments.
@@ -154,8 +162,12 @@ def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any
             raise nearest("scenario", r.scenario, problem.task.scenarios)
         scenario = scenarios.setdefault(r.scenario, {"episodes": r.episodes, "competitors": {}})
         if scenario["episodes"] != r.episodes:
-            raise ValueError(f"{r.policy} met {r.episodes} episodes of {r.scenario}, others {scenario['episodes']}")
-        own = scenario["competitors"].setdefault(r.policy, {"kind": r.kind, "control": r.control, "metrics": {}})
+            raise ValueError(
+                f"{r.policy} met {r.episodes} episodes of {r.scenario}, others {scenario['episodes']}"
+            )
+        own = scenario["competitors"].setdefault(
+            r.policy, {"kind": r.kind, "control": r.control, "metrics": {}}
+        )
         key = f"{r.metric} {r.component}".strip()
         own["metrics"][key] = [round_number(x) for x in (r.value, r.low, r.high)]
         if r.unit != "1":
@@ -179,7 +191,16 @@ def benchmark_records(data: Mapping[str, Any]) -> BenchmarkRecords:
                 metric, _, component = key.partition(" ")
                 found.append(
                     Record(
-                        *(data["environment"], own["control"], scenario, name, own["kind"], metric, component, "all"),
+                        *(
+                            data["environment"],
+                            own["control"],
+                            scenario,
+                            name,
+                            own["kind"],
+                            metric,
+                            component,
+                            "all",
+                        ),
                         *(value, low, high, data["units"].get(key, "1"), each["episodes"]),
                         *(data["seed"], data["split"]),
                     )
@@ -196,7 +217,9 @@ def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, 
 
 def recorded_benchmarks(folder: Path = FOLDER) -> list[str]:
     """Short names of all environments with the record of a benchmark, in the catalogue's order."""
-    return [name for id in catalogue() if record_file(f"{BENCHMARK}/{(name := short_name(id))}", folder).is_file()]
+    return [
+        name for id in catalogue() if record_file(f"{BENCHMARK}/{(name := short_name(id))}", folder).is_file()
+    ]
 
 
 # --- tables of text
@@ -236,5 +259,7 @@ def table_cell(data: Mapping[str, Any], row: str, column: str) -> str:
         if row in (first, f"{first} {second}"):
             rows.append(cells)
     if len(columns) != 1 or len(rows) != 1:
-        raise ValueError(f"{len(rows)} rows {row!r} and {len(columns)} columns {column!r}: one of each is needed")
+        raise ValueError(
+            f"{len(rows)} rows {row!r} and {len(columns)} columns {column!r}: one of each is needed"
+        )
     return str(rows[0][columns[0]])

@@ -22,7 +22,9 @@ COLUMNS = ("difference", "median", "wins", "ns", "control", "cost", "rmse", "ane
 """Of the table, in their order; a page may choose."""
 
 
-def scenario_records(found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()) -> list[Record]:
+def scenario_records(
+    found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
+) -> list[Record]:
     """Return what a benchmark has measured in one scenario, of all but random actions.
 
     Args:
@@ -37,7 +39,8 @@ def scenario_records(found: BenchmarkRecords, scenario: str = "", policies: Sequ
     records = [
         record
         for record in found.records
-        if record.scenario == scenario and (record.policy in policies if policies else record.policy != "random")
+        if record.scenario == scenario
+        and (record.policy in policies if policies else record.policy != "random")
     ]
     if not records:
         raise ValueError(
@@ -48,7 +51,9 @@ def scenario_records(found: BenchmarkRecords, scenario: str = "", policies: Sequ
     return records
 
 
-def results_grid(records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS) -> tuple[list[str], list[list[str]]]:
+def results_grid(
+    records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
+) -> tuple[list[str], list[list[str]]]:
     """Return header and rows of the table of one environment.
 
     Args:
@@ -74,7 +79,9 @@ def results_grid(records: Sequence[Record], paper: str, columns: Sequence[str] =
         "ns": {TIME_TITLE: lambda name: times.get(name, "-")},
         "control": {"control": lambda name: controls[name]},
         "cost": {"mean cost": number("cost")},
-        "rmse": {f"RMSE {c.replace('_', ' ')}, {units[c]}": number("rmse", c) for c in main_components(records)},
+        "rmse": {
+            f"RMSE {c.replace('_', ' ')}, {units[c]}": number("rmse", c) for c in main_components(records)
+        },
         "anees": {"ANEES": lambda name: consistency(found.get((name, "anees", "state", "all")))},
         "score": {"score": lambda name: score_text(found.get((name, "score", "", "all")))},
     }
@@ -117,7 +124,9 @@ def chosen_markdown(
     if wrong := [column for column in columns if column not in COLUMNS]:
         raise ValueError(f"no column {wrong[0]!r}: there are {', '.join(COLUMNS)}")
     if "rmse" in columns and len(found) > 1:
-        raise ValueError("the errors of several environments are of different quantities: leave out the column rmse")
+        raise ValueError(
+            "the errors of several environments are of different quantities: leave out the column rmse"
+        )
     header: list[str] = []
     rows, notes = [], []
     for name, (own, record) in found.items():
@@ -125,7 +134,10 @@ def chosen_markdown(
         # With everybody's records, so that the front and the best are those of the whole table.
         titles, lines = results_grid(scenario_records(own, scenario), own.problem.paper, columns)
         wanted = {f"`{record.policy}`" for record in records}
-        header = [title if len(found) == 1 else title.replace(f"`{own.problem.paper}`", "the paper's") for title in titles]
+        header = [
+            title if len(found) == 1 else title.replace(f"`{own.problem.paper}`", "the paper's")
+            for title in titles
+        ]
         first = [name] if len(found) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]
         notes.append(f"{_where(records)} {record.origin}")

@@ -1,9 +1,9 @@
 """Numbers in sentences: each is named by a path into a record, and rendered from it.
 
 ``ManeuveringTarget/random/bptt/difference`` is of a benchmark: environment, scenario, competitor, quantity.
-``seeds/ManeuveringTarget/random/bptt/mean`` is of training seeds: the cost against the paper's algorithm of an algorithm
-("mean", "median", "between seeds", "over episodes"), or of one run or opponent (no statistic). Every other path is record,
-row and column of a table of text, see :func:`.records.table_cell`.
+``seeds/ManeuveringTarget/random/bptt/mean`` is of training seeds: the cost against the paper's algorithm of an
+algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent (no statistic). Every other
+path is record, row and column of a table of text, see :func:`.records.table_cell`.
 """
 
 from pathlib import Path
@@ -71,7 +71,9 @@ def _of_benchmark(data: Any, path: str, interval: bool) -> str:
         if quantity == "median":
             return f"{100.0 * (metrics['median_cost_ratio'][0] - 1.0):+.1f} %"
         if quantity == "ns":
-            [(value, compiled)] = [(m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")]
+            [(value, compiled)] = [
+                (m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")
+            ]
             return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", asked in Python")
         key, scale, unit = QUANTITIES.get(quantity, (quantity, 1.0, data["units"].get(quantity, "")))
         # The difference to the best one names it.
@@ -89,9 +91,16 @@ def _of_seeds(data: Any, path: str) -> Number:
     against = data["paper"]
     wanted = (statistic,) if statistic else ("run", "opponent")
     for own, kind, other, metric, component, *values in data["scenarios"].get(scenario, ()):
-        if (own, other, metric, component) == (name, against, "relative_cost_difference", "") and kind in wanted:
+        if (own, other, metric, component) == (
+            name,
+            against,
+            "relative_cost_difference",
+            "",
+        ) and kind in wanted:
             return Number(*values)
-    raise ValueError(f"{path!r} leads nowhere: a path is seeds/ENVIRONMENT/SCENARIO/NAME or .../ALGORITHM/STATISTIC")
+    raise ValueError(
+        f"{path!r} leads nowhere: a path is seeds/ENVIRONMENT/SCENARIO/NAME or .../ALGORITHM/STATISTIC"
+    )
 
 
 def _with_unit(number: Number, scale: float, unit: str, interval: bool) -> str:

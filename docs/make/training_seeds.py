@@ -410,7 +410,9 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
     return found
 
 
-def comparison_grids(problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]) -> list[Grid]:
+def comparison_grids(
+    problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]
+) -> list[Grid]:
     """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
     first = comparisons[0]
     paper, references = problem.paper, problem.baselines.references
