@@ -26,9 +26,10 @@ from records import (
     benchmark_data,
     markdown_tables,
     read_benchmark,
-    recorded_benchmarks,
+    recorded_environments,
     short_name,
     today,
+    without_place,
     write_record,
 )
 
@@ -73,7 +74,7 @@ def record(
             found.setdefault(result.environment, []).extend(result.records)
         for id, records in found.items():
             data = benchmark_data(problem_of(id), records)
-            made = ResultRecord(settings.command, today(), settings.versions, note, data)
+            made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
             name = f"{BENCHMARK}/{short_name(id)}"
             console.print(
                 f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
@@ -115,7 +116,7 @@ def readme(
     check_columns(columns)
     check_formats([picture.suffix.removeprefix(".").lower()])
     text = with_results_table(page)
-    panels = panels_of([read_benchmark(name)[0] for name in recorded_benchmarks()])
+    panels = panels_of([read_benchmark(name)[0] for name in recorded_environments()])
     if not panels:
         raise ValueError("the records hold no times: make them by filtergym benchmark")
     save(draw_fronts(panels, columns=columns), picture)

@@ -27,13 +27,13 @@ from records import (
     read_benchmark,
     read_record,
     record_file,
-    recorded_benchmarks,
+    recorded_environments,
 )
 from results_table import chosen_markdown, results_markdown
 from sentence_numbers import number_text, record_of
 from sphinx.addnodes import download_reference
 from sphinx.util.docutils import SphinxDirective, SphinxRole
-from training_seeds import seeds_markdown
+from training_seeds import seeds_markdown, seeds_overview
 
 
 def _words(text: str) -> list[str]:
@@ -105,7 +105,7 @@ class ResultsTable(_Rendered):
 
     def markdown(self) -> str:
         """Return one table."""
-        names = self.name_given.split() or recorded_benchmarks()
+        names = self.name_given.split() or recorded_environments()
         scenario = self.options.get("scenario", "")
         policies, columns = (
             _words(self.options[key]) if key in self.options else () for key in ("policies", "columns")
@@ -135,7 +135,7 @@ class ComparisonOverview(_Rendered):
 
     def markdown(self) -> str:
         """Return one table."""
-        found = [self.benchmark(name)[0] for name in recorded_benchmarks()]
+        found = [self.benchmark(name)[0] for name in recorded_environments()]
         return comparison.overview_markdown(found, self.name_given)
 
 
@@ -144,7 +144,7 @@ class FrontFigure(_Rendered):
 
     def figure(self) -> tuple[str, str, Any]:
         """Return the fronts."""
-        names = self.name_given.split() or recorded_benchmarks()
+        names = self.name_given.split() or recorded_environments()
         panels = panels_of([self.benchmark(name)[0] for name in names])
         if not panels:
             raise ValueError(f"the records of {', '.join(names)} hold no times")
@@ -153,10 +153,12 @@ class FrontFigure(_Rendered):
 
 
 class SeedsTables(_Rendered):
-    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm."""
+    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, all means."""
 
     def markdown(self) -> str:
         """Return the tables."""
+        if not self.name_given:
+            return seeds_overview([self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)])
         environment_id(self.name_given)
         return seeds_markdown(self.record(f"{SEEDS}/{self.name_given}"))
 

@@ -118,6 +118,11 @@ def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
     return ResultRecord(**values)
 
 
+def without_place(command: str) -> str:
+    """Return a command without where and on how many processors it ran, of which its results say nothing."""
+    return re.sub(r" --(out|jobs|threads|cluster)[ =]\S+", "", command)
+
+
 def today() -> str:
     """Return the day, ISO 8601."""
     return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
@@ -215,11 +220,10 @@ def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, 
     return benchmark_records(record.data), record
 
 
-def recorded_benchmarks(folder: Path = FOLDER) -> list[str]:
-    """Short names of all environments with the record of a benchmark, in the catalogue's order."""
-    return [
-        name for id in catalogue() if record_file(f"{BENCHMARK}/{(name := short_name(id))}", folder).is_file()
-    ]
+def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
+    """Short names of all environments with a record of that kind, in the catalogue's order."""
+    names = map(short_name, catalogue())
+    return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
 
 
 # --- tables of text

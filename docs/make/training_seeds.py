@@ -30,7 +30,7 @@ from filtergym.evaluation.store import Store, Work
 from filtergym.evaluation.summary import EvaluationRequest, reduce_episodes
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
-from records import ResultRecord, round_number
+from records import ResultRecord, round_number, short_name
 from scipy.special import stdtrit
 
 from filtergym.names import find_competitor
@@ -538,6 +538,40 @@ def seeds_markdown(record: ResultRecord) -> str:
         own = [Comparison(*where, *each, data["units"].get(each[4], "1")) for each in numbers]
         grids += comparison_grids(problem, runs, own)
     return grids_as_markdown(grids, runs, record.origin)
+
+
+def seeds_overview(records: Sequence[ResultRecord]) -> str:
+    """Return the mean over training seeds of every algorithm in every environment, in Markdown.
+
+    Beside them stands the opponent of the lowest cost that is no reference. What is around an agent, a gate or a
+    policy that it corrects, is not told apart.
+    """
+    means: dict[str, dict[str, str]] = {}
+    for record in records:
+        data = record.data
+        problem = problem_of(data["environment"])
+        [(_, numbers), *_] = data["scenarios"].items()
+        cost = [each for each in numbers if each[2:4] == [data["paper"], "relative_cost_difference"]]
+        own = {name.split()[0]: _percent(values) for name, kind, _, _, _, *values in cost if kind == "mean"}
+        opponents = {name: values for name, kind, _, _, _, *values in cost if kind == "opponent"}
+        classical = {
+            name: values for name, values in opponents.items() if name not in problem.baselines.references
+        }
+        best = min(classical, key=lambda name: classical[name][0])
+        own["strongest classical"] = f"`{best}` {_percent(classical[best])}"
+        own["reference"] = "; ".join(_percent(v) for name, v in opponents.items() if name not in classical)
+        means[short_name(problem.id)] = own
+    algorithms = sorted(
+        {name for own in means.values() for name in own} - {"strongest classical", "reference"}
+    )
+    columns = [*algorithms, "strongest classical", "reference"]
+    heads = [f"`{name}`" if name in algorithms else name for name in columns]
+    rows = [[name, *(own.get(column, "-") or "-" for column in columns)] for name, own in means.items()]
+    return "\n".join(markdown_table(["environment", *heads], rows))
+
+
+def _percent(values: Sequence[float | None]) -> str:
+    return with_interval(Estimate(*values), 100.0)
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
