@@ -535,7 +535,7 @@ def seeds_markdown(record: ResultRecord) -> str:
     grids: list[Grid] = []
     for scenario, numbers in data["scenarios"].items():
         where = (problem.id, scenario, data["split"], data["seed"], data["episodes"])
-        own = [Comparison(*where, *each, data["units"].get(each[4], "1")) for each in numbers]
+        own = [Comparison._make([*where, *each, data["units"].get(each[4], "1")]) for each in numbers]
         grids += comparison_grids(problem, runs, own)
     return grids_as_markdown(grids, runs, record.origin)
 
