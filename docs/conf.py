@@ -1,6 +1,8 @@
 """How the documentation is built: ``make docs``. What is built works offline: nothing is fetched from elsewhere."""
 
 import re
+import sys
+from pathlib import Path
 from typing import Any, NewType
 
 import numpy.typing
@@ -16,7 +18,13 @@ author = "The filtergym developers"
 copyright = "The filtergym developers"
 version = release = filtergym.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_design"]
+# Tables and figures are rendered from records and code while the pages are built.
+sys.path.insert(0, str(Path(__file__).parent / "make"))
+
+extensions = [
+    *("myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_design"),
+    "record_directives",
+]
 # Examples and recipes are shown inside pages; the page of the package index stands alone.
 exclude_patterns = ["examples", "recipes", "package_index.md"]
 

@@ -12,13 +12,13 @@ from types import SimpleNamespace
 import commands
 import pytest
 from filtergym.baselines.problem import problem_of
-from made_results import results_of, without_times
+from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
 from filtergym.commands import terminal
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
-from filtergym.reports.results import read_results, settings_of, write_results
+from filtergym.reports.results import read_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
 OF_OPTIONS = {"Backend": ["filtergym[fast]"], "Cluster": ["filtergym[cluster]"]}
@@ -347,85 +347,6 @@ def test_full_benchmark_compares_everything():
     assert 20 <= dear.episodes < 1000
     # Held-out scenarios are run for final tables only.
     assert [cell.scenario for cell in benchmark.cells(True, [ENV], "validation")] == ["random"]
-
-
-def mean_cost(records, name):
-    return next(r.value for r in records if (r.policy, r.metric, r.window) == (name, "cost", "all"))
-
-
-def test_comparison_shows_what_the_records_say(tmp_path, make_page, monkeypatch):
-    import comparison
-
-    from filtergym.reports.ranking import who_is_best
-
-    names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]
-    result = results_of(ENV, names, None, 10, split="validation")
-    records = result.records
-    write_results(tmp_path / "results.json", [result], settings_of("filtergym benchmark"))
-    found = comparison.read_benchmark([tmp_path / "results.json"])
-    [measured] = found
-    assert (measured.problem.id, measured.records) == (ENV, records)
-    cost, error, typical, consistent, _ = comparison.compare_environment(measured).grids
-    classical = sorted(["imm-tuned", "adaptive-rearm"], key=lambda name: mean_cost(records, name))
-    # What is looked for first comes first: on a narrow screen the rest is scrolled to.
-    first = ["`ppo` (learned)", *(f"`{name}`" for name in classical)]
-    assert cost.header == ["scenario", "verdict", *first, "`known-turn` (reference)"]
-    assert (
-        typical.header
-        == consistent.header
-        == ["scenario", *first, "`imm` (paper)", "`known-turn` (reference)"]
-    )
-    assert cost.rows[0][1] == who_is_best(records)
-    assert typical.rows[0][4] == "+0.0<br>50"
-    [anees] = [r.value for r in records if (r.policy, r.metric, r.window) == ("ppo", "anees", "all")]
-    assert consistent.rows[0][1].startswith(f"{anees:.3g}")
-    assert error.header[:-1] == typical.header
-    assert error.header[-1] == "`known-input-bound` (bound)"
-    [difference] = [
-        100.0 * r.value for r in records if (r.policy, r.metric) == ("ppo", "relative_cost_difference")
-    ]
-    assert float(cost.rows[0][2].partition("<br>")[0]) == pytest.approx(difference, rel=5e-3)
-    *best, reference = comparison.summary(found).rows
-    assert {tuple(row[:3]) for row in best} == {
-        ("ManeuveringTarget", "`ppo`", "learned policy"),
-        ("ManeuveringTarget", f"`{classical[0]}`", "classical"),
-    }
-    assert reference[:3] == ["ManeuveringTarget", "`known-turn`", "reference"]
-    [worst] = comparison.harm(found).rows
-    assert worst[:3] == ["ManeuveringTarget", "`ppo`", "`random`"]
-    assert worst[3] == cost.rows[0][2].replace("<br>", " ")
-    page = tmp_path / "page.md"
-    page.write_text("<!-- room table: begin -->\n<!-- room table: end -->")
-    monkeypatch.chdir(tmp_path)
-    assert make_page("room", ENV, "results.json", "--into", "page.md")[0] == 0
-    assert "| `ppo` | " in page.read_text()
-    assert "no records of filtergym/UavAutopilot-v0" in make_page(
-        "room", "filtergym/UavAutopilot-v0", "results.json"
-    )[2].replace("\n", " ")
-    page.write_text(
-        "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
-        "\n<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
-    )
-    assert make_page("comparison", "results.json", "--into", "page.md")[0] == 0
-    assert "`ppo` (learned)" in page.read_text()
-    assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()
-    assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000
-    again = (
-        "comparison",
-        "results.json",
-        "--into",
-        "page.md",
-        "--format",
-        "svg",
-        "--format",
-        "pdf",
-        "--columns",
-        "1",
-    )
-    assert make_page(*again)[0] == 0
-    assert "(images/comparison_ManeuveringTarget-v0.svg)" in page.read_text()
-    assert 'width="252' in (tmp_path / "images" / "comparison_ManeuveringTarget-v0.svg").read_text()
-    assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.pdf").exists()
 
 
 def test_curves_in_a_format_that_nobody_writes_are_refused_first(make_page, tmp_path, monkeypatch):

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import command_line
 import pytest
-from environment_page import environment_tables, put_tables
+from environment_page import TABLES, environment_tables
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, parameter_names
 from models import make_model
-from pages import insert_between_markers
+from records import FOLDER, read_record, short_name
 
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("filter_designer.md", "rl_researcher.md", "log_file.md")
@@ -34,25 +34,20 @@ def page_file(id: str) -> Path:
 
 
 def page(id: str) -> str:
-    """Text of that page."""
-    return page_file(id).read_text(encoding="utf-8")
+    """Text of that page, with the tables that are rendered of the code."""
+    return "\n".join(
+        [page_file(id).read_text(encoding="utf-8"), *environment_tables(problem_of(id)).values()]
+    )
 
 
 @pytest.mark.parametrize("id", catalogue())
-def test_tables_of_the_page_are_those_of_the_code(id, tmp_path):
-    """If not: ``python docs/make page ID --into docs/environments/PAGE.md``."""
-    copy = tmp_path / "page.md"
-    copy.write_text(page(id), encoding="utf-8")
-    assert put_tables(problem_of(id), copy) == list(environment_tables(problem_of(id)))
-    assert copy.read_text(encoding="utf-8") == page(id)
-
-
-@pytest.mark.parametrize("id", catalogue())
-def test_page_has_the_usual_headings_and_a_room_table(id):
-    text = page(id)
+def test_page_has_the_usual_headings_and_tables(id):
+    text = page_file(id).read_text(encoding="utf-8")
+    name = short_name(id)
     assert [h for h in HEADINGS if f"\n## {h}\n" not in text] == []
-    table = text.partition("<!-- room table: begin -->")[2].partition("<!-- room table: end -->")[0]
-    assert "filtergym benchmark --full" in table or "python docs/make room" in table
+    assert f"```{{results-table}} {name}\n" in text
+    for table in (*TABLES, "policies"):
+        assert f"```{{environment-table}} {table}\n:environment: {name}\n```" in text
 
 
 @pytest.mark.parametrize("id", catalogue())
@@ -106,16 +101,9 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
                 assert (code, bool(shown)) == (0, True), errors
 
 
-def test_page_of_the_command_line_is_that_of_the_code(tmp_path):
-    """If not: ``python docs/make command-line docs/command_line.md``."""
-    copy = tmp_path / "page.md"
-    copy.write_text((DOCS / "command_line.md").read_text(encoding="utf-8"), encoding="utf-8")
-    insert_between_markers(copy, {command_line.MARKER: command_line.command_line_markdown()})
-    assert copy.read_text(encoding="utf-8") == (DOCS / "command_line.md").read_text(encoding="utf-8")
-
-
 def test_page_of_the_command_line_holds_what_help_says(command):
-    sections = re.split(r"^## ", (DOCS / "command_line.md").read_text(encoding="utf-8"), flags=re.M)[1:]
+    assert "```{command-line}\n" in (DOCS / "command_line.md").read_text(encoding="utf-8")
+    sections = re.split(r"^## ", command_line.command_line_markdown(), flags=re.M)[1:]
     options = {
         name: set(re.findall(r"--[a-z-]+", table)) for name, _, table in (s.partition("\n") for s in sections)
     }
@@ -145,8 +133,8 @@ def test_first_page_shows_the_result_and_the_commands_of_the_readme():
 
 def test_every_page_of_results_says_what_makes_it():
     for name, words in (
-        ("comparison.md", "python docs/make comparison results/results.json --into docs/comparison.md"),
-        ("training_seeds.md", "--into docs/training_seeds.md"),
+        ("comparison.md", "python docs/make record results/results.json"),
+        ("training_seeds.md", "--into docs/records"),
         ("speed.md", "python benchmarks/throughput.py"),
         ("plan.md", "python benchmarks/plan.py"),
     ):
@@ -165,7 +153,12 @@ def test_one_command_makes_all_that_is_shipped_and_published():
         assert f"runs/{file.parent.name.removesuffix('-v0')}/{file.stem}-? " in done, file
     for tuned in (DOCS.parent / "baselines").glob("*/tuned.json"):
         assert f"baselines/{tuned.parent.name}/tuned.json" in done, tuned
-    for page in (DOCS / "environments").glob("*.md"):
-        assert f"--into docs/environments/{page.name}" in done, page
+    for file in FOLDER.glob("*.json"):
+        # The drive is made from a log that is not here.
+        assert f"--name {file.stem} " in done or "drive.py" in read_record(file.stem).command, file
+    for id in catalogue():
+        assert f"runs/{short_name(id)}/*-? --scenario random" in done
+    assert done.count("--into docs/records --curves docs/images/training_") == len(catalogue())
+    assert "python docs/make record results/full/results.json" in done
     for report in (DOCS / "reproductions").glob("*/report.md"):
         assert f"filtergym reproduce {report.parent.name} " in done, report

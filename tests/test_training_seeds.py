@@ -3,15 +3,27 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import training_seeds
 from filtergym.agents.learned_policy import PRETRAINED, read_header
+from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.store import Store
+from filtergym.papers.grid import markdown_table
+from records import read_record
 from safetensors.numpy import load_file
-from training_seeds import Study, compare, episode_means, load_runs, spread
+from training_seeds import (
+    Comparison,
+    Study,
+    compare,
+    comparison_grids,
+    episode_means,
+    load_runs,
+    seeds_markdown,
+    spread,
+    trained_of,
+)
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -149,32 +161,21 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     assert scored[8:] == ["agent", "agent", "imm"]
 
 
-def test_command_fills_the_page(folders, tmp_path, make_page, monkeypatch):
+def test_command_makes_the_record_and_the_record_the_tables(folders, tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = tmp_path / "page.md"
-    page.write_text(
-        "a\n<!-- seeds ManeuveringTarget-v0: begin -->\nold\n<!-- seeds ManeuveringTarget-v0: end -->\nb"
-    )
-    arguments = (
-        *folders,
-        "--episodes",
-        20,
-        "--split",
-        "validation",
-        "--out",
-        "seeds.json",
-        "--into",
-        page,
-        "--curves",
-        "curves.png",
-    )
-    code, shown, errors = make_page("seeds", *arguments)
+    arguments = ("--episodes", 20, "--split", "validation", "--out", "seeds.json", "--curves", "curves.png")
+    code, shown, errors = make_page("seeds", *folders, *arguments, "--into", "records")
     assert code == 0, errors
     assert "bptt seed 1" in shown
-    text = page.read_text()
-    assert (text[:2], text[-2:], "old" in text) == ("a\n", "\nb", False)
+    record = read_record("seeds/ManeuveringTarget", tmp_path / "records")
+    assert "--split validation" in record.command
+    text = seeds_markdown(record)
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
         assert word in text
+    # What the record has lost, digits beyond the sixth, is not seen.
+    records = [Comparison(**each) for each in json.loads((tmp_path / "seeds.json").read_text())]
+    for grid in comparison_grids(problem_of(records[0].environment), trained_of(load_runs(folders)), records):
+        assert "\n".join(markdown_table(grid.header, grid.rows)) in text
     # The first table is shown, the others wait for a click; inside HTML, Markdown needs blank lines around it.
     shown, *folded = text.split("<details>\n")
     assert shown.count("\n|---") == shown.count("**Scenario `random`, 20 episodes") == 1
@@ -183,8 +184,7 @@ def test_command_fills_the_page(folders, tmp_path, make_page, monkeypatch):
         assert re.match(r"<summary>[^`]*<code>random</code></summary>\n\n\| ", part)
     assert (tmp_path / "curves.png").stat().st_size > 10_000
     assert not (tmp_path / "unfinished").exists()
-    records = json.loads((tmp_path / "seeds.json").read_text())
-    assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
+    assert {each.statistic for each in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 
 
 def test_the_best_of_an_algorithm_is_shipped(folders, tmp_path, make_page):
@@ -205,19 +205,6 @@ def test_the_best_of_an_algorithm_is_shipped(folders, tmp_path, make_page):
     assert (shipped["seed"], shipped["exported"]["episodes"]) == (1, 32)
 
 
-def test_the_page_folds_what_the_command_folds():
-    page = (Path(__file__).parent.parent / "docs" / "training_seeds.md").read_text(encoding="utf-8")
-    tables = re.findall(r"<!-- seeds \S+: begin -->\n(.*?)<!-- seeds \S+: end -->", page, re.S)
-    assert len(tables) == 5
-    for text in tables:
-        shown, *folded = text.split("<details>\n")
-        after = folded[-1].partition("</details>")[2]
-        assert "Made by `python docs/make seeds RUN" in after
-        assert [part.count("</details>") for part in (shown, *folded)] == [0, *(1 for _ in folded)]
-        assert shown.count("\n|---") == 1
-        assert all(part.count("\n|---") == 1 for part in folded)
-
-
 def test_what_cannot_be_compared(folders, tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
@@ -227,8 +214,6 @@ def test_what_cannot_be_compared(folders, tmp_path, make_page, monkeypatch):
         assert expected in errors
 
     fails("is a bound, which has no cost", folders[0], "--policy", "known-input-bound")
-    (tmp_path / "page.md").write_text("no markers")
-    fails("needs the lines <!-- seeds", folders[0], "--into", "page.md")
     record = json.loads((folders[1] / "run.json").read_text())
     (folders[1] / "run.json").write_text(json.dumps(record | {"envs": 3}))
     with pytest.raises(ValueError, match=r"may differ in the seed only: .* has envs 3"):

@@ -10,7 +10,6 @@ from filtergym.papers.grid import markdown_table
 
 from filtergym.__main__ import GROUPS, application, import_command
 
-MARKER = "commands"
 KINDS = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
 
 

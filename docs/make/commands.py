@@ -1,4 +1,4 @@
-"""Commands that make this project's own pages: ``python docs/make COMMAND``."""
+"""Commands that make what this project's pages are rendered from: ``python docs/make COMMAND``."""
 
 import itertools
 import math
@@ -6,34 +6,40 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-import comparison
 import training_seeds
 import typer
-from command_line import MARKER as COMMANDS_MARKER
-from command_line import command_line_markdown
-from environment_page import environment_tables, put_tables
 from filtergym.agents.export import export_run
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
 from filtergym.envs.scenario_choice import find_scenario
-from filtergym.evaluation.files import whole_files, writable_file
+from filtergym.evaluation.files import writable_file, write_text
+from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
 from filtergym.evaluation.store import UNFINISHED, Store
-from front import draw_fronts, fronts_in_words, panels_of
-from pages import check_markers, insert_between_markers, markers_of
-from room import MARKER, room_markdown, room_records
+from front import draw_fronts, panels_of
+from readme import with_results_table
+from records import (
+    BENCHMARK,
+    FOLDER,
+    SEEDS,
+    ResultRecord,
+    benchmark_data,
+    markdown_tables,
+    read_benchmark,
+    recorded_environments,
+    short_name,
+    today,
+    without_place,
+    write_record,
+)
 
 from filtergym.__main__ import main as run
 from filtergym.__main__ import program_of
-from filtergym.commands.shown import print_results
 from filtergym.commands.terminal import (
     Cluster,
     Columns,
-    Environment,
     Episodes,
     Experiment,
-    Formats,
     Jobs,
     Split,
     Trust,
@@ -42,112 +48,79 @@ from filtergym.commands.terminal import (
     console,
     progress_bar,
 )
-from filtergym.reports.records import read_records, write_records
+from filtergym.reports.records import write_records
+from filtergym.reports.results import read_results, settings_of
 
 PROGRAM = "python docs/make"
 
 
-def comparison_page(
-    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
-    into: Annotated[
-        Path | None,
-        typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
-    ] = None,
-    format: Formats = None,
+Note = Annotated[str, typer.Option(help="What a reader must know before they use the numbers.")]
+Folder = Annotated[Path, typer.Option("--into", help="Folder of the records.")]
+
+
+def record(
+    results: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
+    note: Note = "",
+    into: Folder = FOLDER,
+) -> None:
+    """Make a record of every environment that a full benchmark has measured: what pages show of it.
+
+    Example: python docs/make record results/results.json
+    """
+    for path in results:
+        own, settings = read_results(path)
+        found: dict[str, list[Record]] = {}
+        for result in own:
+            found.setdefault(result.environment, []).extend(result.records)
+        for id, records in found.items():
+            data = benchmark_data(problem_of(id), records)
+            made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
+            name = f"{BENCHMARK}/{short_name(id)}"
+            console.print(
+                f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
+            )
+
+
+def table(
+    text: Annotated[Path, typer.Argument(help="File with tables in Markdown, which a command has printed.")],
+    name: Annotated[list[str], typer.Option(help="Of the record of each table, in their order; repeatable.")],
+    command: Annotated[str, typer.Option(help="That printed them.")],
+    note: Note = "",
+    into: Folder = FOLDER,
+) -> None:
+    """Make a record of every table that a command has printed in Markdown.
+
+    Example: python docs/make table build/plain.txt --name plain_ppo --command "python benchmarks/plain_ppo.py"
+    """
+    tables = markdown_tables(text.read_text(encoding="utf-8")) if text.is_file() else []
+    if len(tables) != len(name):
+        raise ValueError(
+            f"{text} holds {len(tables)} tables, and there are {len(name)} names: say --name for each"
+        )
+    for own, data in zip(name, tables, strict=True):
+        made = ResultRecord(command, today(), settings_of(command).versions, note, data)
+        console.print(f"{write_record(own, made, into)}: {len(data['rows'])} rows", soft_wrap=True)
+
+
+def readme(
+    page: Annotated[Path, typer.Argument(help="Page whose table is replaced.")] = Path("README.md"),
+    picture: Annotated[
+        Path, typer.Option(help="PNG, SVG or PDF file for the fronts of cost and time.")
+    ] = Path("docs/images/front.png"),
     columns: Columns = 2,
 ) -> None:
-    """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
+    """Put the table of results into README, which nobody renders, and draw its picture, both from the records.
 
-    Example: python docs/make comparison results/results.json --into docs/comparison.md
-    """
-    formats = check_formats(format or ["png"])
-    check_columns(columns)
-    found = comparison.read_benchmark(records)
-    names = [own.problem.short_name for own in found]
-    markers = [f"comparison {name}" for name in names]
-    overview = "comparison of all"
-    if into is not None:
-        check_markers(into, markers)
-    compared = [comparison.compare_environment(own, columns) for own in found]
-    if into is not None:
-        texts = {}
-        with whole_files(into.parent / "images") as images:
-            for own, tables, name, marker in zip(found, compared, names, markers, strict=True):
-                for suffix in formats:
-                    save(tables.figure, images / f"comparison_{name}.{suffix}")
-                picture, first = f"images/comparison_{name}.{formats[0]}", own.records[0]
-                command = f"filtergym benchmark --full --seed {first.seed} --split {first.split}"
-                texts[marker] = comparison.comparison_markdown(tables, own, picture, command)
-        on_page = set(markers_of(into))
-        # Tables over all environments only from records of all that the page shows.
-        if overview in on_page and on_page <= {overview, *texts}:
-            texts[overview] = comparison.overview_markdown(found)
-        insert_between_markers(into, texts)
-    for each in compared:
-        for grid in each.grids:
-            console.print(grid)
-    for grid in (comparison.summary(found), comparison.harm(found)):
-        console.print(grid)
-
-
-def room(
-    environment: Environment,
-    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
-    into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
-) -> None:
-    """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
-
-    Example: python docs/make room filtergym/ManeuveringTarget-v0 results/results.json
-    """
-    problem = problem_of(environment)
-    paper = problem.paper  # there is no room without it
-    if into is not None:
-        check_markers(into, [MARKER])
-    found = room_records(comparison.read_benchmark(records), problem)
-    if into is not None:
-        first = found[0]
-        command = f"filtergym benchmark --full --seed {first.seed} --split {first.split}"
-        insert_between_markers(into, {MARKER: room_markdown(found, paper, command)})
-    print_results(found, problem.knows)
-
-
-def front(
-    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
-    into: Annotated[Path, typer.Option(help="PNG, SVG or PDF file for the picture.")] = Path(
-        "docs/images/front.png"
-    ),
-    columns: Columns = 2,
-) -> None:
-    """Draw cost against time, and the front of both, of all competitors in each training distribution.
-
-    Example: python docs/make front results/results.json
+    Example: python docs/make readme
     """
     check_columns(columns)
-    check_formats([into.suffix.removeprefix(".").lower()])
-    panels = panels_of([problem_of(id) for id in catalogue()], read_records(records))
+    check_formats([picture.suffix.removeprefix(".").lower()])
+    text = with_results_table(page)
+    panels = panels_of([read_benchmark(name)[0] for name in recorded_environments()])
     if not panels:
         raise ValueError("the records hold no times: make them by filtergym benchmark")
-    save(draw_fronts(panels, columns=columns), into)
-    for title, names in fronts_in_words(panels).items():
-        console.print(f"{title}: {names}", highlight=False)
-
-
-def page(
-    environment: Environment,
-    into: Annotated[Path | None, typer.Option(help="Page whose tables are replaced.")] = None,
-) -> None:
-    """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
-
-    A field is named for its block, and where that has several rows for each of its parts.
-
-    Example: python docs/make page filtergym/ManeuveringTarget-v0
-    """
-    problem = problem_of(environment)
-    if into is not None:
-        console.print(f"{into}: {', '.join(put_tables(problem, into))}")
-        return
-    for name, table in environment_tables(problem).items():
-        console.print(f"{name}\n\n{table}\n", soft_wrap=True)
+    save(draw_fronts(panels, columns=columns), picture)
+    write_text(page, text)
 
 
 def seeds(
@@ -169,7 +142,10 @@ def seeds(
     seed: Experiment = 0,
     split: Split = "test",
     out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
-    into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
+    into: Annotated[
+        Path | None, typer.Option(help="Folder of the records, where that of the environment is written.")
+    ] = None,
+    note: Note = "",
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
     columns: Columns = 2,
     trust: Trust = False,
@@ -191,13 +167,10 @@ def seeds(
     names: list[str | None] = [*scenario] if scenario else [None]
     scenarios = [find_scenario(problem.task, name).name for name in names]
     opponents = policy or training_seeds.default_opponents(problem)
-    marker = f"seeds {problem.short_name}"
     for file in (out, curves):
         if file is not None:
             writable_file(file)
     store = Store(None if out is None else out.with_name(UNFINISHED))
-    if into is not None:
-        check_markers(into, [marker])
     if curves is not None:
         save(training_seeds.learning_curves(found, columns), curves)
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
@@ -212,7 +185,9 @@ def seeds(
         command = f"{PROGRAM} seeds RUN ... {' '.join(f'--scenario {name}' for name in scenarios)} "
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
-        insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
+        data = training_seeds.seeds_data(study, records)
+        made = ResultRecord(command, today(), settings_of(command).versions, note, data)
+        write_record(f"{SEEDS}/{short_name(problem.id)}", made, into)
     store.clear()
     for grid in grids:
         console.print(grid)
@@ -240,24 +215,12 @@ def ship(
         console.print(f"{file}: {best.name}, of the lowest validation cost")
 
 
-def command_line(
-    into: Annotated[Path, typer.Argument(help="Page whose sections are replaced.")],
-) -> None:
-    """Make the sections of the page of the command line from the commands themselves.
-
-    Example: python docs/make command-line docs/command_line.md
-    """
-    insert_between_markers(into, {COMMANDS_MARKER: command_line_markdown()})
-
-
 COMMANDS: dict[str, Callable[..., None]] = {
-    "page": page,
-    "room": room,
-    "front": front,
-    "comparison": comparison_page,
+    "record": record,
+    "table": table,
     "seeds": seeds,
     "ship": ship,
-    "command-line": command_line,
+    "readme": readme,
 }
 
 

@@ -1,32 +1,23 @@
 """The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.catalogue import catalogue, nearest
+from filtergym.baselines.problem import Problem
 from filtergym.evaluation.competitors import RANKED
 from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_differences
+from records import BenchmarkRecords, ResultRecord, short_name
 
 from filtergym.reports.ranking import HARM, ranking, ranking_sentence, who_is_best
-from filtergym.reports.results import read_all_results
 from filtergym.reports.tables import INCONSISTENT, against_paper, consistency, score_text, with_interval
 
 STRONGEST = 4
 """Classical competitors that the page shows."""
 DIFFERENCE = "relative_cost_difference"
-
-
-class BenchmarkRecords(NamedTuple):
-    """What a benchmark has measured in one environment."""
-
-    problem: Problem
-    records: list[Record]
 
 
 class Comparison(NamedTuple):
@@ -35,31 +26,6 @@ class Comparison(NamedTuple):
     environment: str
     grids: list[Grid]
     figure: Any
-
-
-def read_benchmark(paths: Sequence[Path]) -> list[BenchmarkRecords]:
-    """Read the records of benchmarks, those of an environment together.
-
-    Raises:
-        ValueError: if a file is none, is of something else, or they hold nothing.
-    """
-    found: dict[str, list[Record]] = {}
-    for result in read_all_results(paths)[0]:
-        for record in result.records:
-            check_known(record)
-        found.setdefault(result.environment, []).extend(result.records)
-    if not found:
-        raise ValueError(f"{paths[0]} holds no records: make them by filtergym benchmark --full")
-    return [BenchmarkRecords(problem_of(id), records) for id, records in found.items()]
-
-
-def check_known(record: Record) -> None:
-    """Raise ValueError if a record is of an environment or a scenario that is not here."""
-    cls = catalogue().get(record.environment)
-    if cls is None:
-        raise nearest("environment", record.environment, catalogue())
-    if record.scenario not in cls.scenarios:
-        raise nearest("scenario", record.scenario, cls.scenarios)
 
 
 def compared_policies(problem: Problem, records: Sequence[Record]) -> list[str]:
@@ -116,7 +82,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
         for origin, name in best.items():
             rows.append(
                 [
-                    problem.short_name.removesuffix("-v0"),
+                    short_name(problem.id),
                     f"`{name}`",
                     origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
                     *_cells(name, records),
@@ -140,7 +106,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
             beside = [record for record in records if record.scenario == worst.scenario]
             rows.append(
                 [
-                    problem.short_name.removesuffix("-v0"),
+                    short_name(problem.id),
                     f"`{name}`",
                     f"`{worst.scenario}`",
                     *_cells(name, beside),
@@ -268,18 +234,21 @@ def _two_lines(record: Record | None, scale: float) -> str:
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
-def overview_markdown(found: Sequence[BenchmarkRecords]) -> str:
-    """Both tables over all environments."""
-    lines: list[str] = []
-    for grid in (summary(found), harm(found)):
-        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
-    return "\n".join(lines[:-1])
+def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
+    """Table over all environments, in Markdown: "best" of every origin, or where agents do "harm".
+
+    Raises:
+        ValueError: for another word.
+    """
+    tables = {"best": summary, "harm": harm}
+    if which not in tables:
+        raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")
+    grid = tables[which](found)
+    return "\n".join([f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows)])
 
 
-def comparison_markdown(
-    comparison: Comparison, measured: BenchmarkRecords, picture: str, command: str
-) -> str:
-    """Tables and picture of one environment, with the command that made the records."""
+def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
+    """Sentences and tables of one environment, with the command that made the records."""
     records, paper = measured.records, measured.problem.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
@@ -292,10 +261,7 @@ def comparison_markdown(
     lines.append("")
     for grid in comparison.grids:
         lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
-    lines += [
-        f"![Cost against the paper's algorithm in every scenario, {comparison.environment}]({picture})",
-        "",
-        f"{first.split.capitalize()} split, {count} episodes a scenario, 95 % intervals over episodes. "
-        f"Made by `{command}`.",
-    ]
+    lines.append(
+        f"{first.split.capitalize()} split, {count} episodes a scenario, 95 % intervals over episodes. {record.origin}"
+    )
     return "\n".join(lines)

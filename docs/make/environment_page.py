@@ -9,18 +9,16 @@ import ast
 import inspect
 import textwrap
 import typing
-from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from filtergym.baselines.problem import Problem
 from filtergym.envs.backend import make_model
+from filtergym.envs.catalogue import nearest
 from filtergym.envs.model import Model
 from filtergym.envs.observation import Block
 from filtergym.envs.parameters import Limits, field_limits
 from filtergym.envs.task import Task
 from filtergym.papers.grid import markdown_table
-from pages import insert_between_markers, markers_of
 
 PARTS_SHOWN = 4
 """Fields of one block that are named one by one; more are told by their endings."""
@@ -171,28 +169,23 @@ TABLES = {
     "parameters": _parameters,
     "scenarios": _scenarios,
 }
-"""Of the task, by the names of their markers; that of the policies stands beside them."""
+"""Of the task, by their names; that of the policies stands beside them."""
 
 
 def environment_tables(problem: Problem) -> dict[str, str]:
-    """Make the tables of an environment, by the names of their markers, in Markdown."""
+    """Make the tables of an environment, by their names, in Markdown."""
     tables = {name: make(problem.task) for name, make in TABLES.items()}
     return {name: "\n".join(lines) for name, lines in {**tables, "policies": _policies(problem)}.items()}
 
 
-def put_tables(problem: Problem, page: Path) -> Sequence[str]:
-    """Put those tables into a page that it has markers for, and return their names.
+def environment_table(problem: Problem, name: str) -> str:
+    """Make one table of an environment in Markdown.
 
     Raises:
-        ValueError: if the page does not exist or has none of the markers.
+        ValueError: if there is none of that name.
     """
-    tables = environment_tables(problem)
-    wanted: Iterable[str] = [name for name in tables if name in markers_of(page)]
-    if not wanted:
-        first = next(iter(tables))
-        raise ValueError(
-            f"{page} has none of the markers {', '.join(tables)}: write <!-- {first}: begin --> and "
-            f"<!-- {first}: end --> where that table should stand"
-        )
-    insert_between_markers(page, {name: tables[name] for name in wanted})
-    return list(wanted)
+    if name == "policies":
+        return "\n".join(_policies(problem))
+    if name not in TABLES:
+        raise nearest("table", name, [*TABLES, "policies"])
+    return "\n".join(TABLES[name](problem.task))

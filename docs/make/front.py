@@ -1,27 +1,25 @@
 """The front of cost and time of every environment, drawn from the records of a benchmark in one picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import Problem
 from filtergym.evaluation.front_figure import Panel, draw_panel, legend_of, name_points
-from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.print_layout import figure_with_pairs, in_print
-from filtergym.evaluation.times import front, points_of_records
+from filtergym.evaluation.times import points_of_records
+from records import BenchmarkRecords, short_name
 
 
-def panels_of(problems: Sequence[Problem], records: Sequence[Record]) -> list[Panel]:
+def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
     """Return what is drawn of each environment that the records have times of, in its training distribution."""
     panels = []
-    for problem in problems:
-        own = [
-            r for r in records if (r.environment, r.scenario) == (problem.id, problem.task.default_scenario)
-        ]
+    for problem, records in found:
+        own = [r for r in records if r.scenario == problem.task.default_scenario]
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
-            title = problem.short_name.removesuffix("-v0")
-            panels.append(Panel(title, points, known.score_paper, known.score_reference, learned))
+            panels.append(
+                Panel(short_name(problem.id), points, known.score_paper, known.score_reference, learned)
+            )
     return panels
 
 
@@ -42,8 +40,3 @@ def draw_fronts(panels: Sequence[Panel], *, columns: int = 2) -> Any:
     cells[len(panels)].legend(handles=legend_of(panels), loc="center", frameon=False)
     name_points(figure, dict(zip(cells, panels, strict=False)))
     return figure
-
-
-def fronts_in_words(panels: Sequence[Panel]) -> Mapping[str, str]:
-    """Names on each front, the quickest first."""
-    return {panel.title: ", ".join(front(panel.points)) for panel in panels}

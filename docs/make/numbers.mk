@@ -41,7 +41,9 @@ PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-es
 episodes = $(or $(episodes_$(1)),2000)
 trained = $(foreach agent,$(agents_$(1)),$(DONE)/train-$(1)-$(agent))
 shipped = $(foreach environment,$(ENVIRONMENTS),$(DONE)/ship-$(environment))
-# Tables that go into a page by hand stand in build/.
+# From a command's results to the record that pages are rendered from.
+record := $(BIN)/python docs/make record
+table := $(BIN)/python docs/make table
 finish = @mkdir -p $(DONE) && touch $@
 
 .PHONY: numbers tuned trained shipped evaluated
@@ -53,8 +55,8 @@ numbers: tuned trained shipped evaluated
 tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
-evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/comparison $(DONE)/front $(ENVIRONMENTS:%=$(DONE)/room-%) \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(PAPERS:%=$(DONE)/paper-%)
+evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -87,34 +89,37 @@ $(foreach environment,$(ENVIRONMENTS),$(eval $(call shipping,$(environment))))
 
 $(DONE)/seeds-%: $(DONE)/ship-%
 	$(BIN)/python docs/make seeds runs/$*/*-? --scenario random --episodes $(call episodes,$*) --jobs $(JOBS) \
-	  --out results/seeds/$*.json --into docs/training_seeds.md --curves docs/images/training_$*.png --trust
+	  --out results/seeds/$*.json --into docs/records --curves docs/images/training_$*.png --trust
 	$(finish)
 
-$(DONE)/comparison: $(shipped)
+# The second command alone makes the records of all environments anew from a finished benchmark, wherever it lies.
+$(DONE)/benchmark: $(shipped)
 	$(BIN)/filtergym benchmark --full --jobs $(JOBS) --out results/full
-	$(BIN)/python docs/make comparison results/full/results.json --into docs/comparison.md
-	$(finish)
-
-$(DONE)/front: $(DONE)/comparison
-	$(BIN)/python docs/make front results/full/results.json
-	$(finish)
-
-$(DONE)/room-%: $(DONE)/comparison
-	$(BIN)/python docs/make room filtergym/$*-v0 results/full/results.json --into docs/environments/$(room_$*).md
-	$(BIN)/python docs/make page filtergym/$*-v0 --into docs/environments/$(room_$*).md
+	$(record) results/full/results.json
 	$(finish)
 
 $(DONE)/flights: $(DONE)/ship-ManeuveringTarget
 	$(BIN)/python -m pip install --quiet --no-deps traffic
 	$(BIN)/python benchmarks/flights.py --out docs/data/flights.csv > build/flights.txt
+	$(table) build/flights.txt --name flights_smoothed --name flights_recorded \
+	  --command "python benchmarks/flights.py --out docs/data/flights.csv"
 	$(finish)
 
 $(DONE)/plain:
 	$(BIN)/python benchmarks/plain_ppo.py --markdown --out build/plain_ppo.json > build/plain_ppo.txt
+	$(table) build/plain_ppo.txt --name plain_ppo --command "python benchmarks/plain_ppo.py --markdown"
 	$(finish)
 
 $(DONE)/harm-%: $(DONE)/ship-%
 	$(BIN)/python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*) > build/harm-$*.txt
+	$(table) build/harm-$*.txt --name harm/$* \
+	  --command "python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*)"
+	$(finish)
+
+$(DONE)/exported: $(shipped)
+	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
+	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
+	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
 	$(finish)
 
 $(DONE)/paper-%:

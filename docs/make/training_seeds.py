@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
-from filtergym.baselines.problem import Problem
+from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.scenario_choice import make_task
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.code import files_digest
@@ -30,6 +30,7 @@ from filtergym.evaluation.store import Store, Work
 from filtergym.evaluation.summary import EvaluationRequest, reduce_episodes
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
+from records import ResultRecord, round_number, short_name
 from scipy.special import stdtrit
 
 from filtergym.names import find_competitor
@@ -73,6 +74,18 @@ class SeedRun(NamedTuple):
     def name(self) -> str:
         """Name among the policies, which no opponent has."""
         return f"{self.algorithm} seed {self.run.seed}"
+
+
+class Trained(NamedTuple):
+    """What pages say of one training run."""
+
+    name: str
+    algorithm: str
+    seed: int
+    steps: int | None
+    """At which its best agent was found; None: it is not known."""
+    command: str
+    """That trained it, without the seed."""
 
 
 class EpisodeMeans(NamedTuple):
@@ -397,10 +410,11 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
     return found
 
 
-def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison]) -> list[Grid]:
+def comparison_grids(
+    problem: Problem, runs: Sequence[Trained], comparisons: Sequence[Comparison]
+) -> list[Grid]:
     """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
     first = comparisons[0]
-    problem = runs[0].run.problem
     paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
     units = {c.component: c.unit for c in comparisons if c.metric == "rmse"}
@@ -409,7 +423,7 @@ def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison])
     policies = {c.policy: c.statistic for c in comparisons if c.metric == "rmse"}
     opponents = [name for name, statistic in policies.items() if statistic == "opponent"]
     algorithms = dict.fromkeys(member.algorithm for member in runs)
-    steps = {member.name: f"{member.run.best['steps']:,}" for member in runs if member.run.best}
+    steps = {member.name: f"{member.steps:,}" for member in runs if member.steps is not None}
 
     def cost(policy: str, statistic: str, against: str = paper) -> str:
         return with_interval(found[policy, statistic, against, "relative_cost_difference", ""], 100.0)
@@ -471,15 +485,96 @@ def compare_scenarios(
     """
     records: list[Comparison] = []
     grids: list[Grid] = []
+    runs = trained_of(study.runs)
     for scenario in scenarios:
         means = episode_means(study, scenario, progress, store, workers)
         comparisons = compare(study, means, scenario)
         records += comparisons
-        grids += comparison_grids(study.runs, comparisons)
+        grids += comparison_grids(study.problem, runs, comparisons)
     return records, grids
 
 
-def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[SeedRun], command: str) -> str:
+def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
+    """Return what pages say of training runs."""
+    return [
+        Trained(
+            member.name,
+            member.algorithm,
+            member.run.seed,
+            member.run.best["steps"] if member.run.best else None,
+            member.run.command.removesuffix(f" --seed {member.run.seed}"),
+        )
+        for member in runs
+    ]
+
+
+def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """Return what a record holds of training seeds: the runs, and every number by scenario."""
+    scenarios: dict[str, list[list[Any]]] = {}
+    for c in comparisons:
+        numbers = [round_number(x) for x in (c.value, c.low, c.high)]
+        scenarios.setdefault(c.scenario, []).append(
+            [c.policy, c.statistic, c.against, c.metric, c.component, *numbers]
+        )
+    return {
+        "environment": study.problem.id,
+        "split": study.split,
+        "seed": study.seed,
+        "episodes": study.episodes,
+        "paper": study.problem.paper,
+        "units": {c.component: c.unit for c in comparisons if c.unit != "1"},
+        "runs": [list(each) for each in trained_of(study.runs)],
+        "scenarios": scenarios,
+    }
+
+
+def seeds_markdown(record: ResultRecord) -> str:
+    """Return the tables of training seeds in Markdown, with the commands that made them and the runs."""
+    data = record.data
+    problem, runs = problem_of(data["environment"]), [Trained(*each) for each in data["runs"]]
+    grids: list[Grid] = []
+    for scenario, numbers in data["scenarios"].items():
+        where = (problem.id, scenario, data["split"], data["seed"], data["episodes"])
+        own = [Comparison._make([*where, *each, data["units"].get(each[4], "1")]) for each in numbers]
+        grids += comparison_grids(problem, runs, own)
+    return grids_as_markdown(grids, runs, record.origin)
+
+
+def seeds_overview(records: Sequence[ResultRecord]) -> str:
+    """Return the mean over training seeds of every algorithm in every environment, in Markdown.
+
+    Beside them stands the opponent of the lowest cost that is no reference. What is around an agent, a gate or a
+    policy that it corrects, is not told apart.
+    """
+    means: dict[str, dict[str, str]] = {}
+    for record in records:
+        data = record.data
+        problem = problem_of(data["environment"])
+        [(_, numbers), *_] = data["scenarios"].items()
+        cost = [each for each in numbers if each[2:4] == [data["paper"], "relative_cost_difference"]]
+        own = {name.split()[0]: _percent(values) for name, kind, _, _, _, *values in cost if kind == "mean"}
+        opponents = {name: values for name, kind, _, _, _, *values in cost if kind == "opponent"}
+        classical = {
+            name: values for name, values in opponents.items() if name not in problem.baselines.references
+        }
+        best = min(classical, key=lambda name: classical[name][0])
+        own["strongest classical"] = f"`{best}` {_percent(classical[best])}"
+        own["reference"] = "; ".join(_percent(v) for name, v in opponents.items() if name not in classical)
+        means[short_name(problem.id)] = own
+    algorithms = sorted(
+        {name for own in means.values() for name in own} - {"strongest classical", "reference"}
+    )
+    columns = [*algorithms, "strongest classical", "reference"]
+    heads = [f"`{name}`" if name in algorithms else name for name in columns]
+    rows = [[name, *(own.get(column, "-") or "-" for column in columns)] for name, own in means.items()]
+    return "\n".join(markdown_table(["environment", *heads], rows))
+
+
+def _percent(values: Sequence[float | None]) -> str:
+    return with_interval(Estimate(*values), 100.0)
+
+
+def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
     """Tables, the first shown and the others folded, and the commands that made them and the runs."""
     lines: list[str] = []
     for i, grid in enumerate(grids):
@@ -490,10 +585,9 @@ def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[SeedRun], command: s
             # Between blank lines Markdown is read inside HTML; the summary is HTML only.
             title = re.sub("`(.+?)`", r"<code>\1</code>", html.escape(grid.title, quote=False))
             lines += ["<details>", f"<summary>{title}</summary>", "", *table, "", "</details>", ""]
-    lines += [f"95 % intervals. Made by `{command}` from the runs of", ""]
+    lines += [f"95 % intervals. {origin} The runs are of", ""]
     trained: dict[str, list[str]] = {}
     for member in runs:
-        training = member.run.command.removesuffix(f" --seed {member.run.seed}")
-        trained.setdefault(training, []).append(str(member.run.seed))
+        trained.setdefault(member.command, []).append(str(member.seed))
     lines += [f"* `{training} --seed {'|'.join(seeds)}`" for training, seeds in trained.items()]
     return "\n".join(lines)

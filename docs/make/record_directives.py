@@ -1,0 +1,264 @@
+"""Directives and roles that render records, and tables of the code, where a page names them (Sphinx, MyST).
+
+A mistake in a name is a warning, with which a build under ``-W`` ends. CONTRIBUTING.md shows how to write them.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import comparison
+from command_line import command_line_markdown
+from docutils import nodes
+from docutils.parsers.rst import directives
+from docutils.statemachine import StringList
+from environment_page import environment_table
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.print_layout import save
+from filtergym.papers.grid import markdown_table
+from front import draw_fronts, panels_of
+from records import (
+    BENCHMARK,
+    SEEDS,
+    BenchmarkRecords,
+    ResultRecord,
+    environment_id,
+    read_benchmark,
+    read_record,
+    record_file,
+    recorded_environments,
+)
+from results_table import chosen_markdown, results_markdown
+from sentence_numbers import number_text, record_of
+from sphinx.addnodes import download_reference
+from sphinx.util.docutils import SphinxDirective, SphinxRole
+from training_seeds import seeds_markdown, seeds_overview
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",")]
+
+
+class _Rendered(SphinxDirective):
+    """What is rendered in Markdown by :meth:`markdown`, and shown by :meth:`figure` if it draws anything."""
+
+    required_arguments = 0
+    optional_arguments = 1
+    final_argument_whitespace = True
+
+    @property
+    def name_given(self) -> str:
+        """The argument, or nothing."""
+        return self.arguments[0].strip() if self.arguments else ""
+
+    def markdown(self) -> str:
+        """Return what is shown, in Markdown."""
+        return ""
+
+    def figure(self) -> tuple[str, str, Any] | None:
+        """Return a name, words for who does not see it, and the figure."""
+        return None
+
+    def run(self) -> list[nodes.Node]:
+        """Render; a mistake is reported where the page has it."""
+        try:
+            text, drawn = self.markdown(), self.figure()
+        except ValueError as error:
+            return [self.state.document.reporter.warning(str(error), line=self.lineno)]
+        shown = nodes.section() if self.with_headings else nodes.Element()
+        lines = StringList(text.splitlines(), source=self.get_source_info()[0])
+        self.state.nested_parse(lines, self.content_offset, shown, match_titles=self.with_headings)
+        found: list[nodes.Node] = [*shown.children]
+        if drawn is not None:
+            found.append(self._image(*drawn))
+        return found
+
+    with_headings: ClassVar[bool] = False
+
+    def benchmark(self, name: str) -> tuple[BenchmarkRecords, ResultRecord]:
+        """Read the record of a benchmark, which the page depends on from now on."""
+        self.env.note_dependency(record_file(f"{BENCHMARK}/{name}"))
+        return read_benchmark(name)
+
+    def record(self, name: str) -> ResultRecord:
+        """Read a record, which the page depends on from now on."""
+        self.env.note_dependency(record_file(name))
+        return read_record(name)
+
+    def _image(self, name: str, words: str, figure: Any) -> nodes.Node:
+        folder = Path(self.env.app.doctreedir) / "figures"
+        folder.mkdir(parents=True, exist_ok=True)
+        save(figure, folder / f"{name}.svg")
+        page = Path(self.env.doc2path(self.env.docname)).parent
+        return nodes.image(uri=os.path.relpath(folder / f"{name}.svg", page), alt=words)
+
+
+class ResultsTable(_Rendered):
+    """``{results-table} ENVIRONMENT``: everybody in its training distribution; several, or some, by options."""
+
+    option_spec: ClassVar[Any] = {
+        "scenario": directives.unchanged,
+        "policies": directives.unchanged,
+        "columns": directives.unchanged,
+    }
+
+    def markdown(self) -> str:
+        """Return one table."""
+        names = self.name_given.split() or recorded_environments()
+        scenario = self.options.get("scenario", "")
+        policies, columns = (
+            _words(self.options[key]) if key in self.options else () for key in ("policies", "columns")
+        )
+        if len(names) == 1 and not policies and not columns:
+            return results_markdown(*self.benchmark(names[0]), scenario)
+        return chosen_markdown({name: self.benchmark(name) for name in names}, scenario, policies, columns)
+
+
+class ComparisonTables(_Rendered):
+    """``{comparison} ENVIRONMENT``: every scenario, in sentences, tables and a figure."""
+
+    def markdown(self) -> str:
+        """Return sentences and tables."""
+        measured, record = self.benchmark(self.name_given)
+        self.compared = comparison.compare_environment(measured)
+        return comparison.comparison_markdown(self.compared, measured, record)
+
+    def figure(self) -> tuple[str, str, Any]:
+        """Return cost in every scenario."""
+        words = f"Cost against the paper's algorithm in every scenario, {self.name_given}"
+        return f"comparison_{self.name_given}", words, self.compared.figure
+
+
+class ComparisonOverview(_Rendered):
+    """``{comparison-overview} best`` or ``harm``: over all environments."""
+
+    def markdown(self) -> str:
+        """Return one table."""
+        found = [self.benchmark(name)[0] for name in recorded_environments()]
+        return comparison.overview_markdown(found, self.name_given)
+
+
+class FrontFigure(_Rendered):
+    """``{front-figure} ENVIRONMENT ...``: accuracy against time; default: all environments."""
+
+    def figure(self) -> tuple[str, str, Any]:
+        """Return the fronts."""
+        names = self.name_given.split() or recorded_environments()
+        panels = panels_of([self.benchmark(name)[0] for name in names])
+        if not panels:
+            raise ValueError(f"the records of {', '.join(names)} hold no times")
+        words = f"Cost against processor time of every competitor: {', '.join(names)}"
+        return "_".join(["front", *self.name_given.split()]), words, draw_fronts(panels)
+
+
+class SeedsTables(_Rendered):
+    """``{seeds} ENVIRONMENT``: every training run, and the spread of each algorithm; without a name, all means."""
+
+    def markdown(self) -> str:
+        """Return the tables."""
+        if not self.name_given:
+            return seeds_overview([self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)])
+        environment_id(self.name_given)
+        return seeds_markdown(self.record(f"{SEEDS}/{self.name_given}"))
+
+
+class RecordTable(_Rendered):
+    """``{record-table} NAME``: a table of text, or some of its columns."""
+
+    option_spec: ClassVar[Any] = {"columns": directives.unchanged, "bare": directives.flag}
+
+    def markdown(self) -> str:
+        """Return the table, and unless it is bare who made it."""
+        record = self.record(self.name_given)
+        titles, rows = record.data["columns"], record.data["rows"]
+        if "columns" in self.options:
+            places = [titles.index(title) for title in _words(self.options["columns"])]
+            titles, rows = [titles[i] for i in places], [[row[i] for i in places] for row in rows]
+        table = markdown_table(titles, rows)
+        return "\n".join([*table, *(["", record.origin] if "bare" not in self.options else [])])
+
+
+class EnvironmentTable(_Rendered):
+    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, of the code."""
+
+    option_spec: ClassVar[Any] = {"environment": directives.unchanged_required}
+
+    def markdown(self) -> str:
+        """Return the table."""
+        if "environment" not in self.options:
+            raise ValueError("the option environment is missing, such as `:environment: ManeuveringTarget`")
+        return environment_table(problem_of(environment_id(self.options["environment"])), self.name_given)
+
+
+class CommandLine(_Rendered):
+    """``{command-line}``: all commands, of the code."""
+
+    with_headings: ClassVar[bool] = True
+
+    def markdown(self) -> str:
+        """Return what ``--help`` says."""
+        return command_line_markdown()
+
+
+class NumberRole(SphinxRole):
+    """``{number}`PATH```: a number of a record with its interval; ``{value}`PATH``` without."""
+
+    def __init__(self, interval: bool) -> None:
+        self.interval = interval
+
+    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+        """Render one number."""
+        return _in_sentence(
+            self, lambda: [nodes.Text(number_text(self.text, self.interval))], record_of(self.text)
+        )
+
+
+class RecordRole(SphinxRole):
+    """``{record}`NAME```: the record that numbers of this section are of, to be opened."""
+
+    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+        """Render a link, which tells the command."""
+        return _in_sentence(self, self._link, self.text)
+
+    def _link(self) -> Sequence[nodes.Node]:
+        record = read_record(self.text)
+        target = os.path.relpath(record_file(self.text), Path(self.env.doc2path(self.env.docname)).parent)
+        link = download_reference(
+            "", "", reftarget=target, refdoc=self.env.docname, refdomain="", reftype="download", refexplicit=True,
+            refwarn=True,
+        )  # fmt: skip
+        link += nodes.literal("", self.text)
+        return [nodes.Text("record "), link, nodes.Text(" of "), nodes.literal("", record.command)]
+
+
+def _in_sentence(
+    role: SphinxRole, make: Callable[[], Sequence[nodes.Node]], record: str
+) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+    try:
+        role.env.note_dependency(record_file(record))
+        return [*make()], []
+    except ValueError as error:
+        return [nodes.Text("?")], [role.inliner.reporter.warning(str(error), line=role.lineno)]
+
+
+DIRECTIVES = {
+    "results-table": ResultsTable,
+    "comparison": ComparisonTables,
+    "comparison-overview": ComparisonOverview,
+    "front-figure": FrontFigure,
+    "seeds": SeedsTables,
+    "record-table": RecordTable,
+    "environment-table": EnvironmentTable,
+    "command-line": CommandLine,
+}
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Register all of them."""
+    for name, directive in DIRECTIVES.items():
+        app.add_directive(name, directive)
+    app.add_role("number", NumberRole(interval=True))
+    app.add_role("value", NumberRole(interval=False))
+    app.add_role("record", RecordRole())
+    return {"parallel_read_safe": True}

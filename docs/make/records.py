@@ -1,0 +1,269 @@
+"""Records: what commands have measured, committed once as small files, from which pages are rendered.
+
+A record is JSON: the command that made it, the day, the versions of the libraries, a note, and the data. There are
+three kinds of data: ``benchmark/ENVIRONMENT`` holds what pages show of ``filtergym benchmark --full``,
+``seeds/ENVIRONMENT`` what ``python docs/make seeds`` has computed, and every other record is a table of text.
+"""
+
+import datetime
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filtergym.baselines.problem import Problem, problem_of
+from filtergym.envs.catalogue import catalogue, nearest
+from filtergym.evaluation.files import write_text
+from filtergym.evaluation.metrics import Record
+from filtergym.evaluation.stored import read_json
+
+from filtergym.reports.tables import main_components
+
+FOLDER = Path(__file__).parent.parent / "records"
+BENCHMARK, SEEDS = "benchmark", "seeds"
+"""Folders of the records of an environment."""
+METRICS = (
+    *(
+        "cost",
+        "relative_cost_difference",
+        "median_cost_ratio",
+        "win_rate",
+        "behind_best",
+        "score",
+        "nanoseconds",
+    ),
+    "lost_episodes",
+)
+"""Of a benchmark that pages show, beside the ANEES of the whole state and the errors of the main components."""
+DIGITS = 6
+"""Significant ones that are kept; pages show three."""
+
+
+class ResultRecord(NamedTuple):
+    """One file."""
+
+    command: str
+    """That makes the data again."""
+    made: str
+    """Day, ISO 8601."""
+    versions: dict[str, str]
+    """Of Python and the libraries."""
+    note: str
+    """What a reader must know before they use it; empty: nothing."""
+    data: dict[str, Any]
+
+    @property
+    def origin(self) -> str:
+        """Sentences below a table that say where it is from, in Markdown."""
+        note = f" **{self.note}**" if self.note else ""
+        return f"Made by `{self.command}` on {self.made}.{note}"
+
+
+class BenchmarkRecords(NamedTuple):
+    """What a benchmark has measured in one environment."""
+
+    problem: Problem
+    records: list[Record]
+
+
+def short_name(id: str) -> str:
+    """Return an environment's id without its namespace and version."""
+    return id.rpartition("/")[2].removesuffix("-v0")
+
+
+def environment_id(name: str) -> str:
+    """Return the id of an environment that pages call by its short name.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    known = {short_name(id): id for id in catalogue()}
+    if name not in known:
+        raise nearest("environment", name, known)
+    return known[name]
+
+
+def record_file(name: str, folder: Path = FOLDER) -> Path:
+    """Return the file of a record.
+
+    Raises:
+        ValueError: if that is no name of a record, such as ``benchmark/ManeuveringTarget`` or ``plain_ppo``.
+    """
+    if not re.fullmatch(r"(\w+/)?\w+", name):
+        raise ValueError(f"no name of a record: {name!r}; it has letters, digits, _ and at most one /")
+    return folder / f"{name}.json"
+
+
+def write_record(name: str, record: ResultRecord, folder: Path = FOLDER) -> Path:
+    """Write a record, a line for each of its entries, and return its file."""
+    path = record_file(name, folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, _lines(record._asdict()) + "\n")
+    return path
+
+
+def read_record(name: str, folder: Path = FOLDER) -> ResultRecord:
+    """Read a record.
+
+    Raises:
+        ValueError: if there is none of that name, or the file holds something else.
+    """
+    path = record_file(name, folder)
+    if not path.is_file():
+        raise ValueError(f"no record {name!r}: {path} does not exist")
+    values = read_json(path)
+    if not isinstance(values, dict) or set(values) != set(ResultRecord._fields):
+        raise ValueError(f"{path} is no record: it has not the entries {', '.join(ResultRecord._fields)}")
+    return ResultRecord(**values)
+
+
+def without_place(command: str) -> str:
+    """Return a command without where and on how many processors it ran, of which its results say nothing."""
+    return re.sub(r" --(out|jobs|threads|cluster)[ =]\S+", "", command)
+
+
+def today() -> str:
+    """Return the day, ISO 8601."""
+    return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+
+
+def round_number(value: float | None) -> float | None:
+    """Return a number in the digits that are kept."""
+    return None if value is None else float(f"{value:.{DIGITS}g}")
+
+
+def _lines(value: Any, depth: int = 5, indent: str = "") -> str:
+    """JSON in lines; what holds nothing nested, or lies deeper, stands in one."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if depth == 0 or not any(isinstance(each, (dict, list)) for each in inside):
+        return json.dumps(value, ensure_ascii=False)
+    inner = indent + " "
+    if isinstance(value, list):
+        return "[\n" + ",\n".join(inner + _lines(each, depth - 1, inner) for each in value) + f"\n{indent}]"
+    entries = (f"{inner}{json.dumps(key)}: {_lines(each, depth - 1, inner)}" for key, each in value.items())
+    return "{\n" + ",\n".join(entries) + f"\n{indent}}}"
+
+
+# --- benchmark
+
+
+def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any]:
+    """Return what pages show of a benchmark in one environment: over whole episodes, by scenario and competitor.
+
+    Raises:
+        ValueError: if scenarios are unknown, or the records are of several experiments.
+    """
+    experiments = {(r.split, r.seed) for r in records}
+    if len(experiments) != 1:
+        raise ValueError(f"the records of {problem.id} are of several experiments: {sorted(experiments)}")
+    [(split, seed)] = experiments
+    components = {*main_components(records)}
+    kept = [r for r in records if r.window == "all" and _is_shown(r, components, problem)]
+    scenarios: dict[str, dict[str, Any]] = {}
+    units = {}
+    for r in kept:
+        if r.scenario not in problem.task.scenarios:
+            raise nearest("scenario", r.scenario, problem.task.scenarios)
+        scenario = scenarios.setdefault(r.scenario, {"episodes": r.episodes, "competitors": {}})
+        if scenario["episodes"] != r.episodes:
+            raise ValueError(
+                f"{r.policy} met {r.episodes} episodes of {r.scenario}, others {scenario['episodes']}"
+            )
+        own = scenario["competitors"].setdefault(
+            r.policy, {"kind": r.kind, "control": r.control, "metrics": {}}
+        )
+        key = f"{r.metric} {r.component}".strip()
+        own["metrics"][key] = [round_number(x) for x in (r.value, r.low, r.high)]
+        if r.unit != "1":
+            units[key] = r.unit
+    return {"environment": problem.id, "split": split, "seed": seed, "units": units, "scenarios": scenarios}
+
+
+def _is_shown(record: Record, components: set[str], problem: Problem) -> bool:
+    measured = (record.metric, record.component)
+    if record.metric == "rmse":
+        return record.component in components or measured == problem.baselines.physical
+    return record.metric in METRICS or measured in (("anees", "state"), problem.baselines.physical)
+
+
+def benchmark_records(data: Mapping[str, Any]) -> BenchmarkRecords:
+    """Return the tidy records of one environment that a benchmark's data holds."""
+    found = []
+    for scenario, each in data["scenarios"].items():
+        for name, own in each["competitors"].items():
+            for key, (value, low, high) in own["metrics"].items():
+                metric, _, component = key.partition(" ")
+                found.append(
+                    Record(
+                        *(
+                            data["environment"],
+                            own["control"],
+                            scenario,
+                            name,
+                            own["kind"],
+                            metric,
+                            component,
+                            "all",
+                        ),
+                        *(value, low, high, data["units"].get(key, "1"), each["episodes"]),
+                        *(data["seed"], data["split"]),
+                    )
+                )
+    return BenchmarkRecords(problem_of(data["environment"]), found)
+
+
+def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, ResultRecord]:
+    """Read the record of an environment's benchmark, by the short name of the environment."""
+    environment_id(name)
+    record = read_record(f"{BENCHMARK}/{name}", folder)
+    return benchmark_records(record.data), record
+
+
+def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
+    """Short names of all environments with a record of that kind, in the catalogue's order."""
+    names = map(short_name, catalogue())
+    return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
+
+
+# --- tables of text
+
+
+def markdown_tables(text: str) -> list[dict[str, Any]]:
+    """Return every Markdown table of a text as data: its columns and rows."""
+    blocks: list[list[list[str]]] = []
+    before = ""
+    for line in text.splitlines():
+        if line.startswith("|"):
+            if not before.startswith("|"):
+                blocks.append([])
+            blocks[-1].append([cell.strip() for cell in line.strip().strip("|").split("|")])
+        before = line
+    return [{"columns": block[0], "rows": block[2:]} for block in blocks if len(block) > 2]
+
+
+def table_cell(data: Mapping[str, Any], row: str, column: str) -> str:
+    """Return a cell of a table of text.
+
+    Args:
+        data: of the record.
+        row: its first cell without marks of code, or first and second cell with a space between; an empty first cell
+            is that of the row above.
+        column: its title, or a beginning of it that no other column has.
+
+    Raises:
+        ValueError: if there is no such cell, or several.
+    """
+    columns = [i for i, title in enumerate(data["columns"]) if title == column]
+    columns = columns or [i for i, title in enumerate(data["columns"]) if title.startswith(column)]
+    rows, first = [], ""
+    for cells in data["rows"]:
+        head, second, *_ = (*(cell.replace("`", "") for cell in cells), "")
+        first = head or first
+        if row in (first, f"{first} {second}"):
+            rows.append(cells)
+    if len(columns) != 1 or len(rows) != 1:
+        raise ValueError(
+            f"{len(rows)} rows {row!r} and {len(columns)} columns {column!r}: one of each is needed"
+        )
+    return str(rows[0][columns[0]])

@@ -1,0 +1,153 @@
+"""The table of results: competitors of one scenario, lowest cost first, from the records of benchmarks."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from filtergym.evaluation.metrics import Record
+from filtergym.evaluation.times import TIME_NOTE, TIME_TITLE, column_of_times
+from filtergym.papers.grid import markdown_table
+from records import BenchmarkRecords, ResultRecord, short_name
+
+from filtergym.reports.ranking import ranking_sentence
+from filtergym.reports.tables import (
+    INCONSISTENT,
+    against_paper,
+    consistency,
+    main_components,
+    rank_competitors,
+    score_text,
+    with_interval,
+)
+
+COLUMNS = ("difference", "median", "wins", "ns", "control", "cost", "rmse", "anees", "score")
+"""Of the table, in their order; a page may choose."""
+
+
+def scenario_records(
+    found: BenchmarkRecords, scenario: str = "", policies: Sequence[str] = ()
+) -> list[Record]:
+    """Return what a benchmark has measured in one scenario, of all but random actions.
+
+    Args:
+        found: what it has measured in an environment.
+        scenario: default: the training distribution.
+        policies: names of those that are wanted and there. Default: everybody.
+
+    Raises:
+        ValueError: if there is nothing.
+    """
+    scenario = scenario or found.problem.task.default_scenario
+    records = [
+        record
+        for record in found.records
+        if record.scenario == scenario
+        and (record.policy in policies if policies else record.policy != "random")
+    ]
+    if not records:
+        raise ValueError(
+            f"no records of {found.problem.id} in scenario {scenario!r}"
+            + (f" of {', '.join(policies)}" if policies else "")
+            + ": make them by filtergym benchmark --full"
+        )
+    return records
+
+
+def results_grid(
+    records: Sequence[Record], paper: str, columns: Sequence[str] = COLUMNS
+) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the table of one environment.
+
+    Args:
+        records: of one scenario.
+        paper: name of the paper's algorithm.
+        columns: some of :data:`COLUMNS`.
+    """
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+    times = column_of_times(records)
+
+    def number(metric: str, component: str = "") -> Callable[[str], str]:
+        return lambda name: with_interval(found.get((name, metric, component, "all")))
+
+    titles: dict[str, dict[str, Callable[[str], str]]] = {
+        "difference": {
+            f"cost against `{paper}`, %": lambda name: with_interval(
+                found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+            )
+        },
+        "median": {"median, %": lambda name: against_paper(found, name)[0]},
+        "wins": {"wins, %": lambda name: against_paper(found, name)[1]},
+        "ns": {TIME_TITLE: lambda name: times.get(name, "-")},
+        "control": {"control": lambda name: controls[name]},
+        "cost": {"mean cost": number("cost")},
+        "rmse": {
+            f"RMSE {c.replace('_', ' ')}, {units[c]}": number("rmse", c) for c in main_components(records)
+        },
+        "anees": {"ANEES": lambda name: consistency(found.get((name, "anees", "state", "all")))},
+        "score": {"score": lambda name: score_text(found.get((name, "score", "", "all")))},
+    }
+    competitors = rank_competitors(records)
+    controls = {name: control if kind == "policy" else f"({kind})" for name, kind, control in competitors}
+    shown = [entry for column in columns for entry in titles[column].items()]
+    rows = [[f"`{name}`", *(text(name) for _, text in shown)] for name, *_ in competitors]
+    return ["policy", *(title for title, _ in shown)], rows
+
+
+def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
+    """Return the whole table of one environment and scenario, who is best, and what the columns are, in Markdown."""
+    records, paper = scenario_records(found, scenario), found.problem.paper
+    note = (
+        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. "
+        f"ANEES is the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a "
+        f"factor of two. {TIME_NOTE}\n\n{_where(records)} {record.origin}"
+    )
+    return "\n".join([*markdown_table(*results_grid(records, paper)), "", note])
+
+
+def chosen_markdown(
+    found: Mapping[str, tuple[BenchmarkRecords, ResultRecord]],
+    scenario: str = "",
+    policies: Sequence[str] = (),
+    columns: Sequence[str] = (),
+) -> str:
+    """Return one table of several environments, or of some competitors or columns, in Markdown.
+
+    Args:
+        found: records of the environments by their short names.
+        scenario: default: the training distribution of each.
+        policies: names of competitors. Default: everybody.
+        columns: some of :data:`COLUMNS`. Default: those whose titles are the same in every environment.
+
+    Raises:
+        ValueError: for an unknown column, one that several environments cannot share, and if there is nothing.
+    """
+    columns = columns or ("difference", "median", "wins", "ns", "anees", "score")
+    if wrong := [column for column in columns if column not in COLUMNS]:
+        raise ValueError(f"no column {wrong[0]!r}: there are {', '.join(COLUMNS)}")
+    if "rmse" in columns and len(found) > 1:
+        raise ValueError(
+            "the errors of several environments are of different quantities: leave out the column rmse"
+        )
+    header: list[str] = []
+    rows, notes = [], []
+    for name, (own, record) in found.items():
+        records = scenario_records(own, scenario, policies)
+        # With everybody's records, so that the front and the best are those of the whole table.
+        titles, lines = results_grid(scenario_records(own, scenario), own.problem.paper, columns)
+        wanted = {f"`{record.policy}`" for record in records}
+        header = [
+            title if len(found) == 1 else title.replace(f"`{own.problem.paper}`", "the paper's")
+            for title in titles
+        ]
+        first = [name] if len(found) > 1 else []
+        rows += [[*first, *line] for line in lines if line[0] in wanted]
+        notes.append(f"{_where(records)} {record.origin}")
+    table = markdown_table([*(["environment"] if len(found) > 1 else []), *header], rows)
+    return "\n".join([*table, "", *dict.fromkeys(notes)])
+
+
+def _where(records: Sequence[Record]) -> str:
+    first = records[0]
+    return (
+        f"{short_name(first.environment)}, scenario `{first.scenario}`, {first.episodes} episodes of the "
+        f"{first.split} split, 95 % bootstrap intervals."
+    )

@@ -1,0 +1,108 @@
+"""Numbers in sentences: each is named by a path into a record, and rendered from it.
+
+``ManeuveringTarget/random/bptt/difference`` is of a benchmark: environment, scenario, competitor, quantity.
+``seeds/ManeuveringTarget/random/bptt/mean`` is of training seeds: the cost against the paper's algorithm of an
+algorithm ("mean", "median", "between seeds", "over episodes"), or of one run or opponent (no statistic). Every other
+path is record, row and column of a table of text, see :func:`.records.table_cell`.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filtergym.envs.catalogue import catalogue
+from filtergym.evaluation.times import ProcessorTime, time_text
+from records import BENCHMARK, FOLDER, SEEDS, read_record, short_name, table_cell
+
+from filtergym.reports.tables import with_interval
+
+
+class Number(NamedTuple):
+    """A value with its interval."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+QUANTITIES = {
+    "difference": ("relative_cost_difference", 100.0, "%"),
+    "behind": ("behind_best", 100.0, "%"),
+    "wins": ("win_rate", 100.0, "%"),
+    "cost": ("cost", 1.0, ""),
+    "anees": ("anees state", 1.0, ""),
+    "score": ("score", 1.0, ""),
+}
+"""Key in the record, scale and unit, by the word in a path; beside them ``median``, ``ns`` and ``rmse COMPONENT``."""
+
+
+def record_of(path: str) -> str:
+    """Return the name of the record that a path leads into."""
+    first, _, rest = path.partition("/")
+    if first == SEEDS:
+        return f"{SEEDS}/{rest.partition('/')[0]}"
+    return f"{BENCHMARK}/{first}" if first in map(short_name, catalogue()) else first
+
+
+def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:
+    """Return a number in words of a sentence: ``-43.6 % [-45.0, -42.1]``.
+
+    Args:
+        path: of the number.
+        interval: with it, where there is one.
+        folder: of the records.
+
+    Raises:
+        ValueError: if the path leads nowhere.
+    """
+    name = record_of(path)
+    data = read_record(name, folder).data
+    if name.startswith(f"{SEEDS}/"):
+        return _with_unit(_of_seeds(data, path), 100.0, "%", interval)
+    if name.startswith(f"{BENCHMARK}/"):
+        return _of_benchmark(data, path, interval)
+    row, _, column = path.removeprefix(f"{name}/").partition("/")
+    return table_cell(data, row, column)
+
+
+def _of_benchmark(data: Any, path: str, interval: bool) -> str:
+    _, scenario, competitor, quantity = [*path.split("/", 3), *("",) * 4][:4]
+    try:
+        metrics = data["scenarios"][scenario]["competitors"][competitor]["metrics"]
+        if quantity == "median":
+            return f"{100.0 * (metrics['median_cost_ratio'][0] - 1.0):+.1f} %"
+        if quantity == "ns":
+            [(value, compiled)] = [
+                (m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")
+            ]
+            return f"{time_text(ProcessorTime(value, True))} ns" + ("" if compiled else ", asked in Python")
+        key, scale, unit = QUANTITIES.get(quantity, (quantity, 1.0, data["units"].get(quantity, "")))
+        # The difference to the best one names it.
+        [found] = [values for own, values in metrics.items() if own == key or own.startswith(f"{key} ")]
+        return _with_unit(Number(*found), scale, unit, interval)
+    except (KeyError, ValueError):
+        raise ValueError(
+            f"{path!r} leads nowhere: a path is ENVIRONMENT/SCENARIO/COMPETITOR/QUANTITY, with a quantity of "
+            f"{', '.join(QUANTITIES)}, median, ns, rmse COMPONENT"
+        ) from None
+
+
+def _of_seeds(data: Any, path: str) -> Number:
+    _, _, scenario, name, statistic = [*path.split("/", 4), *("",) * 5][:5]
+    against = data["paper"]
+    wanted = (statistic,) if statistic else ("run", "opponent")
+    for own, kind, other, metric, component, *values in data["scenarios"].get(scenario, ()):
+        if (own, other, metric, component) == (
+            name,
+            against,
+            "relative_cost_difference",
+            "",
+        ) and kind in wanted:
+            return Number(*values)
+    raise ValueError(
+        f"{path!r} leads nowhere: a path is seeds/ENVIRONMENT/SCENARIO/NAME or .../ALGORITHM/STATISTIC"
+    )
+
+
+def _with_unit(number: Number, scale: float, unit: str, interval: bool) -> str:
+    value, space, rest = with_interval(number, scale).partition(" ")
+    return value + (f" {unit}" if unit else "") + (space + rest if interval else "")
