@@ -11,7 +11,7 @@ from comparison import compared_policies
 from filtergym.baselines.problem import problem_of
 from front import panels_of
 from made_results import results_of
-from readme import BEGIN, results_table
+from readme import with_numbers
 from records import (
     FOLDER,
     ResultRecord,
@@ -40,7 +40,6 @@ MEASURED = re.compile(r"(?<![\w.])\d[\d,.]*\s?(?:%|ns\b|µs\b|\[[-+\d., ]+\])")
 NAMED = re.compile(r"\{record\}`|docs/records/")
 """How a section says where its numbers are from; README, which nobody renders, by a link."""
 NOT_CONVERTED = {
-    "README.md",
     "docs/agents.md",
     "docs/compiled.md",
     "docs/device.md",
@@ -120,24 +119,25 @@ def test_every_record_is_small_and_shown():
         assert shown.get(file.parent.name, f"{{record-table}} {name}\n") in everything, name
 
 
-def test_readme_shows_the_record():
+def test_readme_shows_the_records():
     """If not: ``python docs/make readme``."""
-    if "README.md" in NOT_CONVERTED and BEGIN not in PAGES["README.md"]:
-        pytest.skip("README shows a table of its own")
-    assert f"{BEGIN}\n\n{results_table()}\n\n" in PAGES["README.md"]
+    page = DOCS.parent / "README.md"
+    assert with_numbers(page) == page.read_text(encoding="utf-8")
 
 
-def test_readme_gets_the_table_between_its_lines(tmp_path, make_page, monkeypatch):
+def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = tmp_path / "README.md"
-    page.write_text("no lines")
+    page.write_text("no numbers")
     code, _, errors = make_page("readme", page)
-    assert (code, "needs the lines <!-- results table: begin -->" in errors) == (2, True)
-    page.write_text("a\n<!-- results table: begin -->\nold\n<!-- results table: end -->\nb")
+    assert (code, "holds no number of a record" in errors) == (2, True)
+    path = "ManeuveringTarget/random/imm-tuned/difference"
+    page.write_text(f"a <!-- value: {path} -->old<!-- end --> b <!-- number: {path} --><!-- end -->\nc")
     code, _, errors = make_page("readme", page, "--picture", "front.svg")
     assert code == 0, errors
+    shown = [number_text(path, interval) for interval in (False, True)]
     assert page.read_text() == (
-        f"a\n<!-- results table: begin -->\n\n{results_table()}\n\n<!-- results table: end -->\nb"
+        f"a <!-- value: {path} -->{shown[0]}<!-- end --> b <!-- number: {path} -->{shown[1]}<!-- end -->\nc"
     )
     assert "<svg" in (tmp_path / "front.svg").read_text()
 

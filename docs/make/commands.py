@@ -17,7 +17,7 @@ from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
 from filtergym.evaluation.store import UNFINISHED, Store
 from front import draw_fronts, panels_of
-from readme import with_results_table
+from readme import with_numbers
 from records import (
     BENCHMARK,
     FOLDER,
@@ -103,19 +103,19 @@ def table(
 
 
 def readme(
-    page: Annotated[Path, typer.Argument(help="Page whose table is replaced.")] = Path("README.md"),
+    page: Annotated[Path, typer.Argument(help="Page whose numbers are replaced.")] = Path("README.md"),
     picture: Annotated[
         Path, typer.Option(help="PNG, SVG or PDF file for the fronts of cost and time.")
     ] = Path("docs/images/front.png"),
     columns: Columns = 2,
 ) -> None:
-    """Put the table of results into README, which nobody renders, and draw its picture, both from the records.
+    """Put the numbers into README, which nobody renders, and draw its picture, both from the records.
 
     Example: python docs/make readme
     """
     check_columns(columns)
     check_formats([picture.suffix.removeprefix(".").lower()])
-    text = with_results_table(page)
+    text = with_numbers(page)
     panels = panels_of([read_benchmark(name)[0] for name in recorded_environments()])
     if not panels:
         raise ValueError("the records hold no times: make them by filtergym benchmark")

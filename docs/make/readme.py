@@ -1,33 +1,24 @@
-"""README's table of results: README is shown as it stands, so what it has of the records is copied, and tested."""
+"""README's numbers: it is shown as it stands, so what it has of the records is copied into it, and tested.
 
+A number stands between comments that no reader sees, ``<!-- value: PATH -->-43.6 %<!-- end -->``, with ``number`` in
+place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`.
+"""
+
+import re
 from pathlib import Path
 
-from comparison import compared_policies
-from records import read_benchmark
-from results_table import chosen_markdown
+from sentence_numbers import number_text
 
-ENVIRONMENT = "ManeuveringTarget"
-"""That README shows."""
-BEGIN, END = "<!-- results table: begin -->", "<!-- results table: end -->"
-"""Lines of README between which the table stands."""
+NUMBER = re.compile(r"(<!-- (value|number): (\S+(?: \S+)*?) -->).*?(<!-- end -->)", re.S)
 
 
-def results_table() -> str:
-    """Return the table that README shows, in Markdown."""
-    found, record = read_benchmark(ENVIRONMENT)
-    names = compared_policies(found.problem, found.records)
-    return chosen_markdown({ENVIRONMENT: (found, record)}, policies=names)
-
-
-def with_results_table(page: Path) -> str:
-    """Return the text of a page with the table between its markers.
+def with_numbers(page: Path) -> str:
+    """Return the text of a page with every number as its record has it.
 
     Raises:
-        ValueError: if there is no such page, or it lacks the markers.
+        ValueError: if there is no such page, it holds no number of a record, or a path leads nowhere.
     """
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"{page} needs the lines {BEGIN} and {END}, between which the table is put")
-    return f"{before}{BEGIN}\n\n{results_table()}\n\n{END}{after}"
+    if not NUMBER.search(text):
+        raise ValueError(f"{page} holds no number of a record, such as <!-- value: PATH --><!-- end -->")
+    return NUMBER.sub(lambda m: m[1] + number_text(m[3], interval=m[2] == "number") + m[4], text)
