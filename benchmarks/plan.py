@@ -1,8 +1,8 @@
 """What the full comparison costs: every competitor, every algorithm with 20 training seeds, 100 000 episodes a cell.
 
 ``python benchmarks/plan.py --units units.json`` measures unit costs on one core, some seven minutes, and prints
-the plan of docs/plan.md. What the file holds is not measured again: a run that was interrupted goes on, and other
-numbers of episodes, seeds and cores take seconds.
+the plan, of which docs/many_cores.md shows the core hours. What the file holds is not measured again: a run that was
+interrupted goes on, and other numbers of episodes, seeds and cores take seconds.
 
 Measured, in seconds of the processor, after what is compiled has been compiled: for every competitor of the full
 benchmark, and an agent of every algorithm after a short training, ``summarise`` over some episodes of the training

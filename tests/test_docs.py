@@ -135,8 +135,8 @@ def test_every_page_of_results_says_what_makes_it():
     for name, words in (
         ("comparison.md", "python docs/make record results/results.json"),
         ("training_seeds.md", "--into docs/records"),
-        ("speed.md", "python benchmarks/throughput.py"),
-        ("plan.md", "python benchmarks/plan.py"),
+        ("compiled.md", "python benchmarks/throughput.py"),
+        ("many_cores.md", "python benchmarks/plan.py"),
     ):
         assert words in (DOCS / name).read_text(encoding="utf-8"), name
     for report in (DOCS / "reproductions").glob("*/report.md"):
