@@ -12,17 +12,17 @@ class AttitudeParameters(TaskParameters):
     Ranges are ours: wider than hand movements and cheap sensors of the kind that BROAD recorded. Its rate is BROAD's.
     """
 
-    horizon: int = parameter(8000, at_least=1)
-    """Measurements acted on in one episode: 28 s."""
-    decision_interval: int = parameter(20, at_least=1)
-    """Measurements for which one action holds: 70 ms."""
+    horizon: int = parameter(20_000, at_least=1)
+    """Measurements acted on in one episode: 70 s."""
+    decision_interval: int = parameter(40, at_least=1)
+    """Measurements for which one action holds: 0.14 s."""
     sampling_interval: float = parameter(0.0035, above=0.0)
     """T, s (BROAD: 2000 / 7 Hz)."""
     rate_levels: tuple[float, float] = parameter((5.0, 300.0), above=0.0, ascending=True)
     """Limits of the root mean square of the angular rate about each axis while the sensor moves, deg/s, log-uniform."""
     rate_frequencies: tuple[float, float] = parameter((0.1, 1.5), above=0.0, ascending=True)
     """Limits of the frequency of rotations, Hz, log-uniform."""
-    acceleration_levels: tuple[float, float] = parameter((0.1, 10.0), above=0.0, ascending=True)
+    acceleration_levels: tuple[float, float] = parameter((0.1, 20.0), above=0.0, ascending=True)
     """Limits of the root mean square of the acceleration along each axis, m/s^2, log-uniform."""
     acceleration_frequencies: tuple[float, float] = parameter((0.5, 4.0), above=0.0, ascending=True)
     """Limits of the frequency of accelerations, Hz, log-uniform."""
@@ -32,7 +32,7 @@ class AttitudeParameters(TaskParameters):
     """Limits of the time from one break to the next, s."""
     break_shares: tuple[float, float] = parameter((0.1, 0.6), above=0.0, below=1.0, ascending=True)
     """Limits of the share of time that breaks take."""
-    first_rests: tuple[float, float] = parameter((0.0, 10.0), at_least=0.0, ascending=True)
+    first_rests: tuple[float, float] = parameter((0.0, 20.0), at_least=0.0, ascending=True)
     """Limits of the time that the sensor rests first, s."""
     field_strengths: tuple[float, float] = parameter((25.0, 65.0), above=0.0, ascending=True)
     """Limits of the magnetic field, microtesla (on the surface of the Earth)."""

@@ -53,7 +53,7 @@ class Attitude(Task):
             {"rate_levels": (300.0, 600.0), "break_probability": 0.0},
         ),
         "shaken": Scenario(
-            "shaken", "Held out: accelerations above gravity.", {"acceleration_levels": (10.0, 20.0)}
+            "shaken", "Held out: accelerations far above gravity.", {"acceleration_levels": (20.0, 40.0)}
         ),
         "magnet": Scenario(
             "magnet", "Held out: a magnet on the sensor, and much iron in the room.",
@@ -64,7 +64,7 @@ class Attitude(Task):
     components = tuple(Component(f"{axis}_{along}", "1") for axis in AXES for along in "xyz")
     groups: Mapping[str, tuple[str, ...]] = {axis: tuple(f"{axis}_{along}" for along in "xyz") for axis in AXES}
     cost_description = "square of the total angle between estimate and truth, deg^2"
-    reward_unit = 100.0
+    reward_unit = 40.0  # between the mean, which a few magnets rule, and the median
     paper_policy = PaperPolicy("gain", (0.0,))
     start_measurements = 1000
     causes = (
