@@ -46,9 +46,7 @@ def group_of(trial: str) -> str:
 def evaluate(competitor: Any, recording: Any) -> Angles:
     """Run one competitor over all trials by the project's own evaluation."""
     found = filtergym.evaluate(Attitude.id, competitor, scenario=recording)
-    return {
-        part: numpy.sqrt(numpy.nanmean(found[f"{part}_angle"].values[0] ** 2, axis=1)) for part in PARTS
-    }
+    return {part: numpy.sqrt(numpy.nanmean(found[f"{part}_angle"].values[0] ** 2, axis=1)) for part in PARTS}
 
 
 def run_grid(
@@ -70,33 +68,41 @@ def run_grid(
     def table(values: Sequence[numpy.ndarray]) -> numpy.ndarray:
         return numpy.stack([numpy.pad(v, ((0, longest - len(v)), (0, 0)), "edge") for v in values], axis=-1)
 
-    measured = [table([trial.measurements[name][0] for trial in trials]) for name in ("rate", "force", "field")]
+    measured = [
+        table([trial.measurements[name][0] for trial in trials]) for name in ("rate", "force", "field")
+    ]
     padding = [numpy.full((longest - len(trial.seconds[0]), 9), numpy.nan) for trial in trials]
     truth = numpy.stack(
-        [numpy.concatenate([trial.truth[0], end]) for trial, end in zip(trials, padding, strict=True)], axis=-1
+        [numpy.concatenate([trial.truth[0], end]) for trial, end in zip(trials, padding, strict=True)],
+        axis=-1,
     )
     interval = trials[0].parameters["sampling_interval"]
     first = numpy.stack([trial.initial["quaternion"][0] for trial in trials], axis=-1)
     memory = start(numpy.repeat(first, count, axis=-1))
     sums, known = {part: numpy.zeros(len(trials) * count) for part in PARTS}, numpy.zeros(len(trials) * count)
     for k in range(longest):
-        memory, attitude = step(memory, *(numpy.repeat(part[k], count, axis=-1) for part in measured), interval)
+        memory, attitude = step(
+            memory, *(numpy.repeat(part[k], count, axis=-1) for part in measured), interval
+        )
         there = numpy.isfinite(truth[k]).all(axis=0)
         if there.any():
             lanes = numpy.repeat(there, count)
-            error = quaternions.direction_cosines(attitude[:, lanes]) - numpy.repeat(truth[k], count, axis=-1)[:, lanes]
+            error = (
+                quaternions.direction_cosines(attitude[:, lanes])
+                - numpy.repeat(truth[k], count, axis=-1)[:, lanes]
+            )
             for part, angle in zip(PARTS, quaternions.error_angles(error), strict=True):
                 sums[part][lanes] += angle**2
             known += lanes
     return {part: numpy.sqrt(sums[part] / known).reshape(len(trials), count) for part in PARTS}
 
 
-def madgwick_grid(trials: Sequence[Any], weight: float) -> dict[str, numpy.ndarray]:
+def madgwick_grid(trials: Sequence[Any], scale: float) -> dict[str, numpy.ndarray]:
     """Madgwick's filter with all of BETAS."""
     beta = numpy.tile(BETAS, len(trials))
 
     def step(q: Any, rate: Any, force: Any, field: Any, interval: float) -> Any:
-        q = gradient_filters.madgwick_step(q, rate, force, field, beta, interval, weight)
+        q = gradient_filters.madgwick_step(q, rate, force, field, beta, interval, scale)
         return q, q
 
     return run_grid(trials, len(BETAS), lambda q: q, step)
@@ -162,13 +168,20 @@ def published(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Angles]
         stored = scipy.io.loadmat(path, squeeze_me=True)
         total = stored["total_rmse_deg"]
         best = numpy.mean([total[name].item().ravel() for name in total.dtype.names], axis=0).argmin()
-        yield f"{algorithm}, published", {
-            part: numpy.array([stored[f"{part}_rmse_deg"][f"trial_{n}"].item().ravel()[best] for n in names])
-            for part in PARTS
-        }
+        yield (
+            f"{algorithm}, published",
+            {
+                part: numpy.array(
+                    [stored[f"{part}_rmse_deg"][f"trial_{n}"].item().ravel()[best] for n in names]
+                )
+                for part in PARTS
+            },
+        )
 
 
-def measure(folder: Path, agents: Mapping[str, str], peer: bool) -> Iterator[tuple[str, Sequence[str], Angles]]:
+def measure(
+    folder: Path, agents: Mapping[str, str], peer: bool
+) -> Iterator[tuple[str, Sequence[str], Angles]]:
     """Yield name, trials and angles of every competitor, one after the other."""
     paths = sorted((folder / "data_mat").glob("*.mat"))
     if not paths:
@@ -183,12 +196,12 @@ def measure(folder: Path, agents: Mapping[str, str], peer: bool) -> Iterator[tup
     for name, run in agents.items():
         yield name, names, evaluate(run, recording)
     trials = [read_trial(path) for path in paths]
-    for weight, label in ((1.0, "madgwick"), (0.5, "madgwick, half field")):
-        grid = madgwick_grid(trials, weight)
+    for scale, label in ((1.0, "madgwick"), (0.5, "madgwick, sample code")):
+        grid = madgwick_grid(trials, scale)
         best = int(grid["total"].mean(axis=0).argmin())
         yield f"{label}, best beta", names, chosen(grid, best)
         print(f"{label}: best beta {BETAS[best]}")
-        if weight == 1.0:
+        if scale == 1.0:
             yield f"{label}, best beta per group", names, best_per_group(grid, names)
     grid = mahony_grid(trials)
     best = int(grid["total"].mean(axis=0).argmin())
@@ -235,9 +248,13 @@ def put_into(page: Path, table: str) -> None:
 
 def main() -> None:
     """Measure, or render what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("broad", nargs="?", type=Path, help="folder of BROAD")
-    parser.add_argument("--agent", action="append", default=[], metavar="NAME=RUN", help="agent; may be repeated")
+    parser.add_argument(
+        "--agent", action="append", default=[], metavar="NAME=RUN", help="agent; may be repeated"
+    )
     parser.add_argument("--no-peer", action="store_true", help="without the package vqf")
     parser.add_argument("--out", type=Path, help="file of results, CSV")
     parser.add_argument("--render", type=Path, help="print the table of a file of results")
@@ -260,7 +277,9 @@ def main() -> None:
     if asked.out is not None:
         with asked.out.open("w", newline="") as file:
             words = " ".join(f"--agent {name}=RUN" for name in agents)
-            file.write(f"# python benchmarks/attitude.py BROAD {words}; deg, root mean squares of movements\n")
+            file.write(
+                f"# python benchmarks/attitude.py BROAD {words}; deg, root mean squares of movements\n"
+            )
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(["competitor", "trial", *PARTS])
             writer.writerows(rows)

@@ -121,7 +121,7 @@ class MadgwickBank(AttitudeBank):
 
 
 class MahonyBank(AttitudeBank):
-    """Control ``gains``: the action scales the gains of accelerometer and magnetometer, and sets that of the integral."""
+    """Control ``gains``: the action scales the gains of both vectors, and sets that of the integral."""
 
     steered = ("accelerometer", "magnetometer", "integral")
 

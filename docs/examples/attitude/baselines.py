@@ -30,7 +30,11 @@ class Mahony(ConstantPolicy):
     control = "gains"
 
     def __init__(
-        self, model: Model, log10_accelerometer: float = 0.0, log10_magnetometer: float = 0.0, integral: float = 0.0
+        self,
+        model: Model,
+        log10_accelerometer: float = 0.0,
+        log10_magnetometer: float = 0.0,
+        integral: float = 0.0,
     ) -> None:
         super().__init__(model)
         p = self.task.parameters
@@ -46,7 +50,9 @@ class VQF(ConstantPolicy):
 
     control = "time_constants"
 
-    def __init__(self, model: Model, log10_accelerometer: float = 0.0, log10_magnetometer: float = 0.0) -> None:
+    def __init__(
+        self, model: Model, log10_accelerometer: float = 0.0, log10_magnetometer: float = 0.0
+    ) -> None:
         super().__init__(model)
         decades = self.task.parameters.gain_decades
         self.action = (_within(log10_accelerometer / decades), _within(log10_magnetometer / decades))
@@ -55,8 +61,9 @@ class VQF(ConstantPolicy):
 class GatedMadgwick(Policy):
     """Madgwick's filter whose beta falls to its least while the specific force is far from gravity.
 
-    The factor is one up to a tenth of gravity and falls linearly to none at two tenths [R. G. Valenti, I. Dryanovski, J.
-    Xiao, Sensors 15 (2015), 19302-19330, section 4.2], of the root mean square here.
+    The factor is one up to a tenth of gravity and falls linearly to none at two tenths, of the root mean square here.
+
+    Source: R. G. Valenti, I. Dryanovski, J. Xiao, Sensors 15 (2015), 19302-19330, section 4.2.
     """
 
     control = "gain"

@@ -1,9 +1,9 @@
 """Recordings of BROAD as scenarios: read where they lie, none are shipped.
 
-BROAD [1] holds 39 trials of a hand-held sensor with an optical reference, under CC BY 4.0, at
-https://github.com/dlaidig/broad. A trial is a ``.mat`` file of the folder ``data_mat``: ``imu_gyr`` (rad/s), ``imu_acc``
-(m/s^2) and ``imu_mag`` (microtesla), ``(samples, 3)``, the true attitude ``opt_quat`` (to east, north, up; NaN where the
-cameras lost the sensor), ``movement`` (which samples count) and ``sampling_rate`` (Hz).
+BROAD [1] holds 39 trials of a hand-held sensor with an optical reference, at https://github.com/dlaidig/broad, under CC
+BY 4.0. A trial is a ``.mat`` file of the folder ``data_mat``: ``imu_gyr`` (rad/s), ``imu_acc`` (m/s^2) and ``imu_mag``
+(microtesla), ``(samples, 3)``, the true attitude ``opt_quat`` (to east, north, up; NaN where the cameras lost the
+sensor), ``movement`` (which samples count) and ``sampling_rate`` (Hz).
 
 As BROAD judges it, filters run over the whole trial and start from its first sample, and errors count while the sensor
 moves: elsewhere the truth is left out.

@@ -1,30 +1,31 @@
 """Filters of Madgwick and of Mahony: one step each, batch on the last axis.
 
-``q`` is the quaternion from the sensor's frame to the world's (north, west, up), ``w`` the angular rate, ``a`` and ``m``
-specific force and field over their lengths, ``T`` the sampling interval.
+``q`` is the quaternion from the sensor's frame to the world's (north, west, up), ``w`` the angular rate, ``a`` and
+``m`` specific force and field over their lengths, ``T`` the sampling interval.
 
 **Madgwick** [1] moves the quaternion by the gyroscope and against the normalised gradient of what the two vectors miss:
 
     h = q m q*,  b = (sqrt(h1^2 + h2^2), 0, h3)                                        (45), (46)
-    f = (q* up q - a, r (q* b q - m)),  g = J^T f                                      (25), (26), (29) to (31), (34)
+    f = (q* up q - a, s q* b q - m),  g = J^T f                                        (25), (26), (29) to (31), (34)
     q <- q + T (q w / 2 - beta g / |g|), normalised                                    (11), (13), (42), (43)
 
-Equation numbers are those of the report [1]. ``r^2`` is the weight of the magnetometer, one in [1]. Reading: the author's
-sample code (MadgwickAHRS, 2011), with which the published results of BROAD were made, halves the reference field ``b``; for
-directions that is a weight of about one half.
+Equation numbers are those of the report [1], where ``s`` is one. In the sample code of its author (MadgwickAHRS, 2011),
+with which the published results of BROAD were made, the reference field is half as long, ``s = 1 / 2``: then the vectors
+never agree, the rest of ``f`` points along ``q`` and shortens the normalised step, and the magnetometer counts half.
 
 **Mahony** [2] turns by the gyroscope plus what the vectors miss, and integrates that into an estimate of the bias:
 
     e = k_a a x (q* up q) + k_m m x (q* b q)                                           (1)
-    bias <- bias - k_I T (a x (q* up q) + m x (q* b q)),  q <- q exp(T (w - bias + e))   (2)
+    bias <- bias - k_I T (a x (q* up q) + m x (q* b q))
+    q <- q exp(T (w - bias + e))                                                       (2)
 
-the explicit complementary filter of [2], its equations (32) and (48) in discrete time, with the weights of the two vectors
-as gains. Reading: the reference field ``b`` is that of (46) above, as in the author of [1]'s sample code.
+the explicit complementary filter of [2] in discrete time, with the weights of the two vectors as gains. Reading: the
+reference field ``b`` is that of (46), as in the sample code that was published with [1].
 
 [1] S. O. H. Madgwick, An efficient orientation filter for inertial and inertial/magnetic sensor arrays, report,
     University of Bristol, 2010; S. O. H. Madgwick, A. J. L. Harrison, R. Vaidyanathan, IEEE ICORR, 2011.
-[2] R. Mahony, T. Hamel, J.-M. Pflimlin, Nonlinear complementary filters on the special orthogonal group, IEEE Transactions
-    on Automatic Control 53 (2008), 1203-1218.
+[2] R. Mahony, T. Hamel, J.-M. Pflimlin, Nonlinear complementary filters on the special orthogonal group, IEEE
+    Transactions on Automatic Control 53 (2008), 1203-1218.
 """
 
 from typing import Any
@@ -66,7 +67,7 @@ def madgwick_step(
     magnetometer: Array,
     beta: Any,
     interval: float,
-    magnetometer_weight: float = 1.0,
+    field_scale: float = 1.0,
 ) -> Array:
     """Quaternion after one step of Madgwick's filter, ``(4, N)``.
 
@@ -77,7 +78,7 @@ def madgwick_step(
         magnetometer: likewise.
         beta: speed of the quaternion against the gradient, 1/s, ``(N,)`` or a number.
         interval: T, s.
-        magnetometer_weight: ``r^2``.
+        field_scale: ``s``.
     """
     xp = namespace(q)
     a, m = normalise(accelerometer), normalise(magnetometer)
@@ -95,7 +96,7 @@ def madgwick_step(
             2.0 * x * f1 + 2.0 * y * f2,
         ]
     )
-    bx, bz = 2.0 * b[0], 2.0 * b[2]
+    bx, bz = 2.0 * field_scale * b[0], 2.0 * field_scale * b[2]
     f4 = bx * (0.5 - y * y - z * z) + bz * (x * z - w * y) - m[0]
     f5 = bx * (x * y - w * z) + bz * (w * x + y * z) - m[1]
     f6 = bx * (w * y + x * z) + bz * (0.5 - x * x - y * y) - m[2]
@@ -108,7 +109,7 @@ def madgwick_step(
             (bz * x - 2.0 * bx * z) * f4 + (bz * y - bx * w) * f5 + bx * x * f6,
         ]
     )
-    gradient = normalise(gravity + magnetometer_weight * field)
+    gradient = normalise(gravity + field)
     turning = 0.5 * multiply(q, xp.concat([0.0 * rate[:1], rate]))
     return normalise(q + interval * (turning - beta * gradient))
 

@@ -65,7 +65,9 @@ def observe(state: Indicators, cosines: Array, measurement: Measurement, interva
         interval: T, s.
     """
     xp, number = namespace(cosines), state.number + 1.0
-    fast, slow, reference = (xp.maximum(1.0 / number, interval / tau + 0.0 * number) for tau in (FAST, SLOW, REFERENCE))
+    fast, slow, reference = (
+        xp.maximum(1.0 / number, interval / tau + 0.0 * number) for tau in (FAST, SLOW, REFERENCE)
+    )
     size = length(measurement.force)
     tilt = to_world(cosines, measurement.force)[:2] / size
     field = to_world(cosines, measurement.field)
@@ -101,20 +103,19 @@ def indicator_blocks(interval: float) -> tuple[Block, ...]:
     Args:
         interval: T, s.
     """
-    percent = 100.0
 
     def shown(name: str, value: Any, text: str, compression: Any = LOG1P) -> Block:
         return Block(name, lambda f, _: value(f.indicators), text, shown=compression)
 
     return (
-        shown("tilt", lambda s: DEGREES * length(s.tilt), "angle of the fast average of the specific force to the estimated vertical, deg"),
-        shown("slow_tilt", lambda s: DEGREES * length(s.slow_tilt), "that of the slow average, deg"),
+        shown("tilt", lambda s: DEGREES * length(s.tilt), "angle of the mean force to the estimated vertical, deg"),
+        shown("slow_tilt", lambda s: DEGREES * length(s.slow_tilt), "that of the slow mean, deg"),
         shown("tilt_rms", lambda s: DEGREES * _root(s.tilt_square), "root mean square of the angle, deg"),
-        shown("excess_rms", lambda s: _root(s.excess_square), "root mean square of specific force less gravity, m/s^2"),
-        shown("heading", lambda s: DEGREES * s.heading, "fast average of the heading of the field, deg", SIGNED_LOG),
-        shown("slow_heading", lambda s: DEGREES * s.slow_heading, "slow average of it, deg", SIGNED_LOG),
+        shown("excess_rms", lambda s: _root(s.excess_square), "root mean square of force less gravity, m/s^2"),
+        shown("heading", lambda s: DEGREES * s.heading, "mean heading of the field, deg", SIGNED_LOG),
+        shown("slow_heading", lambda s: DEGREES * s.slow_heading, "slow mean of it, deg", SIGNED_LOG),
         shown("heading_rms", lambda s: DEGREES * _root(s.heading_square), "root mean square of it, deg"),
-        shown("field_rms", lambda s: percent * _root(s.field_square), "root mean square of field less reference, in hundredths"),
+        shown("field_rms", lambda s: 100.0 * _root(s.field_square), "root mean square of the change of the field, percent"),
         shown("rate_rms", lambda s: _root(s.rate_square), "root mean square of the angular rate, rad/s"),
         Block(
             "settling",

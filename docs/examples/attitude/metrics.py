@@ -20,7 +20,10 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         return MetricInputs()
     squares = {
         part: numpy.stack(
-            [numpy.nanmean(run[f"{part}_angle"].values[:, times] ** 2, axis=1) for times in slices_of(run).values()],
+            [
+                numpy.nanmean(run[f"{part}_angle"].values[:, times] ** 2, axis=1)
+                for times in slices_of(run).values()
+            ],
             axis=1,
         )
         for part in PARTS
@@ -31,7 +34,13 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
     """Measures of the attitude: ``angle_rmse``, root of the mean square of an angle over all episodes, deg."""
     return [
-        Measure("angle_rmse", part, window, bootstrap.interval(numpy.sqrt(bootstrap.means(gathered.each[part][:, i]))), "deg")
+        Measure(
+            "angle_rmse",
+            part,
+            window,
+            bootstrap.interval(numpy.sqrt(bootstrap.means(gathered.each[part][:, i]))),
+            "deg",
+        )
         for part in gathered.each
         for i, window in enumerate(slices_of(evaluation))
     ]

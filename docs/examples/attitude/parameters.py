@@ -39,8 +39,8 @@ class AttitudeParameters(TaskParameters):
     dips: tuple[float, float] = parameter((30.0, 80.0), at_least=0.0, below=90.0, ascending=True)
     """Limits of its angle below the horizon, deg."""
     field_levels: tuple[float, float] = parameter((0.3, 15.0), above=0.0, ascending=True)
-    """Limits of the root mean square of what iron in a room adds to each axis of the field, microtesla, log-uniform, drawn
-    for the time before and after a change."""
+    """Limits of the root mean square of what iron in a room adds to each axis of the field, microtesla, log-uniform,
+    drawn for the time before and after a change."""
     field_times: tuple[float, float] = parameter((0.3, 5.0), above=0.0, ascending=True)
     """Limits of the time constant in which that changes while the sensor moves, s, log-uniform."""
     magnet_probability: float = parameter(0.2, at_least=0.0, at_most=1.0)
@@ -64,7 +64,7 @@ class AttitudeParameters(TaskParameters):
     initial_heading: float = parameter(5.0, at_least=0.0)
     """Standard deviation of its heading, deg."""
     stated_sigma: float = parameter(3.0, above=0.0)
-    """Standard deviation that every filter states for its attitude about each axis, deg: they have no covariance of their
+    """Standard deviation that every filter states for its attitude about each axis, deg: none has a covariance of its
     own."""
     gain_decades: float = parameter(1.5, above=0.0)
     """Decades by which an action of one scales a gain or a time constant."""

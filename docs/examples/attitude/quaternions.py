@@ -3,14 +3,14 @@
 A quaternion ``q = (w, x, y, z)``, ``(4, N)``, turns vectors from the sensor's frame into the world's:
 ``v_world = q v_sensor q*`` [1, eq. 5.4.3]. The world's axes are north (magnetic), west and up.
 
-The *direction cosines* ``C``, ``(9, N)``, are the rows of its rotation matrix: north, west and up as unit vectors in the
-sensor's frame. They have no sign to choose and no jump, so that an estimate minus a truth is an error. Three angles
+The *direction cosines* ``C``, ``(9, N)``, are the rows of its rotation matrix: north, west and up as unit vectors in
+the sensor's frame. They have no sign to choose and no jump, so that an estimate minus a truth is an error. Three angles
 follow from that difference ``E = C - C0`` alone. With ``s = |E|^2`` the angle of the whole rotation between the two is
 
     sin^2(total / 2) = s / 8                                                                  (1)
 
-because ``|C - C0|^2 = 6 - 2 trace(C C0^T) = 4 (1 - cos(total))``. With ``u`` the part of it that belongs to up, two unit
-vectors at the angle of inclination,
+because ``|C - C0|^2 = 6 - 2 trace(C C0^T) = 4 (1 - cos(total))``. With ``u`` the part of it that belongs to up, two
+unit vectors at the angle of inclination,
 
     sin^2(inclination / 2) = |u|^2 / 4                                                        (2)
 
@@ -66,7 +66,9 @@ def normalise(vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product, ``(3, N)``."""
-    return namespace(a).stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return namespace(a).stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def exponential(rotation: Array) -> Array:
@@ -120,8 +122,9 @@ def align(accelerometer: Array, magnetometer: Array) -> Array:
 def quaternion_of(cosines: Array) -> Array:
     """Unit quaternion of direction cosines, ``(4, N)``.
 
-    Four times the squares of its entries follow from the diagonal; the largest is a safe divisor [S. W. Shepperd, Journal
-    of Guidance and Control 1 (1978), 223-224].
+    Four times the squares of its entries follow from the diagonal; the largest is a safe divisor.
+
+    Source: S. W. Shepperd, Journal of Guidance and Control 1 (1978), 223-224.
     """
     xp = namespace(cosines)
     a, b, c, d, e, f, g, h, i = (cosines[k] for k in range(9))

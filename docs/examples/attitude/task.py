@@ -22,9 +22,9 @@ def _context_cause(name: str, phrase: str, key: str, limit: float) -> Cause:
 class Attitude(Task):
     """Attitude of a hand-held sensor from gyroscope, accelerometer and magnetometer.
 
-    Rotations of any speed, breaks, accelerations, iron in the room, now and then a magnet on the sensor, and gyroscopes with
-    a bias: nobody says when. What is estimated are the directions of north, west and up in the sensor's frame. The action
-    sets the gains of a filter of the field.
+    Rotations of any speed, breaks, accelerations, iron in the room, now and then a magnet on the sensor, and gyroscopes
+    with a bias: nobody says when. What is estimated are the directions of north, west and up in the sensor's frame. The
+    action sets the gains of a published filter.
     """
 
     id = "broad/Attitude-v0"
@@ -37,7 +37,7 @@ class Attitude(Task):
     banks: Mapping[str, Any] = {"gain": MadgwickBank, "gains": MahonyBank, "time_constants": VQFBank}
     actions: Mapping[str, str] = {
         "gain": "decades of beta over the reach `gain_decades`; 0 is Madgwick's filter with its published default",
-        "gains": "decades of the gains of accelerometer and magnetometer, and the integral gain over `integral_gain`; 0 is "
+        "gains": "decades of the gains of accelerometer and magnetometer, and integral gain over `integral_gain`; 0 is "
         "Mahony's filter with the published default",
         "time_constants": "decades of the time constants of accelerometer and magnetometer; 0 is VQF",
     }
@@ -62,7 +62,9 @@ class Attitude(Task):
         "biased": Scenario("biased", "Held out: gyroscopes with a large bias.", {"gyroscope_bias": 1.0}),
     }  # fmt: skip
     components = tuple(Component(f"{axis}_{along}", "1") for axis in AXES for along in "xyz")
-    groups: Mapping[str, tuple[str, ...]] = {axis: tuple(f"{axis}_{along}" for along in "xyz") for axis in AXES}
+    groups: Mapping[str, tuple[str, ...]] = {
+        axis: tuple(f"{axis}_{along}" for along in "xyz") for axis in AXES
+    }
     cost_description = "square of the total angle between estimate and truth, deg^2"
     reward_unit = 40.0  # between the mean, which a few magnets rule, and the median
     paper_policy = PaperPolicy("gain", (0.0,))
@@ -74,8 +76,8 @@ class Attitude(Task):
     )
 
     def set_up(self) -> None:
-        """Compute the stated covariance: a small rotation of the variance v about each axis moves every direction cosine
-        by 2 v / 3 on average, since ``|C - C0|^2`` is twice the square of the angle.
+        """Compute the stated covariance: a small rotation of the variance v about each axis moves each direction cosine
+        by a variance of 2 v / 3 on average, since ``|C - C0|^2`` is twice the square of the angle.
         """
         variance = 2.0 / 3.0 * (RADIAN * self.parameters.stated_sigma) ** 2
         rows = [[variance if i == j else 0.0 for j in range(9)] for i in range(9)]

@@ -3,38 +3,38 @@
 Written from the paper [1], batch on the last axis; ``T`` is the sampling interval, ``q`` in products turns vectors.
 
 1. *Gyroscope.* The rate alone turns the sensor against an almost inertial frame, ``p <- p exp(T (w - bias))``.
-2. *Inclination.* The specific force in that frame is smoothed by a second-order Butterworth filter of the time constant
-   ``tau_acc``: accelerations cancel over time, gravity does not. With ``a = r lowpass(p f p*) r*``, normalised, and
-   ``c = sqrt((a_3 + 1) / 2)``,
+2. *Inclination.* The specific force ``f`` in that frame is smoothed by a second-order Butterworth filter of the time
+   constant ``tau_acc``: accelerations cancel over time, gravity does not. With ``a = r lowpass(p f p*) r*``, normalised,
+   and ``c = sqrt((a_3 + 1) / 2)``,
 
        r <- (c, a_2 / (2 c), -a_1 / (2 c), 0) r
 
 3. *Heading.* With ``g`` the heading of the field in the frame of ``r p``,
 
-       d <- d + k wrap(g - d),   k = max(k_tau, 1 / n) at the n-th measurement,   k_tau = 1 - exp(-T / tau_mag)
+       d <- d + k wrap(g - d),   k = max(1 - exp(-T / tau_mag), 1 / n) at the n-th measurement while n T < tau_mag
 
    and the attitude is ``q = turn(-d) r p``.
-4. *Bias.* A Kalman filter of the three biases, whose covariance grows towards the first one in ``bias_forgetting_time``.
-   At rest, that is while gyroscope and accelerometer have stayed near their own smoothed values for ``rest_time``, the
-   smoothed rate is a measurement of the bias. In motion the correction of step 2 is: an inclination that has to be
-   corrected all the time is turned by a bias. With ``R`` the rotation matrix of ``r p``, smoothed like the force,
+4. *Bias.* A Kalman filter of the three biases, with a slow random walk. At rest, that is while gyroscope and
+   accelerometer have stayed near their own smoothed values for some time, the smoothed rate is a measurement of the
+   bias. In motion, an inclination that has to be corrected all the time shows the bias: with ``R`` the rotation matrix of
+   ``r p`` and ``R'`` the same smoothed like the force, the measurement of ``R' bias`` is
 
-       (a_1 / T, a_2 / T, 0) - ... = R (b - bias),   first axis: -a_2 / T, second: a_1 / T, vertical: weakly zero
+       (lowpass(R bias)_1 - a_2 / T, lowpass(R bias)_2 + a_1 / T, 0)
 
-5. *Disturbed fields.* Norm and dip of the field are compared with those of a reference. While they differ, ``k`` is zero, for
-   ``rejection_time`` at most, then a fraction; where they stay the same for ``new_field_time`` of motion they are the new
-   reference.
+   where the third, about the vertical, hardly counts.
+5. *Disturbed fields.* Norm and dip of the field are compared with those of a reference. While they differ, ``k`` is zero,
+   after a minute of that a half; a field that stays the same for a while of motion is the new reference.
 
-The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, here as
-a state-variable filter with trapezoidal integrators [2, section 3.10]: in the steady state its memory is the value itself,
-so that time constants may change while it runs. In its first ``tau`` seconds a filter gives the mean of all so far, and goes
-on from there.
+The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, here
+as a state-variable filter with trapezoidal integrators [2]: in the steady state its memory is the value itself, so that
+time constants may change while it runs. In its first ``tau`` seconds a filter gives the mean of all so far, and goes on
+from there.
 
-Reading: the paper's frame is east, north, up; here it is north, west, up, and heading and first axes are turned with it.
+Reading: the paper's frame is east, north, up; here it is north, west, up.
 
 [1] D. Laidig, T. Seel, VQF: highly accurate IMU orientation estimation with bias estimation and magnetic disturbance
-    rejection, Information Fusion 91 (2023), 187-204, arXiv:2203.17024; the values of its table of parameters.
-[2] V. Zavalishin, The art of VA filter design, Native Instruments, 2012.
+    rejection, Information Fusion 91 (2023), 187-204, arXiv:2203.17024; constants are its defaults.
+[2] V. Zavalishin, The art of VA filter design, Native Instruments, 2012, chapter 4.
 """
 
 import math
@@ -289,7 +289,9 @@ def vqf_step(
         watch, factor = _watch_step(watch, field, length(turning), interval)
         gain = gain * factor
     # The mean of all so far, until that moves less than the filter.
-    gain = xp.where(number * interval <= magnetometer_time, xp.maximum(1.0 / number, gain + 0.0 * number), gain)
+    gain = xp.where(
+        number * interval <= magnetometer_time, xp.maximum(1.0 / number, gain + 0.0 * number), gain
+    )
     heading = wrap(state.heading + gain * difference)
     return VQF(p, r, heading, force, number, bias, watch)
 
@@ -324,7 +326,9 @@ def _bias_step(
     xp = namespace(rate)
     smoothed_rate, rate_filter = low_pass(estimate.rate, rate, REST_FILTER_TIME, interval)
     smoothed_force, force_filter = low_pass(estimate.force, accelerometer, REST_FILTER_TIME, interval)
-    still = (square(rate - smoothed_rate) < REST_RATE**2) & (square(accelerometer - smoothed_force) < REST_FORCE**2)
+    still = (square(rate - smoothed_rate) < REST_RATE**2) & (
+        square(accelerometer - smoothed_force) < REST_FORCE**2
+    )
     for i in range(3):
         still = still & (xp.abs(smoothed_rate[i]) <= BIAS_LIMIT)
     rest = xp.where(still, estimate.rest + interval, 0.0)
@@ -341,9 +345,7 @@ def _bias_step(
         ]
     )
     innovation = xp.where(at_rest, smoothed_rate - bias, innovation)
-    H = [
-        [xp.where(at_rest, float(i == j), R[3 * i + j]) for j in range(3)] for i in range(3)
-    ]
+    H = [[xp.where(at_rest, float(i == j), R[3 * i + j]) for j in range(3)] for i in range(3)]
     growth = (0.1 * DEGREE) ** 2 * interval / BIAS_FORGETTING_TIME
     weights = [_noise_for(sigma, growth) for sigma in (BIAS_SIGMA_MOTION, BIAS_SIGMA_REST)]
     variances = [
@@ -389,9 +391,7 @@ def _noise_for(sigma: float, growth: float) -> float:
     return sigma**4 / growth + sigma**2
 
 
-def _watch_step(
-    watch: FieldWatch, field: Array, turning: Array, interval: float
-) -> tuple[FieldWatch, Array]:
+def _watch_step(watch: FieldWatch, field: Array, turning: Array, interval: float) -> tuple[FieldWatch, Array]:
     """Step 5 of the module: watch after a measurement, and the factor on the gain of the heading, ``(N,)``.
 
     Args:
@@ -419,8 +419,12 @@ def _watch_step(
     fast = turning >= NEW_FIELD_RATE
     time = xp.where(stays, watch.candidate + xp.where(fast, interval, 0.0), 0.0)
     follow = stays & fast
-    candidate_norm = xp.where(stays, watch.candidate_norm + xp.where(follow, slow * (norm - watch.candidate_norm), 0.0), norm)
-    candidate_dip = xp.where(stays, watch.candidate_dip + xp.where(follow, slow * (dip - watch.candidate_dip), 0.0), dip)
+    candidate_norm = xp.where(
+        stays, watch.candidate_norm + xp.where(follow, slow * (norm - watch.candidate_norm), 0.0), norm
+    )
+    candidate_dip = xp.where(
+        stays, watch.candidate_dip + xp.where(follow, slow * (dip - watch.candidate_dip), 0.0), dip
+    )
     needed = xp.where(watch.norm == 0.0, FIRST_FIELD_TIME, NEW_FIELD_TIME)
     accepted = disturbed & follow & (time >= needed)
     disturbed = disturbed & ~accepted
