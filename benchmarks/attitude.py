@@ -2,10 +2,14 @@
 
 BROAD (CC BY 4.0) is read where it lies, a copy of https://github.com/dlaidig/broad; trials that lack are left out and
 counted. A filter runs over a whole trial, its errors count while the sensor moves, and a trial counts by its root mean
-square. Agents are run folders of `filtergym train attitude:broad/Attitude-v0`.
+square. Agents are run folders of `filtergym train attitude:broad/Attitude-v0`; several of one name are training seeds,
+and count by their mean.
 
-Example: python benchmarks/attitude.py broad --agent bptt=runs/bptt --out docs/data/attitude.csv
-         python benchmarks/attitude.py --render docs/data/attitude.csv --into docs/attitude.md
+Without BROAD the same competitors are run over simulated episodes of every scenario.
+
+Example: python benchmarks/attitude.py --broad broad --agent bptt=runs/bptt --out docs/data/attitude_broad.csv
+         python benchmarks/attitude.py --agent bptt=runs/bptt --out docs/data/attitude_simulated.csv
+         python benchmarks/attitude.py --render docs/data/attitude_broad.csv --into docs/attitude.md
 """
 
 import argparse
@@ -19,7 +23,7 @@ from typing import Any
 
 import numpy
 import scipy.io
-from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.bootstrap import Bootstrap, Estimate
 
 import filtergym
 
@@ -30,6 +34,9 @@ from attitude import gradient_filters, quaternions  # noqa: E402  (found beside 
 from attitude.broad import read_trial, read_trials  # noqa: E402
 from attitude.task import Attitude  # noqa: E402
 
+COMPETITORS = ("madgwick", "madgwick-gated", "mahony", "vqf-basic", "vqf")
+EPISODES = 64
+"""Of each scenario: 20,000 measurements of each are held in memory."""
 PARTS = ("total", "inclination", "heading")
 BETAS = numpy.round(numpy.geomspace(0.01, 0.4, 25), 4)
 GAINS = tuple(itertools.product(numpy.round(numpy.geomspace(0.1, 2.0, 8), 3), (0.0, 0.001, 0.003)))
@@ -43,10 +50,19 @@ def group_of(trial: str) -> str:
     return re.sub(r"_([A-D]|\dcm|\d+s)$", "", trial[3:])
 
 
-def evaluate(competitor: Any, recording: Any) -> Angles:
-    """Run one competitor over all trials by the project's own evaluation."""
-    found = filtergym.evaluate(Attitude.id, competitor, scenario=recording)
-    return {part: numpy.sqrt(numpy.nanmean(found[f"{part}_angle"].values[0] ** 2, axis=1)) for part in PARTS}
+def evaluate(competitors: Sequence[Any], scenario: Any, **keywords: Any) -> Angles:
+    """Run competitors by the project's own evaluation, and take the mean over them.
+
+    Returns:
+        Root mean squares of each episode.
+    """
+    runs = []
+    for competitor in competitors:
+        found = filtergym.evaluate(Attitude.id, competitor, scenario=scenario, **keywords)
+        squares = {part: numpy.nanmean(found[f"{part}_angle"].values[0] ** 2, axis=1) for part in PARTS}
+        runs.append({part: numpy.sqrt(square) for part, square in squares.items()})
+        print(f"  {competitor}: {runs[-1]['total'].mean():.3f} deg", flush=True)
+    return {part: numpy.mean([run[part] for run in runs], axis=0) for part in PARTS}
 
 
 def run_grid(
@@ -180,7 +196,7 @@ def published(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Angles]
 
 
 def measure(
-    folder: Path, agents: Mapping[str, str], peer: bool
+    folder: Path, agents: Mapping[str, Sequence[str]], peer: bool
 ) -> Iterator[tuple[str, Sequence[str], Angles]]:
     """Yield name, trials and angles of every competitor, one after the other."""
     paths = sorted((folder / "data_mat").glob("*.mat"))
@@ -189,12 +205,12 @@ def measure(
     recording, names = read_trials(paths), [path.stem for path in paths]
     for name, angles in published(folder, names):
         yield name, names, angles
-    for name in ("madgwick", "madgwick-gated", "mahony", "vqf-basic", "vqf"):
-        yield name, names, evaluate(name, recording)
+    for name in COMPETITORS:
+        yield name, names, evaluate([name], recording)
     if peer:
-        yield "vqf, its authors' package", names, evaluate({"peer": PeerVQF}, recording)
-    for name, run in agents.items():
-        yield name, names, evaluate(run, recording)
+        yield "vqf, its authors' package", names, evaluate([{"peer": PeerVQF}], recording)
+    for name, runs in agents.items():
+        yield name, names, evaluate(runs, recording)
     trials = [read_trial(path) for path in paths]
     for scale, label in ((1.0, "madgwick"), (0.5, "madgwick, sample code")):
         grid = madgwick_grid(trials, scale)
@@ -210,14 +226,36 @@ def measure(
 
 
 def interval_text(found: Any) -> str:
-    """Value and interval, deg."""
+    """Value and interval."""
     return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
 
 
-def render(path: Path) -> str:
-    """Table of a file of results: means over the trials, with intervals over them, sorted by the total angle."""
+def simulate(agents: Mapping[str, Sequence[str]]) -> Iterator[list[Any]]:
+    """Yield competitor, scenario, and the mean over episodes of the root mean square of the total angle."""
+    bootstrap = Bootstrap(EPISODES)
+    competitors = {**{name: [name] for name in (*COMPETITORS, "undisturbed")}, **agents}
+    for scenario in Attitude.scenarios:
+        for name, runs in competitors.items():
+            angle = evaluate(runs, scenario, episodes=EPISODES)["total"]
+            estimate = bootstrap.interval(bootstrap.means(angle))
+            print(f"{scenario}, {name}: {interval_text(estimate)}", flush=True)
+            yield [name, scenario, *(f"{value:.4f}" for value in estimate)]
+
+
+def read_results(path: Path) -> list[dict[str, str]]:
+    """Rows of a file of results."""
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+
+def render(path: Path) -> tuple[str, str]:
+    """Name and table of a file of results."""
+    rows = read_results(path)
+    return ("simulated", _simulated_table(rows)) if "scenario" in rows[0] else ("broad", _broad_table(rows))
+
+
+def _broad_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Means over the trials, with intervals over them, sorted by the total angle."""
     names = list(dict.fromkeys(row["competitor"] for row in rows))
     values = {
         name: {part: numpy.array([float(r[part]) for r in rows if r["competitor"] == name]) for part in PARTS}
@@ -238,12 +276,39 @@ def render(path: Path) -> str:
     return "\n".join(lines)
 
 
-def put_into(page: Path, table: str) -> None:
+def _simulated_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """One row for each competitor, one column for each scenario, sorted by the first."""
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    cells = {
+        (row["competitor"], row["scenario"]): Estimate(*(float(row[key]) for key in Estimate._fields))
+        for row in rows
+    }
+    names = dict.fromkeys(row["competitor"] for row in rows)
+    lines = [f"| competitor | {' | '.join(scenarios)} |", "|---" * (1 + len(scenarios)) + "|"]
+    for name in sorted(names, key=lambda name: cells[name, scenarios[0]].value):
+        lines.append(f"| {name} | {' | '.join(interval_text(cells[name, s]) for s in scenarios)} |")
+    return "\n".join(lines)
+
+
+def put_into(page: Path, name: str, table: str) -> None:
     """Replace what stands between the lines of the page that mark the table."""
-    begin, end = "<!-- broad: begin -->", "<!-- broad: end -->"
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, _, rest = page.read_text().partition(begin)
     _, _, after = rest.partition(end)
     page.write_text(f"{before}{begin}\n{table}\n{end}{after}")
+
+
+def write_results(
+    path: Path, agents: Mapping[str, Sequence[str]], columns: Sequence[str], rows: Sequence[Any]
+) -> None:
+    """Write a file of results, with the command that makes it in its first line."""
+    broad = "" if "scenario" in columns else "--broad BROAD "
+    words = " ".join(f"--agent '{name}=RUN'" for name, runs in agents.items() for _ in runs)
+    with path.open("w", newline="") as file:
+        file.write(f"# python benchmarks/attitude.py {broad}{words}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def main() -> None:
@@ -251,7 +316,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("broad", nargs="?", type=Path, help="folder of BROAD")
+    parser.add_argument("--broad", type=Path, help="folder of BROAD; without it episodes are simulated")
     parser.add_argument(
         "--agent", action="append", default=[], metavar="NAME=RUN", help="agent; may be repeated"
     )
@@ -261,28 +326,25 @@ def main() -> None:
     parser.add_argument("--into", type=Path, help="page to put it into")
     asked = parser.parse_args()
     if asked.render is not None:
-        table = render(asked.render)
+        name, table = render(asked.render)
         print(table)
         if asked.into is not None:
-            put_into(asked.into, table)
+            put_into(asked.into, name, table)
         return
+    agents: dict[str, list[str]] = {}
+    for agent in asked.agent:
+        name, _, run = agent.partition("=")
+        agents.setdefault(name, []).append(run)
     if asked.broad is None:
-        parser.error("name the folder of BROAD, or a file to render")
-    agents = dict(agent.partition("=")[::2] for agent in asked.agent)
-    rows = []
-    for name, trials, angles in measure(asked.broad, agents, not asked.no_peer):
-        print(f"{name}: {angles['total'].mean():.3f} deg", flush=True)
-        for i, trial in enumerate(trials):
-            rows.append([name, trial, *(f"{angles[part][i]:.4f}" for part in PARTS)])
+        columns, rows = ["competitor", "scenario", *Estimate._fields], list(simulate(agents))
+    else:
+        columns, rows = ["competitor", "trial", *PARTS], []
+        for name, trials, angles in measure(asked.broad, agents, not asked.no_peer):
+            print(f"{name}: {angles['total'].mean():.3f} deg", flush=True)
+            for i, trial in enumerate(trials):
+                rows.append([name, trial, *(f"{angles[part][i]:.4f}" for part in PARTS)])
     if asked.out is not None:
-        with asked.out.open("w", newline="") as file:
-            words = " ".join(f"--agent {name}=RUN" for name in agents)
-            file.write(
-                f"# python benchmarks/attitude.py BROAD {words}; deg, root mean squares of movements\n"
-            )
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["competitor", "trial", *PARTS])
-            writer.writerows(rows)
+        write_results(asked.out, agents, columns, rows)
 
 
 if __name__ == "__main__":

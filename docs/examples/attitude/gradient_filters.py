@@ -9,9 +9,9 @@
     f = (q* up q - a, s q* b q - m),  g = J^T f                                        (25), (26), (29) to (31), (34)
     q <- q + T (q w / 2 - beta g / |g|), normalised                                    (11), (13), (42), (43)
 
-Equation numbers are those of the report [1], where ``s`` is one. In the sample code of its author (MadgwickAHRS, 2011),
-with which the published results of BROAD were made, the reference field is half as long, ``s = 1 / 2``: then the vectors
-never agree, the rest of ``f`` points along ``q`` and shortens the normalised step, and the magnetometer counts half.
+Equation numbers are those of the report [1], where ``s`` is one. In its author's sample code (MadgwickAHRS, 2011), with
+which the published results of BROAD were made, the reference field is half as long, ``s = 1 / 2``: the vectors never
+agree then, the rest of ``f`` points along ``q`` and shortens the normalised step, and the magnetometer counts half.
 
 **Mahony** [2] turns by the gyroscope plus what the vectors miss, and integrates that into an estimate of the bias:
 

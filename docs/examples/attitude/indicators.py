@@ -6,7 +6,7 @@ An average over the time constant tau is an exponential one, from the first meas
 import math
 from typing import Any, NamedTuple
 
-from filtergym.envs.observation import LOG1P, SIGNED_LOG, Array, Block
+from filtergym.envs.observation import LOG1P, SHARE, SIGNED_LOG, Array, Block
 from filtergym.filters.array_namespace import namespace
 
 from .quaternions import DEGREES, TINY, length, square, to_world
@@ -115,12 +115,13 @@ def indicator_blocks(interval: float) -> tuple[Block, ...]:
         shown("heading", lambda s: DEGREES * s.heading, "mean heading of the field, deg", SIGNED_LOG),
         shown("slow_heading", lambda s: DEGREES * s.slow_heading, "slow mean of it, deg", SIGNED_LOG),
         shown("heading_rms", lambda s: DEGREES * _root(s.heading_square), "root mean square of it, deg"),
-        shown("field_rms", lambda s: 100.0 * _root(s.field_square), "root mean square of the change of the field, percent"),
+        shown("field_rms", lambda s: 100.0 * _root(s.field_square), "root mean square change of the field, percent"),
         shown("rate_rms", lambda s: _root(s.rate_square), "root mean square of the angular rate, rad/s"),
         Block(
             "settling",
             lambda f, _: namespace(f.indicators.number).exp(-interval / 5.0 * f.indicators.number),
             "exp(-t / 5 s), t since the start",
+            shown=SHARE,
         ),
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Attitude of a hand-held sensor from gyroscope, accelerometer and magnetometer."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from filtergym.envs.causes import Cause
 from filtergym.envs.observation import Array
@@ -34,19 +34,23 @@ class Attitude(Task):
     )
     Parameters = AttitudeParameters
     World = AttitudeWorld
-    banks: Mapping[str, Any] = {"gain": MadgwickBank, "gains": MahonyBank, "time_constants": VQFBank}
-    actions: Mapping[str, str] = {
+    banks: ClassVar[Mapping[str, Any]] = {
+        "gain": MadgwickBank,
+        "gains": MahonyBank,
+        "time_constants": VQFBank,
+    }
+    actions: ClassVar[Mapping[str, str]] = {
         "gain": "decades of beta over the reach `gain_decades`; 0 is Madgwick's filter with its published default",
         "gains": "decades of the gains of accelerometer and magnetometer, and integral gain over `integral_gain`; 0 is "
         "Mahony's filter with the published default",
         "time_constants": "decades of the time constants of accelerometer and magnetometer; 0 is VQF",
     }
-    reach: Mapping[str, tuple[str, ...]] = {
+    reach: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gain": ("gain_decades",),
         "gains": ("gain_decades", "integral_gain"),
         "time_constants": ("gain_decades",),
     }
-    scenarios: Mapping[str, Scenario] = {
+    scenarios: ClassVar[Mapping[str, Scenario]] = {
         "random": Scenario("random", "Motions, fields and sensors of all kinds.", training=True),
         "fast": Scenario(
             "fast", "Held out: fast rotations without breaks.",

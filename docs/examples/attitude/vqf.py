@@ -4,8 +4,8 @@ Written from the paper [1], batch on the last axis; ``T`` is the sampling interv
 
 1. *Gyroscope.* The rate alone turns the sensor against an almost inertial frame, ``p <- p exp(T (w - bias))``.
 2. *Inclination.* The specific force ``f`` in that frame is smoothed by a second-order Butterworth filter of the time
-   constant ``tau_acc``: accelerations cancel over time, gravity does not. With ``a = r lowpass(p f p*) r*``, normalised,
-   and ``c = sqrt((a_3 + 1) / 2)``,
+   constant ``tau_acc``: accelerations cancel over time, gravity does not. With ``a = r lowpass(p f p*) r*`` over its
+   length and ``c = sqrt((a_3 + 1) / 2)``,
 
        r <- (c, a_2 / (2 c), -a_1 / (2 c), 0) r
 
@@ -16,19 +16,19 @@ Written from the paper [1], batch on the last axis; ``T`` is the sampling interv
    and the attitude is ``q = turn(-d) r p``.
 4. *Bias.* A Kalman filter of the three biases, with a slow random walk. At rest, that is while gyroscope and
    accelerometer have stayed near their own smoothed values for some time, the smoothed rate is a measurement of the
-   bias. In motion, an inclination that has to be corrected all the time shows the bias: with ``R`` the rotation matrix of
-   ``r p`` and ``R'`` the same smoothed like the force, the measurement of ``R' bias`` is
+   bias. In motion, an inclination that has to be corrected all the time shows the bias: with ``R`` the rotation matrix
+   of ``r p`` and ``R'`` the same smoothed like the force, the measurement of ``R' bias`` is
 
        (lowpass(R bias)_1 - a_2 / T, lowpass(R bias)_2 + a_1 / T, 0)
 
    where the third, about the vertical, hardly counts.
-5. *Disturbed fields.* Norm and dip of the field are compared with those of a reference. While they differ, ``k`` is zero,
-   after a minute of that a half; a field that stays the same for a while of motion is the new reference.
+5. *Disturbed fields.* Norm and dip of the field are compared with those of a reference. While they differ ``k`` is
+   zero, after a minute of that it is halved; a field that stays the same for a while of motion is the new reference.
 
-The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, here
-as a state-variable filter with trapezoidal integrators [2]: in the steady state its memory is the value itself, so that
-time constants may change while it runs. In its first ``tau`` seconds a filter gives the mean of all so far, and goes on
-from there.
+The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, as a
+state-variable filter with trapezoidal integrators [2]: in the steady state its memory is the value itself, so that time
+constants may change while it runs. In its first ``tau`` seconds a filter gives the mean of all so far, and goes on from
+there.
 
 Reading: the paper's frame is east, north, up; here it is north, west, up.
 
