@@ -25,10 +25,10 @@ Written from the paper [1], batch on the last axis; ``T`` is the sampling interv
 5. *Disturbed fields.* Norm and dip of the field are compared with those of a reference. While they differ ``k`` is
    zero, after a minute of that it is halved; a field that stays the same for a while of motion is the new reference.
 
-The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, as a
-state-variable filter with trapezoidal integrators [2]: in the steady state its memory is the value itself, so that time
-constants may change while it runs. In its first ``tau`` seconds a filter gives the mean of all so far, and goes on from
-there.
+The low-pass filters are the bilinear transform of the Butterworth filter with the cut-off ``sqrt(2) / (2 pi tau)``, as
+state-variable filters with trapezoidal integrators [2]: in the steady state their memory is the value itself, so that
+time constants may change while they run. In its first ``tau`` seconds a filter gives the mean of all so far, and then
+goes on from there.
 
 Reading: the paper's frame is east, north, up; here it is north, west, up.
 
