@@ -303,7 +303,7 @@ def write_results(
 ) -> None:
     """Write a file of results, with the command that makes it in its first line."""
     broad = "" if "scenario" in columns else "--broad BROAD "
-    words = " ".join(f"--agent '{name}=RUN'" for name, runs in agents.items() for _ in runs)
+    words = " ".join(f'--agent "{name}=RUN"' for name, runs in agents.items() for _ in runs)
     with path.open("w", newline="") as file:
         file.write(f"# python benchmarks/attitude.py {broad}{words}\n")
         writer = csv.writer(file, lineterminator="\n")

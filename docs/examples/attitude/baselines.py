@@ -111,6 +111,7 @@ class Undisturbed:
     """
 
     kind = "reference"
+    traceable = True
     knows = "accelerations, disturbances of the field and the constant errors of the sensors"
     gain = 0.2
     """1/s: about white error of the gyroscope over that of the accelerometer's direction."""
