@@ -201,14 +201,14 @@ class Recording:
         """
         if self.environment != cls.id:
             raise ValueError(f"recording {self.name!r} is of {self.environment}, not of {cls.id}")
-        known = [f.name for f in dataclasses.fields(cls.Parameters)]
-        unknown = [name for name in self.parameters if name not in known]
+        defaults = {f.name: f.default for f in dataclasses.fields(cls.Parameters)}
+        unknown = [name for name in self.parameters if name not in defaults]
         if unknown:
             raise ValueError(
                 f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
             )
         named = {**self.parameters, **keywords}
-        interval = freeze(named.get("decision_interval", 1))
+        interval = freeze(named.get("decision_interval", defaults["decision_interval"]))
         check("decision_interval", interval, *field_limits(cls.Parameters)["decision_interval"])
         longest, shortest = int(self.lengths.max()), int(self.lengths.min())
         if shortest < interval:
