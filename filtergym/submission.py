@@ -151,7 +151,7 @@ class Verification(_Stored):
     """Largest difference of its results from those that were found here, in units of :data:`TOLERANCE`."""
     round: Line
     """Value of the round, which was not known when the file was handed in."""
-    seed: Count | None
+    seed: Annotated[int, msgspec.Meta(ge=0)] | None
     """Number of the round's experiment, which follows from both; None: no round."""
     results: tuple[Figure, ...]
     """Over the episodes of the round; without a round over those of the protocol."""
@@ -376,7 +376,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> tuple[Any, Traini
             stored = getattr(found, "policy", found)
             run = stored.header["run"]
             scenarios = check_trained(problem, run.get("scenario"))
-            steps, seed = int(run.get("steps_done") or run.get("steps") or 0), int(run.get("seed") or 0)
+            steps, seed = int(run.get("steps") or 0), int(run.get("seed") or 0)
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
             text = str(error).replace(str(file), "its agent")
             raise ValueError(f"{path}: {''.join(c if c.isprintable() else ' ' for c in text)}") from error

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import board as leaderboard
 import comparison
 import training_seeds
 import typer
@@ -240,6 +241,21 @@ def ship(
         console.print(f"{file}: {best.name}, of the lowest validation cost")
 
 
+def board(
+    folder: Annotated[Path, typer.Argument(help="Folder of submissions and their verifications.")] = Path(
+        "leaderboard"
+    ),
+    into: Annotated[Path, typer.Option(help="Page whose tables are replaced.")] = Path("docs/leaderboard.md"),
+) -> None:
+    """Make the page of the board from verified submissions.
+
+    Example: python docs/make board leaderboard
+    """
+    entries = leaderboard.read_entries(folder)
+    insert_between_markers(into, {leaderboard.MARKER: leaderboard.board_markdown(entries)})
+    console.print(f"{into}: {len(entries)} submissions")
+
+
 def command_line(
     into: Annotated[Path, typer.Argument(help="Page whose sections are replaced.")],
 ) -> None:
@@ -257,6 +273,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "comparison": comparison_page,
     "seeds": seeds,
     "ship": ship,
+    "board": board,
     "command-line": command_line,
 }
 
