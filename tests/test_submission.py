@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import shlex
 import shutil
 import sys
 import zipfile
@@ -136,6 +137,18 @@ def test_the_round_depends_on_every_byte_of_the_file():
 # --- results edited
 
 
+@pytest.fixture(scope="module")
+def found(honest):
+    """Results of the honest agent, run again once."""
+    return verify(honest / "agent.json").again
+
+
+@pytest.fixture
+def run_once(found, monkeypatch):
+    """Take those, for tests that edit nothing but what the file says of them."""
+    monkeypatch.setattr(submissions, "run_protocol", lambda *arguments: found)
+
+
 def lower(figure):
     figure["value"] *= 1.0 - 1e-4
 
@@ -146,7 +159,7 @@ def narrower(figure):
 
 @pytest.mark.parametrize("metric", ["cost", "relative_cost_difference", "win_rate", "anees", "rmse"])
 @pytest.mark.parametrize("change", [lower, narrower])
-def test_an_edited_number_does_not_hold(metric, change, edited, command):
+def test_an_edited_number_does_not_hold(metric, change, edited, command, run_once):
     def edit(content):
         [figure] = [f for f in content["results"] if f["metric"] == metric]
         change(figure)
@@ -163,11 +176,12 @@ def test_an_edited_number_does_not_hold(metric, change, edited, command):
         lambda results: results.append(dict(results[0])),
         lambda results: results.append({**results[0], "scenario": "paper"}),
         lambda results: results[0].update(scenario="paper"),
+        lambda results: results[0].update(scenario="import_trap:Mine"),
         lambda results: results[0].update(value=None),
         lambda results: results.clear(),
     ],
 )
-def test_results_that_are_not_those_of_the_protocol_do_not_hold(edit, edited, command):
+def test_results_that_are_not_those_of_the_protocol_do_not_hold(edit, edited, command, run_once):
     text = refused(command, edited("agent", lambda content: edit(content["results"])))
     assert "do not hold" in text
 
@@ -336,7 +350,6 @@ def test_source_runs_only_when_it_is_trusted(trap, edited, command):
         lambda c: c["protocol"].update(name="import_trap:Mine"),
         lambda c: c["protocol"].update(scenarios=["import_trap.py"]),
         lambda c: c["card"].update(scenarios=["import_trap.py"]),
-        lambda c: c["results"][0].update(scenario="import_trap:Mine"),
     ],
 )
 def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, command):
@@ -428,10 +441,13 @@ def test_damaged_files_end_in_a_sentence(honest, tmp_path):
 )
 def test_a_title_is_words(title, edited, command):
     assert "holds no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
-    code, _, errors = command("submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title)
-    assert code == 2 or not title
-    assert not Path("x.json").exists() or not title
-    assert "\x1b[2J" not in errors
+    if title:  # without one it is the name
+        code, _, errors = command(
+            "submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title
+        )
+        assert (code, errors.count("\n")) == (2, 1)
+        assert "\x1b" not in errors
+        assert not Path("x.json").exists()
 
 
 # --- the command, and the board
@@ -449,8 +465,6 @@ def test_the_commands_of_the_page_run(command, tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(MINE, encoding="utf-8")
     page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
     for line in page.partition("```sh\n")[2].partition("```")[0].splitlines():
-        import shlex
-
         _, *words = shlex.split(line)
         words += ["--protocol", "trial"] if words[0] == "submit" else []
         code, _, errors = command(*words)

@@ -145,21 +145,22 @@ def verify_file(
     with Workers(jobs) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         found = verify(file, value, trust, workers, lambda done: bar.update(line, advance=done))
-    own, verification = found.submission, found.verification
-    columns = {"it says": own.results, "here": found.again}
-    if verification.seed is not None:
+    own, verification, holds = found.submission, found.verification, found.deviation.holds
+    columns = {"it says": own.results}
+    if not holds:
+        columns["here"] = found.again
+    elif verification.seed is not None:
         columns["fresh episodes"] = verification.results
     console.print(_results_table(f"{own.card.title}, by {own.card.author}", columns))
     console.print(f"SHA-256 {verification.submission}", soft_wrap=True)
-    if not found.deviation.holds:
-        raise ValueError(f"the numbers of {file} do not hold: {found.deviation.sentence}")
+    versions = f"made by filtergym {own.filtergym}, verified by {verification.filtergym}"
+    if not holds:
+        raise ValueError(f"the numbers of {file} do not hold: {found.deviation.sentence} ({versions})")
     console.print(
         f"the numbers hold: they differ by {found.deviation.size * TOLERANCE:.1e} at most, and rounding explains "
-        f"{TOLERANCE:.0e}",
+        f"{TOLERANCE:.0e}; {versions}",
         soft_wrap=True,
     )
-    if own.filtergym != verification.filtergym:
-        console.print(f"made by filtergym {own.filtergym}, verified by {verification.filtergym}")
     if verification.seed is not None:
         console.print(
             f"fresh episodes: experiment {verification.seed}, of this file and {value!r}", soft_wrap=True
