@@ -66,7 +66,7 @@ class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What stands in a file, and nothing else."""
 
 
-class Protocol(_Stored):
+class Protocol(_Stored, frozen=True):
     """Episodes that a submission is run over."""
 
     name: Name
@@ -80,7 +80,7 @@ class Protocol(_Stored):
     split: Literal["test"] = "test"
 
 
-class Card(_Stored):
+class Card(_Stored, frozen=True):
     """What an author says of a submission."""
 
     title: Title
@@ -95,7 +95,7 @@ class Card(_Stored):
     """That it was trained or tuned on."""
 
 
-class Figure(_Stored, omit_defaults=True):
+class Figure(_Stored, frozen=True, omit_defaults=True):
     """One number of the results, with its 95 % interval over the episodes."""
 
     scenario: Name
@@ -106,26 +106,26 @@ class Figure(_Stored, omit_defaults=True):
     component: Annotated[str, msgspec.Meta(pattern=r"^[\w.:/+-]{0,100}\Z")] = ""
 
 
-class Arrays(_Stored, tag="arrays"):
+class Arrays(_Stored, frozen=True, tag="arrays"):
     """An agent: a safetensors file as ``filtergym export`` writes it."""
 
     safetensors: bytes
 
 
-class Source(_Stored, tag="source"):
+class Source(_Stored, frozen=True, tag="source"):
     """An estimator or a policy: one file of Python, and the name of the class in it."""
 
     text: str
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_]\w{0,99}\Z")]
 
 
-class Shipped(_Stored, tag="shipped"):
+class Shipped(_Stored, frozen=True, tag="shipped"):
     """A classical competitor of this package."""
 
     name: Name
 
 
-class Submission(_Stored):
+class Submission(_Stored, frozen=True):
     """All that a file holds."""
 
     environment: Name
@@ -141,7 +141,7 @@ class Submission(_Stored):
     format: Literal["filtergym submission 1"] = "filtergym submission 1"
 
 
-class Verification(_Stored):
+class Verification(_Stored, frozen=True):
     """What has come out where a submission was run again."""
 
     submission: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
@@ -373,7 +373,7 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> tuple[Any, Traini
         file.write_bytes(held.safetensors)
         try:
             found = load_policy(problem.task, file)
-            stored = getattr(found, "policy", found)
+            stored: Any = getattr(found, "policy", found)
             run = stored.header["run"]
             scenarios = check_trained(problem, run.get("scenario"))
             steps, seed = int(run.get("steps") or 0), int(run.get("seed") or 0)
