@@ -52,6 +52,8 @@ GROUPS: Mapping[str, Commands] = {
         "report": "report:make",
         "export": "export:export",
         "offline": "measure:write_offline",
+        "submit": "submit:submit",
+        "verify": "submit:verify_file",
     },
 }
 MARKUP: Any = "markdown"

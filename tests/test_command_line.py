@@ -83,6 +83,8 @@ REFUSED = {
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
     "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
+    "submit": (ENV, "nobody", "--out", "new/mine.json"),
+    "verify": ("missing.json", "--out", "new/mine.verified.json"),
 }
 
 

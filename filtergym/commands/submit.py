@@ -1,0 +1,209 @@
+"""The commands that hand in a competitor with its results, and run again what somebody has handed in."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from ..baselines.problem import problem_of
+from ..evaluation.files import writable_file, write_text
+from ..evaluation.parallel import Workers
+from ..submission import (
+    PROTOCOLS,
+    TIME,
+    TOLERANCE,
+    VERIFIED,
+    Card,
+    Figure,
+    Source,
+    make_submission,
+    measurements_of,
+    protocol_of,
+    read_submission,
+    verify,
+    write_stored,
+)
+from .terminal import (
+    Environment,
+    Jobs,
+    Trust,
+    complete_policy,
+    complete_training_scenario,
+    console,
+    import_environments,
+    one_of,
+    progress_bar,
+    whole_numbers,
+)
+
+
+def submit(
+    environment: Environment,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A shipped agent or classical competitor, a .safetensors, the folder of a training run, or "
+            "module:Class of an estimator in one file.",
+            autocompletion=complete_policy,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="File that is handed in, .json.")],
+    protocol: Annotated[
+        str,
+        typer.Option(
+            help="board: 500 episodes of every scenario, 100 in TightlyCoupledNavigation; trial: 32 of the training "
+            "distribution.",
+            autocompletion=one_of(*PROTOCOLS),
+        ),
+    ] = "board",
+    title: Annotated[str | None, typer.Option(help="On the board; default: the name.")] = None,
+    author: Annotated[str, typer.Option(help="On the board.")] = "-",
+    trained_by: Annotated[
+        str, typer.Option(help="Command that trained or tuned it; an agent's own file says so.")
+    ] = "",
+    budget: Annotated[
+        int, typer.Option(help="Decisions or measurements that this took; an agent's own file says so.")
+    ] = 0,
+    seeds: Annotated[
+        str | None, typer.Option(help="Training seeds of which it is the best, such as 0-4.")
+    ] = None,
+    trained_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Training scenario; repeatable; an agent's own file says so.",
+            autocompletion=complete_training_scenario,
+        ),
+    ] = None,
+    jobs: Jobs = 1,
+) -> None:
+    """Run a protocol, and write competitor, card and results into one file.
+
+    An agent is written as its arrays, which execute nothing; an estimator as the text of its module.
+
+    Example: filtergym submit filtergym/ManeuveringTarget-v0 bptt --protocol trial --out bptt.json
+    """
+    problem = problem_of(environment)
+    writable_file(out)
+    card = Card(
+        title or Path(name).stem.rpartition(":")[2],
+        author,
+        trained_by,
+        budget,
+        tuple(whole_numbers("--seeds", seeds)) if seeds else (),
+        tuple(trained_on or ()),
+    )
+    with Workers(jobs) as workers, progress_bar() as bar:
+        line = bar.add_task("evaluating", total=measurements_of(problem, protocol_of(problem, protocol)))
+        made = make_submission(
+            problem, name, protocol, card, workers, lambda done: bar.update(line, advance=done)
+        )
+    digest = write_stored(out, made)
+    console.print(_results_table(made.card.title, {"": made.results}))
+    console.print(f"saved in {out}, SHA-256 {digest}", soft_wrap=True)
+
+
+def verify_file(
+    file: Annotated[Path, typer.Argument(help="A submission.")],
+    value: Annotated[
+        str | None,
+        typer.Option(
+            "--round",
+            metavar="VALUE",
+            help="Value that nobody knew when the file was handed in; fresh episodes follow from it and the file.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help=f"File for what is found, which the board takes: NAME{VERIFIED}.")
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(help="Write the source code of the submission, to read it, and run nothing."),
+    ] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option(help="module:id of an environment of your own.", callback=import_environments),
+    ] = None,
+    trust: Trust = False,
+    jobs: Jobs = 1,
+) -> None:
+    """Run what somebody has handed in again, and say whether its numbers hold.
+
+    Costs repeat but for rounding, whatever the processor; times are not compared. What holds source code needs --trust.
+
+    Example: filtergym verify leaderboard/ManeuveringTarget-bptt-small.json --round 2c7f
+    """
+    if source is not None:
+        held = read_submission(file)[0].competitor
+        if not isinstance(held, Source):
+            raise ValueError(f"{file} holds no source code")
+        write_text(source, held.text)
+        console.print(f"source code in {source}, its class {held.name}", soft_wrap=True)
+        return
+    if out is not None:
+        writable_file(out)
+    with Workers(jobs) as workers, progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        found = verify(file, value, trust, workers, lambda done: bar.update(line, advance=done))
+    own, verification, holds = found.submission, found.verification, found.deviation.holds
+    columns = {"it says": own.results}
+    if not holds:
+        columns["here"] = found.again
+    elif verification.seed is not None:
+        columns["fresh episodes"] = verification.results
+    console.print(_results_table(f"{own.card.title}, by {own.card.author}", columns))
+    console.print(f"SHA-256 {verification.submission}", soft_wrap=True)
+    versions = f"made by filtergym {own.filtergym}, verified by {verification.filtergym}"
+    if not holds:
+        raise ValueError(f"the numbers of {file} do not hold: {found.deviation.sentence} ({versions})")
+    console.print(
+        f"the numbers hold: they differ by {found.deviation.size * TOLERANCE:.1e} at most, and rounding explains "
+        f"{TOLERANCE:.0e}; {versions}",
+        soft_wrap=True,
+    )
+    if verification.seed is not None:
+        console.print(
+            f"fresh episodes: experiment {verification.seed}, of this file and {value!r}", soft_wrap=True
+        )
+    if out is not None:
+        write_stored(out, verification)
+        console.print(f"saved in {out}", soft_wrap=True)
+
+
+def _results_table(title: str, columns: dict[str, tuple[Figure, ...]]) -> Table:
+    """Cost against the paper's algorithm and consistency in every scenario, from several runs side by side."""
+    table = Table(title=title, title_justify="left", caption=_time_line(columns), caption_justify="left")
+    table.add_column("scenario")
+    for name in columns:
+        table.add_column(f"{name} cost vs paper, %".strip(), justify="right")
+        table.add_column("ANEES", justify="right")
+    rows = {name: {(f.scenario, f.metric): f for f in figures} for name, figures in columns.items()}
+    for scenario in dict.fromkeys(f.scenario for figures in columns.values() for f in figures):
+        cells = []
+        for known in rows.values():
+            cells.append(_percent(known.get((scenario, "relative_cost_difference"))))
+            anees = known.get((scenario, "anees"))
+            cells.append("-" if anees is None or anees.value is None else f"{anees.value:.3g}")
+        table.add_row(scenario, *cells)
+    return table
+
+
+def _percent(figure: Figure | None) -> str:
+    if figure is None or figure.value is None:
+        return "-"
+    interval = (
+        ""
+        if figure.low is None or figure.high is None
+        else f" [{100 * figure.low:+.1f}, {100 * figure.high:+.1f}]"
+    )
+    return f"{100 * figure.value:+.1f}{interval}"
+
+
+def _time_line(columns: dict[str, tuple[Figure, ...]]) -> str:
+    """Say how long a measurement takes in each run, of which each may be on another machine."""
+    times = {
+        name: f.value for name, figures in columns.items() for f in figures if f.metric == TIME and f.value
+    }
+    return "nanoseconds a measurement: " + ", ".join(
+        f"{time:,.0f} {name}".strip() for name, time in times.items()
+    )

@@ -1,0 +1,628 @@
+"""Submissions: a competitor, its card and its results on a protocol in one file that anybody can run again.
+
+A file is JSON of declared types. Nothing in it is compressed, so that it is as large as it looks, and nothing in it
+names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source
+text, which runs only where the reader says that it is trusted. A competitor of this package is its name.
+
+Whoever runs a file again finds the same numbers but for rounding: the noise of an episode is a function of its seed.
+Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
+relative. A filter hands on what n measurements have left of an error times the condition number of what it inverts,
+kappa, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7. :data:`TOLERANCE` is the
+next power of ten.
+
+The episodes of a protocol are known beforehand. Those of a round are not: their seed is drawn from the digest of the
+file and a value that nobody knew when the file was handed in, see :func:`round_seed`.
+"""
+
+import hashlib
+import inspect
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import msgspec
+
+from .agents.learned_policy import load_policy, pretrained_path
+from .agents.named_policies import pretrained_agents
+from .agents.training_run import best_agent, training_scenarios
+from .baselines.problem import Problem, problem_of
+from .envs.catalogue import import_user_module, nearest
+from .envs.failures import own_line
+from .envs.scenario_choice import find_mixture
+from .evaluation.competitors import RANKED, check_competitor, kind_of
+from .evaluation.files import whole_file
+from .evaluation.parallel import Workers
+from .evaluation.rollout import Progress
+from .evaluation.summary import EvaluationRequest, combine_summaries, summaries
+
+if TYPE_CHECKING:
+    from .evaluation.metrics import Record
+
+TOLERANCE = 1e-6
+"""Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""
+MOST_BYTES = 8_000_000
+"""Of a file."""
+SUFFIX, VERIFIED = ".json", ".verified.json"
+"""Of a submission, and of what its verification has found."""
+OWN = "submission"
+"""Name of a submission among the competitors of its evaluation."""
+TIME = "nanoseconds"
+"""The metric that differs from run to run: it is told, and not compared."""
+RATIOS = ("relative_cost_difference", "median_cost_ratio", "win_rate", "anees", "lost_episodes")
+"""Metrics whose scale is one."""
+METRICS = ("cost", *RATIOS, TIME)
+"""Metrics of results, beside the one that the environment calls physical."""
+
+Name = Annotated[str, msgspec.Meta(pattern=r"^[\w.:/+-]{1,100}\Z")]
+Title = Annotated[str, msgspec.Meta(pattern=r"^[\w .,:+()/&'-]{1,80}\Z")]
+"""Words that mean nothing to a terminal, to Markdown or to HTML."""
+Line = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]{0,1000}\Z")]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+
+
+class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What stands in a file, and nothing else."""
+
+
+class Protocol(_Stored, frozen=True):
+    """Episodes that a submission is run over."""
+
+    name: Name
+    version: Count
+    scenarios: tuple[Name, ...]
+    """The training distribution first."""
+    episodes: Count
+    """Of every scenario."""
+    seed: Count
+    """Number of the experiment."""
+    split: Literal["test"] = "test"
+
+
+class Card(_Stored, frozen=True):
+    """What an author says of a submission."""
+
+    title: Title
+    author: Title = "-"
+    command: Line = ""
+    """That trained or tuned it."""
+    budget: Count = 0
+    """Decisions of its training, or measurements of its tuning; 0: neither."""
+    seeds: tuple[Count, ...] = ()
+    """Training seeds of which this is the best."""
+    scenarios: tuple[Name, ...] = ()
+    """That it was trained or tuned on."""
+
+
+class Figure(_Stored, frozen=True, omit_defaults=True):
+    """One number of the results, with its 95 % interval over the episodes."""
+
+    scenario: Name
+    metric: Name
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    component: Annotated[str, msgspec.Meta(pattern=r"^[\w.:/+-]{0,100}\Z")] = ""
+
+
+class Arrays(_Stored, frozen=True, tag="arrays"):
+    """An agent: a safetensors file as ``filtergym export`` writes it."""
+
+    safetensors: bytes
+
+
+class Source(_Stored, frozen=True, tag="source"):
+    """An estimator or a policy: one file of Python, and the name of the class in it."""
+
+    text: str
+    name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_]\w{0,99}\Z")]
+
+
+class Shipped(_Stored, frozen=True, tag="shipped"):
+    """A classical competitor of this package."""
+
+    name: Name
+
+
+class Submission(_Stored, frozen=True):
+    """All that a file holds."""
+
+    environment: Name
+    """Gymnasium id."""
+    interface: Count
+    """Version of the environment's interface."""
+    filtergym: Name
+    """Version of the package that made the results."""
+    protocol: Protocol
+    card: Card
+    competitor: Arrays | Source | Shipped
+    results: tuple[Figure, ...]
+    format: Literal["filtergym submission 1"] = "filtergym submission 1"
+
+
+class Verification(_Stored, frozen=True):
+    """What has come out where a submission was run again."""
+
+    submission: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    """SHA-256 of its file."""
+    filtergym: Name
+    difference: float
+    """Largest difference of its results from those that were found here, in units of :data:`TOLERANCE`."""
+    round: Line
+    """Value of the round, which was not known when the file was handed in."""
+    seed: Annotated[int, msgspec.Meta(ge=0)] | None
+    """Number of the round's experiment, which follows from both; None: no round."""
+    results: tuple[Figure, ...]
+    """Over the episodes of the round; without a round over those of the protocol."""
+    format: Literal["filtergym verification 1"] = "filtergym verification 1"
+
+
+SCENARIOS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "filtergym/ManeuveringTarget-v0": (
+            "random", "paper", "atc", "cruise", "descent", "missed-detections", "irregular-scans", "glint", "biased",
+            "clutter",
+        ),
+        "filtergym/UavAutopilot-v0": (
+            "random", "paper-noise", "paper-step", "gust-front", "sensor-degradation", "actuator-lag", "gyro-bias",
+        ),
+        "filtergym/RadarEsmTracking-v0": (
+            "random", "paper", "fixed-type", "crowded", "silent", "class-change", "glint", "correlated-errors",
+        ),
+        "filtergym/LooselyCoupledNavigation-v0": (
+            "random", "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver",
+        ),
+        "filtergym/TightlyCoupledNavigation-v0": (
+            "random", "paper", "kinematic", "matched", "rates-lost", "two-satellites", "accelerometer-failure",
+            "urban", "satellite-ramp", "satellite-bias", "coloured-ranges",
+        ),
+    }
+)  # fmt: skip
+"""Of the protocol ``board``; another environment's are all that it has."""
+EPISODES: Mapping[str, int] = MappingProxyType({"filtergym/TightlyCoupledNavigation-v0": 100})
+"""Of the protocol ``board``, where they are not 500."""
+PROTOCOLS = ("board", "trial")
+"""Names: what the board takes, and a short one to try."""
+
+
+def protocol_of(problem: Problem, name: str) -> Protocol:
+    """Return a protocol for an environment.
+
+    Args:
+        problem: whose scenarios it has.
+        name: ``"board"``, or ``"trial"``: 32 episodes of the training distribution.
+
+    Raises:
+        ValueError: for another name.
+    """
+    if name not in PROTOCOLS:
+        raise nearest("protocol", name, PROTOCOLS)
+    default = problem.task.default_scenario
+    if name == "trial":
+        return Protocol(name, 1, (default,), 32, 0)
+    others = (own for own in problem.task.scenarios if own != default)
+    scenarios = SCENARIOS.get(problem.id, (default, *others))
+    return Protocol(name, 1, scenarios, EPISODES.get(problem.id, 500), 0)
+
+
+# --- files
+
+
+def read_submission(path: Path) -> tuple[Submission, str]:
+    """Read a submission, and run nothing of it.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        What it holds, and the SHA-256 digest of the file.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    content = _read(path)
+    return _decode(path, content, Submission), hashlib.sha256(content).hexdigest()
+
+
+def read_verification(path: Path) -> Verification:
+    """Read what a verification has found.
+
+    Raises:
+        ValueError: if the file holds none.
+    """
+    return _decode(path, _read(path), Verification)
+
+
+def write_stored(path: Path, stored: Submission | Verification) -> str:
+    """Write either, and return the SHA-256 digest of the file.
+
+    Raises:
+        ValueError: if it cannot be written, or is larger than a reader takes.
+    """
+    content = msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n"
+    if len(content) > MOST_BYTES:
+        raise ValueError(
+            f"a submission is at most {MOST_BYTES / 1e6:g} MB, and this one has {len(content):,} bytes"
+        )
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"{path} is larger than {MOST_BYTES / 1e6:g} MB, which no submission is")
+    return content
+
+
+def _decode(path: Path, content: bytes, kind: Any) -> Any:
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} holds no {kind.__name__.lower()} of filtergym: {error}") from error
+
+
+# --- competitors
+
+
+def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
+    """Return what a submission holds of a competitor that its author names.
+
+    Args:
+        problem: whose competitor it is.
+        name: of a shipped agent or a classical competitor; a ``.safetensors``; the folder of a run that has one; or
+            ``module:Class``, of a module in one file that imports installed packages only.
+
+    Raises:
+        ValueError: for whatever else.
+    """
+    if name in pretrained_agents(problem.id):
+        return Arrays(pretrained_path(problem.id, name).read_bytes())
+    if name in problem.baselines.names:
+        return Shipped(name)
+    path = Path(name)
+    if path.is_dir():
+        path = best_agent(path)
+        if path.suffix != ".safetensors":
+            raise ValueError(f"{name} holds a model only: filtergym export {name} writes its arrays")
+    if path.suffix == ".safetensors":
+        return Arrays(_read(path))
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        raise nearest(
+            "competitor to submit", name, [*problem.baselines.names, *pretrained_agents(problem.id)]
+        )
+    found = import_user_module(module, f"cannot submit {name!r}")
+    try:
+        text = inspect.getsource(found)
+    except (OSError, TypeError) as error:
+        raise ValueError(f"cannot submit {name!r}: {module} is not one file of Python") from error
+    return Source(text, attribute)
+
+
+def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = False) -> Any:
+    """Return what makes the competitor of a submission.
+
+    Args:
+        problem: that it is of.
+        submission: from a file.
+        path: of the file, for errors.
+        trust: run source.
+
+    Raises:
+        ValueError: if it holds source and is not trusted, what is no competitor, or one that is told the truth; and of
+            an agent if its card does not say what its arrays say of its training.
+    """
+    held = submission.competitor
+    if isinstance(held, Arrays):
+        found, training = _load_agent(problem, held, path)
+        card = submission.card
+        said = Training(card.command, card.budget, card.scenarios, card.seeds)
+        if said[:3] != training[:3] or not {*training.seeds} <= {*said.seeds}:
+            raise ValueError(f"{path}: its card says {said} of its training, and its arrays {training}")
+        return found
+    if isinstance(held, Source):
+        if not trust:
+            raise ValueError(
+                f"{path} holds source code, and to verify it is to execute it: read it (--source FILE writes it), and "
+                "if you trust it add --trust"
+            )
+        found = _run_source(held, path)
+    elif held.name in problem.baselines.names:
+        found = problem.competitor(held.name)
+    else:
+        raise nearest("competitor", held.name, problem.baselines.names)
+    if kind_of(found) not in RANKED:
+        raise ValueError(
+            f"{path} holds a {kind_of(found)}, which may know what no sensor says: only policies and estimators can be "
+            "submitted"
+        )
+    if isinstance(held, Source) and getattr(found, "task_keywords", None):
+        raise ValueError(
+            f"{path} asks for parameters of its own, task_keywords: a submission takes the environment as it is"
+        )
+    return found
+
+
+class Training(NamedTuple):
+    """What an agent's file says of its training."""
+
+    command: str
+    budget: int
+    scenarios: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+
+def _load_agent(problem: Problem, held: Arrays, path: Path) -> tuple[Any, Training]:
+    """Load an agent and what its file says of its training.
+
+    Raises:
+        ValueError: in one printable sentence that names the submission, if the arrays are no agent of the environment,
+            or it was trained on what is held out.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "agent.safetensors"
+        file.write_bytes(held.safetensors)
+        try:
+            found = load_policy(problem.task, file)
+            stored: Any = getattr(found, "policy", found)
+            run = stored.header["run"]
+            scenarios = check_trained(problem, run.get("scenario"))
+            steps, seed = int(run.get("steps") or 0), int(run.get("seed") or 0)
+        except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+            text = str(error).replace(str(file), "its agent")
+            raise ValueError(f"{path}: {''.join(c if c.isprintable() else ' ' for c in text)}") from error
+    stored.path = path  # in errors from now on; its own is gone
+    return found, Training(str(run.get("command", "")), steps, scenarios, (seed,))
+
+
+def check_trained(problem: Problem, scenario: Any) -> tuple[str, ...]:
+    """Return the names of the scenarios that something was trained on; what a file says opens no other file.
+
+    Raises:
+        ValueError: for a scenario that is held out, or none.
+    """
+    names = tuple(find_mixture(problem.task, scenario) or [scenario or problem.task.default_scenario])
+    for name in names:
+        if not (isinstance(name, str) and name in problem.task.scenarios):
+            raise nearest("scenario", name, problem.task.scenarios)
+        training_scenarios(problem.task, name)
+    return names
+
+
+def _run_source(held: Source, path: Path) -> Any:
+    """Execute source text and return the class that it names."""
+    module = ModuleType(
+        f"{__name__}.source"
+    )  # nobody finds it by this name: other processes get the class itself
+    try:
+        exec(compile(held.text, f"<source of {path}>", "exec", dont_inherit=True), module.__dict__)
+    except Exception as error:  # a module is a program: it can raise anything
+        raise ValueError(
+            f"cannot run the source of {path}: {type(error).__name__}: {error}{own_line(error)}"
+        ) from error
+    if held.name not in module.__dict__:
+        raise ValueError(f"the source of {path} has no {held.name!r}")
+    return check_competitor(held.name, module.__dict__[held.name])
+
+
+# --- runs
+
+
+def make_submission(
+    problem: Problem,
+    name: str,
+    protocol: str,
+    card: Card,
+    workers: Workers,
+    progress: Progress | None = None,
+) -> Submission:
+    """Run a protocol and return what is handed in.
+
+    Args:
+        problem: that is solved.
+        name: of the competitor, see :func:`pack`.
+        protocol: name of the protocol.
+        card: what the author says; of an agent what its arrays say of its training goes before.
+        workers: who shares the work.
+        progress: told of measurements done.
+
+    Raises:
+        ValueError: for what :func:`verify` would refuse.
+    """
+    from . import __version__
+
+    held, own, path = pack(problem, name), protocol_of(problem, protocol), Path(name)
+    if isinstance(held, Arrays):
+        training = _load_agent(problem, held, path)[1]
+        card = msgspec.structs.replace(card, **{**training._asdict(), "seeds": card.seeds or training.seeds})
+    submission = Submission(problem.id, problem.task.interface, __version__, own, card, held, ())
+    submission = _decode(path, msgspec.json.encode(submission), Submission)  # of its declared types
+    check_submission(problem, submission, path)
+    maker = unpack(problem, submission, path, trust=True)
+    results = run_protocol(problem, maker, own, own.seed, workers, progress)
+    return msgspec.structs.replace(submission, results=results)
+
+
+def check_submission(problem: Problem, submission: Submission, path: Path) -> None:
+    """Check what a submission says against what this package knows, and run nothing.
+
+    Raises:
+        ValueError: for another interface, an altered protocol, or training on a held-out scenario.
+    """
+    if submission.interface != problem.task.interface:
+        raise ValueError(
+            f"{path} was made for interface {submission.interface} of {problem.id}, which now has "
+            f"{problem.task.interface}: submit it again"
+        )
+    known = protocol_of(problem, submission.protocol.name)
+    if submission.protocol != known:
+        raise ValueError(f"{path}: its protocol {known.name!r} is not that of this package: {known}")
+    for scenario in submission.card.scenarios:
+        check_trained(problem, scenario)
+
+
+def run_protocol(
+    problem: Problem,
+    maker: Any,
+    protocol: Protocol,
+    seed: int,
+    workers: Workers,
+    progress: Progress | None = None,
+) -> tuple[Figure, ...]:
+    """Run a competitor and the paper's algorithm over the episodes of a protocol, and time it in the first scenario.
+
+    Args:
+        problem: whose scenarios these are.
+        maker: of the competitor.
+        protocol: which episodes.
+        seed: number of the experiment, the protocol's or a round's.
+        workers: who shares the work.
+        progress: told of measurements done.
+    """
+    known = problem.baselines
+    makers = {OWN: maker} | (
+        {known.score_paper: problem.competitor(known.score_paper)} if known.score_paper else {}
+    )
+    requests = []
+    for scenario in protocol.scenarios:
+        timed = scenario == protocol.scenarios[0]
+        experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
+        horizon = experiment.make_task().horizon
+        requests += [
+            EvaluationRequest(experiment, name, own, known.metrics, horizon) for name, own in makers.items()
+        ]
+    found = dict(summaries(requests, workers, progress))
+    figures: list[Figure] = []
+    for i in range(0, len(requests), len(makers)):
+        records = combine_summaries([found[i + k] for k in range(len(makers))])[0]
+        figures += _figures(records, known.physical)
+    return tuple(figures)
+
+
+def measurements_of(problem: Problem, protocol: Protocol) -> int:
+    """Return how many measurements a run of a protocol has, of both competitors."""
+    tasks = (problem.experiment(scenario).make_task() for scenario in protocol.scenarios)
+    return (1 + bool(problem.baselines.score_paper)) * protocol.episodes * sum(task.horizon for task in tasks)
+
+
+def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator[Figure]:
+    for r in records:
+        wanted = r.metric in METRICS or (r.metric, r.component) == physical
+        if r.policy == OWN and r.window == "all" and wanted:
+            yield Figure(r.scenario, r.metric, r.value, r.low, r.high, r.component)
+
+
+class Deviation(NamedTuple):
+    """The number of some results that is furthest from what was found."""
+
+    size: float
+    """In units of :data:`TOLERANCE`; infinite where one of both has no such number."""
+    sentence: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether rounding explains it."""
+        return self.size <= 1.0
+
+
+def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
+    """Compare results with those that were found when the same episodes were run again; times are not compared.
+
+    Args:
+        claimed: of a file.
+        found: here.
+    """
+
+    def table(figures: Sequence[Figure]) -> dict[tuple[str, str, str], list[float | None]]:
+        own = [f for f in figures if f.metric != TIME]
+        return {(f.scenario, f.metric, f.component): [f.value, f.low, f.high] for f in own}
+
+    said, known = table(claimed), table(found)
+    worst = Deviation(0.0, "")
+    if said.keys() != known.keys() or len(said) != sum(f.metric != TIME for f in claimed):
+        odd = sorted(said.keys() ^ known.keys())
+        which = " ".join(odd[0]) if odd else "a number twice"
+        return Deviation(float("inf"), f"its results are not those of its protocol: {which}")
+    for key, numbers in known.items():
+        for one, other, which in zip(said[key], numbers, ("", "lower end of ", "upper end of "), strict=True):
+            size = 0.0 if one is None and other is None else float("inf")
+            if one is not None and other is not None:
+                size = abs(one - other) / (TOLERANCE * (abs(other) + (key[1] in RATIOS)) or 1.0)
+            if size > worst.size:
+                name = f"{which}{key[1]} {key[2]}".rstrip()
+                worst = Deviation(
+                    size, f"{name} in scenario {key[0]!r} is {_number(other)}, and it says {_number(one)}"
+                )
+    return worst
+
+
+def _number(value: float | None) -> str:
+    return "not known" if value is None else f"{value:.9g}"
+
+
+def round_seed(digest: str, value: str) -> int:
+    """Return the number of a round's experiment: the first 64 bits of a SHA-256 digest.
+
+    Args:
+        digest: SHA-256 of the submission's file, 64 hexadecimal digits.
+        value: drawn after all files were handed in, such as a pulse of a public beacon.
+    """
+    return int.from_bytes(hashlib.sha256(f"{digest} {value}".encode()).digest()[:8], "big")
+
+
+class Outcome(NamedTuple):
+    """What a verification has found."""
+
+    submission: Submission
+    deviation: Deviation
+    """Of the results of the file from those over the same episodes here."""
+    again: tuple[Figure, ...]
+    """Those."""
+    verification: Verification
+
+
+def verify(
+    path: Path,
+    value: str | None = None,
+    trust: bool = False,
+    workers: Workers | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Run the protocol of a submission again; of one whose numbers hold also over the episodes of a round.
+
+    Args:
+        path: of the file.
+        value: of the round; None: no round.
+        trust: run source.
+        workers: who shares the work; default: this process.
+        progress: told of measurements done.
+
+    Raises:
+        ValueError: if it is no submission, not of this package's protocol and interface, or holds source and is not
+            trusted.
+    """
+    from . import __version__
+
+    submission, digest = read_submission(path)
+    problem = problem_of(submission.environment)
+    check_submission(problem, submission, path)
+    maker = unpack(problem, submission, path, trust)
+    workers, protocol = workers or Workers(), submission.protocol
+    again = run_protocol(problem, maker, protocol, protocol.seed, workers, progress)
+    found = deviation(submission.results, again)
+    results, seed = again, None
+    if value is not None and found.holds:
+        seed = round_seed(digest, value)
+        results = run_protocol(problem, maker, protocol, seed, workers, progress)
+    size = min(found.size, 1e300)  # JSON has no infinity
+    verification = Verification(digest, __version__, size, value or "", seed, results)
+    return Outcome(submission, found, again, verification)

@@ -1,0 +1,516 @@
+"""Submissions: honest ones hold wherever they are run again; whatever lies is caught or refused."""
+
+import base64
+import hashlib
+import json
+import shlex
+import shutil
+import sys
+import zipfile
+from pathlib import Path
+
+import commands
+import numpy as np
+import pytest
+from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.catalogue import catalogue
+from filtergym.evaluation.parallel import Workers
+
+from filtergym import submission as submissions
+from filtergym.submission import (
+    MOST_BYTES,
+    TIME,
+    TOLERANCE,
+    Card,
+    deviation,
+    make_submission,
+    protocol_of,
+    read_submission,
+    round_seed,
+    verify,
+    write_stored,
+)
+
+ID = "filtergym/ManeuveringTarget-v0"
+AGENTS = PRETRAINED / "ManeuveringTarget-v0"
+ROOT = Path(__file__).parent.parent
+MINE = (ROOT / "docs" / "examples" / "mine.py").read_text(encoding="utf-8")
+SPRING = "open({!r}, 'w')\n"
+
+
+def stored(path, name, card=None):
+    """Write a submission of a few episodes."""
+    made = make_submission(problem_of(ID), name, "trial", card or Card("A title"), Workers())
+    write_stored(path, made)
+    return path
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory):
+    """Folder of honest submissions: an agent, an estimator as source, a classical one."""
+    folder = tmp_path_factory.mktemp("honest")
+    (folder / "own_filter.py").write_text(MINE, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        stored(folder / "source.json", "own_filter:Mine")
+    sys.modules.pop("own_filter", None)
+    stored(folder / "agent.json", "bptt-small")
+    stored(folder / "shipped.json", "kalman-imm")
+    return folder
+
+
+@pytest.fixture
+def edited(honest, tmp_path, monkeypatch):
+    """Edit the JSON of an honest submission; returns the path of what came of it."""
+    monkeypatch.chdir(tmp_path)
+
+    def edit(name, change):
+        content = json.loads((honest / f"{name}.json").read_text(encoding="utf-8"))
+        change(content)
+        path = tmp_path / "edited.json"
+        path.write_text(json.dumps(content), encoding="utf-8")
+        return path
+
+    return edit
+
+
+def refused(command, path, *words):
+    """Return the one sentence that a verification ends in."""
+    code, _, errors = command("verify", path, *words)
+    assert (code, errors.count("\n")) == (2, 1), errors
+    return errors
+
+
+@pytest.mark.parametrize("name", ["agent", "source", "shipped"])
+def test_an_honest_submission_holds(name, honest, command, tmp_path):
+    out = tmp_path / "found.verified.json"
+    code, shown, errors = command(
+        "verify", honest / f"{name}.json", "--trust", "--round", "a pulse", "--out", out
+    )
+    assert code == 0, errors
+    assert "the numbers hold" in shown
+    found = submissions.read_verification(out)
+    digest = hashlib.sha256((honest / f"{name}.json").read_bytes()).hexdigest()
+    assert found.submission == digest
+    assert found.difference <= 1.0
+    seed = int(hashlib.sha256(f"{digest} a pulse".encode()).hexdigest()[:16], 16)
+    assert found.seed == seed == round_seed(digest, "a pulse")
+    # Other episodes: the same numbers again would say that nothing was drawn.
+    known = read_submission(honest / f"{name}.json")[0].results
+    assert deviation(known, found.results).size > 1.0
+
+
+def test_what_runs_is_the_text_wherever_it_runs(honest):
+    """The module that was packed is not there any more; two processes find what one has found."""
+    assert "own_filter" not in sys.modules
+    alone = verify(honest / "source.json", trust=True)
+    with Workers(2) as workers:
+        shared = verify(honest / "source.json", trust=True, workers=workers)
+    assert alone.deviation.size == shared.deviation.size == 0.0
+
+
+def test_results_are_those_of_an_evaluation(honest):
+    from filtergym import evaluate, tidy_records
+
+    data = evaluate(ID, ["bptt-small", "imm"], episodes=32)
+    known = {
+        (r.metric, r.component): (r.value, r.low, r.high)
+        for r in tidy_records(data)
+        if r.policy == "bptt-small" and r.window == "all"
+    }
+    figures = [f for f in read_submission(honest / "agent.json")[0].results if f.metric != TIME]
+    assert {f.metric for f in figures} >= {"cost", "relative_cost_difference", "anees", "rmse"}
+    for figure in figures:
+        assert (figure.value, figure.low, figure.high) == pytest.approx(
+            known[figure.metric, figure.component], rel=1e-12
+        )
+
+
+def test_the_round_depends_on_every_byte_of_the_file():
+    digests = [hashlib.sha256(content).hexdigest() for content in (b"a", b"b")]
+    seeds = {round_seed(digest, value) for digest in digests for value in ("1", "2", "")}
+    assert len(seeds) == 6
+    assert all(0 <= seed < 2**64 for seed in seeds)
+
+
+# --- results edited
+
+
+@pytest.fixture(scope="module")
+def found(honest):
+    """Results of the honest agent, run again once."""
+    return verify(honest / "agent.json").again
+
+
+@pytest.fixture
+def run_once(found, monkeypatch):
+    """Take those, for tests that edit nothing but what the file says of them."""
+    monkeypatch.setattr(submissions, "run_protocol", lambda *arguments: found)
+
+
+def lower(figure):
+    figure["value"] *= 1.0 - 1e-4
+
+
+def narrower(figure):
+    figure["high"] -= 1e-3 * (figure["high"] - figure["low"])
+
+
+@pytest.mark.parametrize("metric", ["cost", "relative_cost_difference", "win_rate", "anees", "rmse"])
+@pytest.mark.parametrize("change", [lower, narrower])
+def test_an_edited_number_does_not_hold(metric, change, edited, command, run_once):
+    def edit(content):
+        [figure] = [f for f in content["results"] if f["metric"] == metric]
+        change(figure)
+
+    text = refused(command, edited("agent", edit))
+    assert "the numbers of edited.json do not hold" in text.replace(str(Path.cwd()) + "/", "")
+    assert metric in text
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda results: results.pop(0),
+        lambda results: results.append(dict(results[0])),
+        lambda results: results.append({**results[0], "scenario": "paper"}),
+        lambda results: results[0].update(scenario="paper"),
+        lambda results: results[0].update(scenario="import_trap:Mine"),
+        lambda results: results[0].update(value=None),
+        lambda results: results.clear(),
+    ],
+)
+def test_results_that_are_not_those_of_the_protocol_do_not_hold(edit, edited, command, run_once):
+    text = refused(command, edited("agent", lambda content: edit(content["results"])))
+    assert "do not hold" in text
+
+
+def test_rounding_holds_and_times_are_not_compared(honest):
+    import msgspec
+
+    known = read_submission(honest / "agent.json")[0].results
+
+    def times(factor, figures):
+        return [msgspec.structs.replace(f, value=f.value * factor) for f in figures]
+
+    assert deviation(times(1.0 + 0.4 * TOLERANCE, known), known).holds
+    assert not deviation(times(1.0 + 2.5 * TOLERANCE, known), known).holds
+    slower = [msgspec.structs.replace(f, value=3.0 * f.value) if f.metric == TIME else f for f in known]
+    assert slower != list(known)
+    assert deviation(slower, known) == (0.0, "")
+
+
+# --- arrays swapped
+
+
+def with_agent(content, path):
+    content["competitor"]["safetensors"] = base64.b64encode(path.read_bytes()).decode()
+
+
+def rewritten(source, out, change=lambda arrays: None, **header):
+    """Write an agent's file with other arrays or another record of its training."""
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(source, framework="numpy") as file:
+        metadata = dict(file.metadata())
+        arrays = {name: file.get_tensor(name).copy() for name in file.keys()}  # noqa: SIM118
+    change(arrays)
+    metadata["run"] = json.dumps({**json.loads(metadata["run"]), **header})
+    save_file(arrays, out, metadata)
+    return out
+
+
+def test_another_agent_contradicts_the_card(edited, command):
+    path = edited("agent", lambda content: with_agent(content, AGENTS / "ppo.safetensors"))
+    assert "its card says" in refused(command, path)
+
+
+def test_other_arrays_under_the_same_card_do_not_hold(edited, command, tmp_path):
+    def scale(arrays):
+        arrays["weight_0"] *= np.float32(0.9)
+
+    other = rewritten(AGENTS / "bptt-small.safetensors", tmp_path / "other.safetensors", scale)
+    assert "do not hold" in refused(command, edited("agent", lambda content: with_agent(content, other)))
+
+
+def test_arrays_of_another_environment_are_refused(edited, command):
+    other = PRETRAINED / "UavAutopilot-v0" / "bptt-small.safetensors"
+    text = refused(command, edited("agent", lambda content: with_agent(content, other)))
+    assert "was trained on filtergym/UavAutopilot-v0" in text
+
+
+@pytest.mark.parametrize("content", [b"", b"half", b"\xff" * 8, b"\x08" + 7 * b"\0" + b'{"a":{}}'])
+def test_arrays_that_are_none_are_refused(content, edited, command):
+    def edit(stored):
+        stored["competitor"]["safetensors"] = base64.b64encode(content).decode()
+
+    assert "its agent is not a learned policy" in refused(command, edited("agent", edit))
+
+
+# --- scenarios confused
+
+
+@pytest.mark.parametrize(
+    ("scenario", "sentence"),
+    [
+        ("paper", "held out"),
+        ("glint", "held out"),
+        ("random:0.5,glint:0.5", "held out"),
+        ("flights.csv", "unknown scenario 'flights.csv'"),
+        ({"x": [1]}, "unknown scenario"),
+        (["random"], "unknown scenario"),
+    ],
+)
+def test_training_on_what_is_tested_is_refused(scenario, sentence, edited, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if catalogue()[ID].scenarios.get(scenario if isinstance(scenario, str) else "") is not None:
+        assert not catalogue()[ID].scenarios[scenario].training
+    (tmp_path / "flights.csv").write_text("what a record names is not opened")
+    agent = rewritten(AGENTS / "bptt-small.safetensors", tmp_path / "own.safetensors", scenario=scenario)
+    assert sentence in refused(command, edited("agent", lambda content: with_agent(content, agent)))
+    code, _, errors = command("submit", ID, agent, "--protocol", "trial", "--out", "new.json")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert sentence in errors
+    assert not (tmp_path / "new.json").exists()
+
+
+def test_tuning_on_what_is_tested_is_refused(edited, command):
+    text = refused(command, edited("source", lambda c: c["card"].update(scenarios=["glint"])), "--trust")
+    assert "'glint' is held out" in text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"episodes": 16}, {"seed": 7}, {"version": 2}, {"scenarios": []}, {"scenarios": ["random", "random"]},
+        {"split": "train"}, {"split": "validation"}, {"name": "board"}, {"name": "own"}, {"backend": "numpy"},
+    ],
+)  # fmt: skip
+def test_an_altered_protocol_is_refused(change, edited, command):
+    assert "protocol" in refused(command, edited("agent", lambda content: content["protocol"].update(change)))
+
+
+def test_another_interface_is_refused(edited, command):
+    text = refused(command, edited("agent", lambda content: content.update(interface=1)))
+    assert "was made for interface 1" in text
+
+
+def test_every_scenario_is_on_the_board():
+    """A scenario that comes or goes is another protocol: give it the next version."""
+    for id, task in catalogue().items():
+        if id in submissions.SCENARIOS:
+            protocol = protocol_of(problem_of(id), "board")
+            assert {*protocol.scenarios} == {*task.scenarios}
+            assert protocol.scenarios[0] == task.default_scenario
+    assert set(submissions.SCENARIOS) == {id for id in catalogue() if id.startswith("filtergym/")}
+
+
+# --- code
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch):
+    """A module that writes a file where it is imported, in the working directory; the name of that file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    sprung = tmp_path / "sprung"
+    (tmp_path / "import_trap.py").write_text(SPRING.format(str(sprung)) + MINE)
+    yield sprung
+    sys.modules.pop("import_trap", None)
+
+
+def test_source_runs_only_when_it_is_trusted(trap, edited, command):
+    def spring(content):
+        content["competitor"]["text"] = SPRING.format(str(trap)) + MINE
+
+    path = edited("source", spring)
+    assert "holds source code, and to verify it is to execute it" in refused(command, path)
+    assert "add --trust" in refused(command, path, "--round", "a pulse")
+    code, shown, _ = command("verify", path, "--source", "read_me.py")
+    assert code == 0
+    assert "its class Mine" in shown
+    assert Path("read_me.py").read_text(encoding="utf-8") == SPRING.format(str(trap)) + MINE
+    assert not trap.exists()
+    assert command("verify", path, "--trust")[0] == 0
+    assert trap.exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.update(environment="import_trap:mine/Trap-v0"),
+        lambda c: c.update(competitor={"type": "shipped", "name": "import_trap:Mine"}),
+        lambda c: c.update(competitor={"type": "shipped", "name": "import_trap"}),
+        lambda c: c.update(competitor={"type": "shipped", "name": "./agent.safetensors"}),
+        lambda c: c.update(competitor={"type": "shipped", "name": "run"}),
+        lambda c: c.update(competitor={"type": "source", "text": MINE, "name": "import_trap:Mine"}),
+        lambda c: c.update(competitor={"type": "module", "name": "import_trap"}),
+        lambda c: c["protocol"].update(name="import_trap:Mine"),
+        lambda c: c["protocol"].update(scenarios=["import_trap.py"]),
+        lambda c: c["card"].update(scenarios=["import_trap.py"]),
+    ],
+)
+def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, command):
+    shutil.copyfile(AGENTS / "ppo.safetensors", "agent.safetensors")
+    Path("run").mkdir()
+    (Path("run") / "run.json").write_text("{}")
+    for name in ("source", "shipped"):
+        path = edited(name, change)
+        refused(command, path, *(["--trust"] if name == "source" else []))
+        assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("further", "sentence"),
+    [
+        ("Mine.kind = 'reference'\n", "holds a reference, which may know what no sensor says"),
+        ("Mine.kind = 'bound'\n", "may know what no sensor says"),
+        ("Mine.kind = 'smoother'\nMine.smooth = Mine.update\n", "only policies and estimators"),
+        ("Mine.task_keywords = {'range_sigma': 1.0}\n", "asks for parameters of its own"),
+        ("del Mine\n", "has no 'Mine'"),
+        ("Mine = 3\n", "'Mine' is no competitor"),
+        ("1 / 0\n", "cannot run the source of edited.json: ZeroDivisionError"),
+        ("import another_file_of_mine\n", "cannot run the source of edited.json: ModuleNotFoundError"),
+        ("def (\n", "cannot run the source of edited.json: SyntaxError"),
+    ],
+)
+def test_source_that_cannot_compete_is_refused(further, sentence, edited, command):
+    path = edited("source", lambda content: content["competitor"].update(text=MINE + further))
+    assert sentence in refused(command, path, "--trust").replace(str(Path.cwd()) + "/", "")
+
+
+def test_what_is_told_the_truth_is_refused(edited, command):
+    def name(content):
+        content["competitor"]["name"] = "known-turn"
+
+    assert "holds a reference" in refused(command, edited("shipped", name))
+    assert (
+        "holds a reference"
+        in command("submit", ID, "known-turn", "--protocol", "trial", "--out", "x.json")[2]
+    )
+
+
+# --- files that are none
+
+
+def test_a_truncated_file_is_refused(honest, command, tmp_path):
+    content = (honest / "agent.json").read_bytes()
+    path = tmp_path / "half.json"
+    for share in (0.0, 0.01, 0.3, 0.99):
+        path.write_bytes(content[: int(share * len(content))])
+        assert "holds no submission of filtergym" in refused(command, path)
+
+
+def test_what_is_packed_or_large_is_refused(command, tmp_path):
+    packed = tmp_path / "bomb.json"
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("../../outside.py", b"0" * 10_000_000)
+    assert "holds no submission" in refused(command, packed)
+    large = tmp_path / "large.json"
+    with large.open("wb") as file:
+        file.truncate(100 * MOST_BYTES)  # takes no room on the disk
+    assert "is larger than 8 MB" in refused(command, large)
+    (tmp_path / "deep.json").write_bytes(b"[" * 1_000_000)
+    assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
+    assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    assert "there is no file" in refused(command, tmp_path / "none.json")
+    assert "there is no file" in refused(command, "/dev/zero")
+
+
+def test_damaged_files_end_in_a_sentence(honest, tmp_path):
+    """Whatever bytes are changed, a file is read as what it says or refused as a ValueError."""
+    rng, path = np.random.default_rng(0), tmp_path / "damaged.json"
+    content = np.frombuffer((honest / "shipped.json").read_bytes(), np.uint8)
+    refusals = 0
+    for _ in range(300):
+        damaged = content.copy()
+        damaged[rng.integers(len(content), size=3)] = rng.integers(256, size=3)
+        path.write_bytes(damaged.tobytes())
+        try:
+            read_submission(path)
+        except ValueError:
+            refusals += 1
+    assert refusals > 100
+
+
+@pytest.mark.parametrize(
+    "title", ["\x1b[2J", "a|b", "<script>", "`x`", "[x](y)", "a\nb", "", "x" * 81, "a\n"]
+)
+def test_a_title_is_words(title, edited, command):
+    assert "holds no submission" in refused(command, edited("agent", lambda c: c["card"].update(title=title)))
+    if title:  # without one it is the name
+        code, _, errors = command(
+            "submit", ID, "imm", "--protocol", "trial", "--out", "x.json", "--title", title
+        )
+        assert (code, errors.count("\n")) == (2, 1)
+        assert "\x1b" not in errors
+        assert not Path("x.json").exists()
+
+
+# --- the command, and the board
+
+
+def test_an_agent_carries_what_its_file_says_of_its_training(honest):
+    found = read_submission(honest / "agent.json")[0]
+    run = json.loads((AGENTS / "bptt-small.json").read_text(encoding="utf-8"))
+    assert (found.card.command, found.card.budget) == (run["command"], run["steps"])
+    assert (found.card.seeds, found.card.scenarios) == ((run["seed"],), (run["scenario"],))
+
+
+def test_the_commands_of_the_page_run(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(MINE, encoding="utf-8")
+    page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    for line in page.partition("```sh\n")[2].partition("```")[0].splitlines():
+        _, *words = shlex.split(line)
+        words += ["--protocol", "trial"] if words[0] == "submit" else []
+        code, _, errors = command(*words)
+        assert code == 0, errors
+    sys.modules.pop("mine", None)
+    assert submissions.read_verification(tmp_path / "mine.verified.json").round == "2c7f"
+
+
+def test_the_board_shows_every_file():
+    entries = read_entries(ROOT / "leaderboard")
+    text = board_markdown(entries)
+    assert len(entries) == len(list((ROOT / "leaderboard").glob("*.verified.json")))
+    assert all(path.stem.split("-", 1)[0] in text for path in (ROOT / "leaderboard").glob("*.json"))
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == len(entries) + text.count("## ")  # and a head for each environment
+
+
+def test_the_board_takes_only_what_was_verified(tmp_path):
+    folder = tmp_path / "board"
+    name = "ManeuveringTarget-bptt-small"
+
+    def board(change=lambda own, verified: None):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        own, verified = (
+            json.loads((ROOT / "leaderboard" / f"{name}{end}").read_text())
+            for end in (".json", ".verified.json")
+        )
+        before = json.dumps(own)
+        change(own, verified)
+        path = folder / f"{name}.json"
+        if json.dumps(own) == before:
+            shutil.copyfile(ROOT / "leaderboard" / path.name, path)
+        else:
+            path.write_text(json.dumps(own))
+        (folder / f"{name}.verified.json").write_text(json.dumps(verified))
+        return read_entries(folder)
+
+    assert len(board()) == 1
+    for change in (
+        lambda own, verified: own["card"].update(title="Another"),
+        lambda own, verified: verified.update(submission="0" * 64),
+        lambda own, verified: verified.update(seed=7),
+        lambda own, verified: verified.update(round="another"),
+        lambda own, verified: verified.update(difference=2.0),
+        lambda own, verified: verified.update(results=verified["results"][:3]),
+    ):
+        with pytest.raises(ValueError, match=r"^[^\n]+$"):
+            board(change)
