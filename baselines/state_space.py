@@ -149,8 +149,8 @@ class InteractingKalman:
 
 
 class KnownModel:
-    """The Kalman filter, extended where the model is not linear, that is told the true model: functions, Q and R of this
-    episode, and which hypothesis holds.
+    """The Kalman filter, extended where the model is not linear, that is told the true model: functions, Q and R of
+    this episode, and which hypothesis holds.
     """
 
     kind = "reference"
@@ -201,7 +201,11 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
     """
     several = len(task.definition.filters) > 1
     linear = all(model.is_linear for model in task.definition.filters)
-    policies: dict[str, Any] = {"kalman": Kalman, "covariance-matching": CovarianceMatching, "random": RandomPolicy}
+    policies: dict[str, Any] = {
+        "kalman": Kalman,
+        "covariance-matching": CovarianceMatching,
+        "random": RandomPolicy,
+    }
     estimators: dict[str, Any] = {"extended": Extended}
     if not linear:
         estimators["unscented"] = Unscented

@@ -1,8 +1,8 @@
 """Functions of a vector with their exact Jacobians, for every kind of array.
 
 A function that somebody has written with NumPy is traced once, on a vector of symbols, and its Jacobian follows by
-reverse mode, one row for each entry of the answer (:mod:`.gradients`). Both are straight lines of arithmetic on one lane,
-which are then computed with the functions of any array namespace: on NumPy, on torch, or on traced arrays again.
+reverse mode, one row for each entry of the answer (:mod:`.gradients`). Both are straight lines of arithmetic on one
+lane, which are then computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
 """
 
 import operator
@@ -57,7 +57,9 @@ class VectorFunction:
                 for i in range(len(answer) if len(shape) == 1 else 0)
             ]
         if len(shape) != 1:
-            raise ValueError(f"must return a vector, such as a list of numbers, got an array of shape {shape}")
+            raise ValueError(
+                f"must return a vector, such as a list of numbers, got an array of shape {shape}"
+            )
         (self.size,) = shape
         nodes = [node for gradient in gradients for node in gradient.nodes.tolist()]
         self._value = _program(graph, answer.nodes.tolist())
@@ -81,7 +83,7 @@ class VectorFunction:
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Jacobian at vectors: rows of the value, columns of x; arguments as of :meth:`value`, returns ``(m, n, N)``."""
+        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of x; arguments as of :meth:`value`."""
         entries, n = _compute(self._jacobian, x, xp), len(x)
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 

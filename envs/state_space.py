@@ -7,15 +7,15 @@ filters may believe others. Functions are traced once, on vectors of symbols, an
 (:mod:`..compiler.vector_functions`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
 from ..compiler.vector_functions import VectorFunction
-from ..filters.smoothing import semidefinite_root
 from ..filters.small_matrices import apply, product, transpose
+from ..filters.smoothing import semidefinite_root
 from .causes import MISSED, OUTLIER
 from .draws import Draws, category, draw_between
 from .filter import Initial
@@ -173,12 +173,13 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         factors = [
             draw_between(draws.log_uniform, name, limits) + zero
-            for name, limits in (("process noise", p.process_noise), ("measurement noise", p.measurement_noise))
+            for name, limits in (
+                ("process noise", p.process_noise),
+                ("measurement noise", p.measurement_noise),
+            )
         ]
         count = len(own.world)
-        first = (
-            draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
-        )
+        first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
         mean = self.task.constant(own.mean)[:, None] + 0.0 * normals
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
         state = mean + apply(self.initial_root[:, :, None], normals)
@@ -218,7 +219,8 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         """Number of the model that follows, ``(N,)``."""
         rows = numpy.cumsum(self.task.definition.transition, axis=1)[:, :-1]
         thresholds = [
-            self._chosen([0.0 * uniform + value for value in column], hypothesis) for column in rows.T.tolist()
+            self._chosen([0.0 * uniform + value for value in column], hypothesis)
+            for column in rows.T.tolist()
         ]
         return self.xp.astype(category(uniform, thresholds, self.xp), self.xp.float64)
 
@@ -269,9 +271,9 @@ class StateSpace(Task):
 
     ## Description
 
-    The state moves by a function f and noise of covariance Q, sensors measure a function h of it with noise of covariance
-    R. Filters start with the same mean and covariance and know the model, or another one where the author says so. Kalman
-    filters are extended ones where f or h is not linear; their Jacobians are exact.
+    The state moves by a function f and noise of covariance Q; sensors measure a function h of it with noise of
+    covariance R. Filters start with the same mean and covariance. They know the model, or believe another one where the
+    author says so. Kalman filters are extended ones where f or h is not linear; their Jacobians are exact.
 
     ## Action Space
 
@@ -306,7 +308,11 @@ class StateSpace(Task):
     causes = (MISSED, OUTLIER)
     cost_description = "weighted squared error of the components"
     reward = "log-relative"
-    reach = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}
+    reach: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "noise": ("noise_decades",),
+        "gain": ("gain_factor",),
+        "evidence": ("evidence_scale",),
+    }
 
     def set_up(self) -> None:
         """Put the models that the filters believe on the task's arrays."""

@@ -22,7 +22,7 @@ from ..filters.ordered_sums import ordered_sum
 from ..filters.small_matrices import outer, product, transpose
 from .controls import bank_action_space, bank_probabilities
 from .filter import Bank, Initial
-from .observation import ACTION, AVERAGE_OF_LOG1P, KEPT_AS_LOG, LOG1P, PLAIN, SHARE, SIGNED_LOG, Array, Block
+from .observation import ACTION, AVERAGE_OF_LOG1P, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
 from .state_space import Equations, Measurement, StateSpace, StateSpaceParameters
 
 AVERAGED = 0.1
@@ -221,8 +221,9 @@ class KalmanNetBank(KalmanBank):
         K = M H^T (H M H^T + C R' C)^-1,  M = F P F^T + A D Q D A,  in Joseph's form with P' and R'
 
     The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering
-    for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547. Reading: their network answers with
-    the gain itself; here with the noises of a Kalman gain, so that a network that knows nothing is the filter as written.
+    for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547. Reading: their network answers
+    with the gain itself; here with the noises of a Kalman gain, so that a network that knows nothing is the filter as
+    written.
     """
 
     def __init__(self, task: StateSpace, control: str) -> None:
@@ -252,14 +253,22 @@ class KalmanNetBank(KalmanBank):
 
         return (
             *super().blocks,
-            Block("state", lambda f, _: f.mean * self.scales, "predicted state over the deviation of the process noise", names, SIGNED_LOG),
-            Block("correction", lambda f, _: f.correction, "the last correction, likewise", names, SIGNED_LOG),
+            Block(
+                "state",
+                lambda f, _: f.mean * self.scales,
+                "predicted state over the deviation of the process noise",
+                names,
+                SIGNED_LOG,
+            ),
+            Block(
+                "correction", lambda f, _: f.correction, "the last correction, likewise", names, SIGNED_LOG
+            ),
             Block("spread", spread, "deviation of the state, likewise", names, KEPT_AS_LOG),
         )
 
     def start(self, initial: Initial) -> KalmanNetTrack:
         """Start where everyone starts."""
-        return KalmanNetTrack(*super().start(initial), 0.0 * initial.mean)
+        return KalmanNetTrack(**super().start(initial)._asdict(), correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
         """Entries of an action: process, sensor, agility, caution, offset."""
@@ -364,10 +373,26 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
                 modes,
                 SIGNED_LOG,
             ),
-            Block("log_predicted", lambda f, _: f.log_predicted, "log predicted probabilities", modes, PLAIN),
-            Block("probability", lambda f, _: f.probabilities, "probabilities after the last action", modes, SHARE),
             Block(
-                "available", lambda _, m: m.available, "1 where a value was received", parts if len(parts) > 1 else (), SHARE
+                "predicted_probability",
+                lambda f, _: f.log_predicted,
+                "predicted probabilities",
+                modes,
+                KEPT_AS_LOG,
+            ),
+            Block(
+                "probability",
+                lambda f, _: f.probabilities,
+                "probabilities after the last action",
+                modes,
+                SHARE,
+            ),
+            Block(
+                "available",
+                lambda _, m: m.available,
+                "1 where a value was received",
+                parts if len(parts) > 1 else (),
+                SHARE,
             ),
             Block("last_action", lambda f, _: f.action, "action applied before", modes, ACTION),
         )
@@ -415,7 +440,12 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
     def act(self, state: Mixture, measurement: Measurement, action: Array) -> Mixture:
         """Weigh the hypotheses."""
         probabilities = bank_probabilities(
-            self.control, action, state.log_predicted, state.log_likelihood, self.parameters.evidence_scale, self.xp
+            self.control,
+            action,
+            state.log_predicted,
+            state.log_likelihood,
+            self.parameters.evidence_scale,
+            self.xp,
         )
         mean, covariance = imm.combine(state.means, state.covariances, probabilities)
         action = self.xp.clip(action, -1.0, 1.0)
@@ -436,7 +466,8 @@ def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
     banks: dict[str, Any] = {"noise": NoiseBank, "gain": GainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",
-        "gain": "`gain_factor` to its power: factors on the Kalman gain of each component; **0 is the filter as written**",
+        "gain": "`gain_factor` to its power: factors on the Kalman gain of each component; "
+        "**0 is the filter as written**",
     }
     if count > 1:
         banks = {"evidence": HypothesisBank, **banks}

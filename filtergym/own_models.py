@@ -1,5 +1,6 @@
 """An environment from a state-space model in a few lines."""
 
+import dataclasses
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ from . import register_task
 from .baselines.state_space import state_space_baselines
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
+from .envs.catalogue import nearest
 from .envs.model import Model
 from .envs.state_space import (
     StateSpace,
@@ -61,7 +63,7 @@ def state_space(
         covariance: of the initial state, ``(n, n)``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``.
-        weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, so that the cost is the mean squared error.
+        weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
         filter_model: what the filters believe in place of f, h, Q or R.
         hypotheses: further models between which the world switches, each by what differs from the first: f, h, Q, R.
             Filters then are interacting multiple models of all of them.
@@ -74,9 +76,13 @@ def state_space(
         The class of the task.
 
     Raises:
-        ValueError: for arrays that do not fit each other, functions that cannot be traced or do not answer with m finite
+        ValueError: for arrays that do not fit each other, functions that cannot be traced or do not answer with enough
             numbers, and whatever :func:`filtergym.register_task` refuses.
     """
+    allowed = [field.name for field in dataclasses.fields(StateSpaceParameters)]
+    for parameter in parameters:
+        if parameter not in allowed:
+            raise nearest("argument of state_space", parameter, allowed)
     mean = _array("mean", mean, (None,))
     n = len(mean)
     first = {"f": f, "h": h, "Q": Q, "R": R}
@@ -106,12 +112,13 @@ def state_space(
     module = sys._getframe(1).f_globals.get("__name__", "__main__")
     attributes = state_space_attributes(definition, names, units, dict(parameters))
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
-    cls = type(name, (StateSpace,), attributes)
+    cls: Any = type(name, (StateSpace,), attributes)
     cls.reward_unit = _typical_cost(cls, StateSpaceParameters(**parameters))
     register_task(cls, state_space_baselines(cls))
     if module in sys.modules:
         setattr(sys.modules[module], name, cls)
-    return cls
+    made: type[StateSpace] = cls
+    return made
 
 
 def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
@@ -124,9 +131,7 @@ def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
 
 def _array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
     array = numpy.asarray(values, dtype=float)
-    fits = array.ndim == len(shape) and all(
-        a in (None, b) for a, b in zip(shape, array.shape, strict=True)
-    )
+    fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if not fits or not numpy.isfinite(array).all() or not array.size:
         words = ", ".join("n" if size is None else str(size) for size in shape)
         raise ValueError(f"{what} must be finite numbers of shape ({words}), got the shape {array.shape}")
@@ -178,7 +183,9 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
         transition = [[1.0]] if count == 1 else transition
     matrix = _array("transition", transition, (count, count))
     if (matrix < 0.0).any() or (numpy.abs(matrix.sum(axis=1) - 1.0) > 1e-9).any():
-        raise ValueError(f"transition must hold probabilities, each row with the sum 1, got {matrix.tolist()}")
+        raise ValueError(
+            f"transition must hold probabilities, each row with the sum 1, got {matrix.tolist()}"
+        )
     return tuple(map(tuple, matrix.tolist()))
 
 

@@ -3,9 +3,9 @@ r"""Kalman's update with an innovation and a gain that are given: extended, unsc
     S = H P H^T + R,  K = P H^T S^-1,  x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T       (Joseph form)
 
 with the innovation ``nu = z - h(x')`` and the Jacobian H of h at x'; Bar-Shalom, Li and Kirubarajan, Estimation with
-Applications to Tracking and Navigation (2001), sections 5.2 and 10.3. Joseph's form holds for every gain. Entries that
-were not received take no part: their rows of H and of the innovation become zero, and their noise is of variance one and
-independent of all others.
+Applications to Tracking and Navigation (2001), sections 5.2 and 10.3. Joseph's form holds for every gain. Entries
+that were not received take no part: their rows of H and of the innovation become zero, and their noise is of variance
+one and independent of all others.
 
 Arrays have the batch last; a matrix shared by the whole batch is ``(n, n)``.
 """
@@ -15,8 +15,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from .array_namespace import Array, namespace
-from .kalman import Update
 from .gaussian import log_density
+from .kalman import Update
 from .ordered_sums import ordered_sum
 from .small_matrices import apply, mirror_lower, product, solve_definite, transpose
 from .unscented import GAUSSIAN, Spread, transform
@@ -45,9 +45,7 @@ def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Re
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
     """
     H, R = (part[..., None] if part.ndim == 2 else part for part in (H, R))
-    return Received(
-        available * innovation, available[:, None] * H, _independent(R, available), available
-    )
+    return Received(available * innovation, available[:, None] * H, _independent(R, available), available)
 
 
 def _independent(S: Array, available: Array) -> Array:
@@ -122,5 +120,8 @@ def unscented_update(
     K = transpose(solve_definite(S, cross))
     density, nis = log_density(nu, S)
     return Update(
-        mean + apply(K, nu), mirror_lower(covariance - product(K, cross)), density + _of_missing(available), nis
+        mean + apply(K, nu),
+        mirror_lower(covariance - product(K, cross)),
+        density + _of_missing(available),
+        nis,
     )
