@@ -584,6 +584,8 @@ def main() -> None:
         text = page_with_tables(options.page.read_text(encoding="utf-8"))
         options.page.write_text(text, encoding="utf-8")
         return
+    # Agents name the module in which their training has found the environment.
+    sys.modules[MODULE] = sys.modules["__main__"]
     options.runs.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     figures: dict[str, Any] = {}
