@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .evaluation.competitors import FunctionPolicy, Likelihood
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
+    from .own_models import state_space
 
 __version__ = "0.1.0"
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "record",
     "register",
     "register_task",
+    "state_space",
     "tidy_records",
 ]
 MODULES = {
@@ -45,6 +47,7 @@ MODULES = {
     "evaluation.competitors": ("FunctionPolicy", "Likelihood"),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),
+    "own_models": ("state_space",),
 }
 """Where names of this package come from, when they are first used."""
 

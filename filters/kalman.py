@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from .array_namespace import Array, namespace
 from .gaussian import log_density
-from .small_matrices import apply, cholesky, product, solve_lower, transpose
+from .small_matrices import apply, product, solve_definite, transpose
 
 
 class Update(NamedTuple):
@@ -67,7 +67,7 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
     innovation = z - apply(H, mean)
     HP = product(H, covariance)
     S = product(HP, transpose(H)) + R
-    K = transpose(_solve(S, HP))
+    K = transpose(solve_definite(S, HP))
     n = mean.shape[0]
     identity = xp.eye(n, dtype=mean.dtype, device=mean.device)[..., None]
     rest = identity - product(K, H)
@@ -76,21 +76,6 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
     joseph = 0.5 * (joseph + transpose(joseph))
     log_likelihood, squared_distance = log_density(innovation, S)
     return Update(mean + apply(K, innovation), joseph, log_likelihood, squared_distance)
-
-
-def _solve(S: Array, B: Array) -> Array:
-    """Solve ``S X = B`` for symmetric positive definite ``S``, both with the batch last."""
-    xp = namespace(B)
-    L = cholesky(S)
-    y = solve_lower(L, B)
-    m = len(L)
-    x: list[Array] = [None] * m
-    for i in reversed(range(m)):
-        entry = y[i]
-        for j in range(i + 1, m):
-            entry = entry - L[j][i] * x[j]
-        x[i] = entry / L[i][i]
-    return xp.stack(x, axis=0)
 
 
 def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list[float]], list[list[float]]]:

@@ -87,3 +87,17 @@ def solve_lower(L: list[list[Array]], b: Array) -> list[Array]:
             entry = entry - row[j] * y[j]
         y.append(entry / row[i])
     return y
+
+
+def solve_definite(A: Array, B: Array) -> Array:
+    """Solve ``A X = B`` for symmetric positive definite ``A``, ``(n, n, ...)``, and ``B`` of shape ``(n, m, ...)``."""
+    L = cholesky(A)
+    y = solve_lower(L, B)
+    n = len(L)
+    x: list[Array] = [None] * n
+    for i in reversed(range(n)):
+        entry = y[i]
+        for j in range(i + 1, n):
+            entry = entry - L[j][i] * x[j]
+        x[i] = entry / L[i][i]
+    return namespace(B).stack(x, axis=0)

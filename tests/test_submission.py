@@ -9,7 +9,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-import commands
+from board import board_markdown, read_entries
 import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED

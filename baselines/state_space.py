@@ -1,0 +1,226 @@
+"""What a task of state-space models is compared with: the filter as written, other filters of the same model, and the
+filter that is told the true model.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..envs.filter import Initial
+from ..envs.model import Model
+from ..envs.observation import Array
+from ..envs.state_space import Equations, Measurement, StateSpace, Truth
+from ..envs.state_space_banks import HypothesisBank, Mixture
+from ..evaluation.competitors import ConstantPolicy, Likelihood, Policy, RandomPolicy
+from ..filters import kalman, unscented
+from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain
+from ..filters.ordered_sums import ordered_sum
+from .table import Baselines, tunable
+
+UNCERTAIN = 1e-9
+"""Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
+
+
+class Kalman(ConstantPolicy):
+    """The Kalman filter as written, extended where the model is not linear."""
+
+    control = "noise"
+    action = (0.0, 0.0)
+
+
+class CovarianceMatching(Policy):
+    """Process noise raised while the normalised innovation squared is above its mean, lowered while it is below."""
+
+    control = "noise"
+    traceable = True
+    step = 0.02
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.nis, self.last, self.available = (model.reader(n) for n in ("nis", "last_action", "available"))
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Take a step from the last action."""
+        degrees = numpy.sum(self.available(observation), axis=1)
+        excess = numpy.minimum(self.nis(observation)[:, 0], 5.0 * degrees) - degrees
+        process = numpy.clip(self.last(observation)[:, 0] + self.step * excess, -1.0, 1.0)
+        return numpy.stack([process, 0.0 * process], axis=1), None
+
+
+class InteractingMultipleModel(ConstantPolicy):
+    """The interacting multiple model of the hypotheses."""
+
+    control = "evidence"
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.action = (0.0,) * len(model.task.modes)
+
+
+def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
+    """How well a measurement was predicted; NaN where nothing was received."""
+    degrees = ordered_sum(available)
+    there = degrees > 0.0
+    return Likelihood(
+        xp.where(there, result.log_likelihood, math.nan),
+        xp.where(there, result.squared_distance, math.nan),
+        degrees,
+    )
+
+
+def _numbers(measurement: Measurement, xp: Any) -> Array:
+    """Values with zero in place of what was not received."""
+    return xp.where(measurement.available > 0.0, measurement.values, 0.0)
+
+
+class Extended:
+    """The Kalman filter as written, extended where the model is not linear, as an estimator.
+
+    Args:
+        task: the problem.
+        process_noise: factor on Q.
+        measurement_noise: factor on R.
+    """
+
+    kind = "estimator"
+    traceable = True
+
+    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+        self.xp, self.equations = task.xp, task.believed[0]
+        self.Q = process_noise * self.equations.Q[:, :, None]
+        self.R = measurement_noise * self.equations.R[:, :, None]
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """Predict and update."""
+        mean, carried = self.equations.carry(*memory)
+        result = _update(self.equations, mean, carried + self.Q, self.R, measurement, self.xp)
+        after = Initial(result.mean, result.covariance)
+        return *after, after, _likelihood(result, measurement.available, self.xp)
+
+
+def _update(
+    equations: Equations, mean: Array, P: Array, R: Array, measurement: Measurement, xp: Any
+) -> kalman.Update:
+    nu = _numbers(measurement, xp) - equations.measure(mean)
+    received = keep_received(nu, equations.measurement_matrix(mean), R, measurement.available)
+    return update_with_gain(mean, P, received, kalman_gain(P, received))
+
+
+class Unscented(Extended):
+    """The unscented Kalman filter; arguments as of :class:`Extended`."""
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts, nowhere certain."""
+        return Initial(initial.mean, initial.covariance + UNCERTAIN * self.Q)
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """Predict and update by sigma points."""
+        mean, spread = unscented.transform(memory.mean, memory.covariance, self.equations.move)
+        z, h = _numbers(measurement, self.xp), self.equations.measure
+        result = unscented_update(mean, spread + self.Q, z, h, self.R, measurement.available)
+        after = Initial(result.mean, result.covariance)
+        return *after, after, _likelihood(result, measurement.available, self.xp)
+
+
+class InteractingKalman:
+    """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
+
+    kind = "estimator"
+    traceable = True
+
+    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+        self.xp, self.bank = task.xp, HypothesisBank(task, "evidence", process_noise, measurement_noise)
+
+    def start(self, initial: Initial, N: int) -> Mixture:
+        """Start where everyone starts."""
+        return self.bank.start(initial)
+
+    def update(self, measurement: Measurement, memory: Mixture) -> tuple[Array, Array, Mixture, Array]:
+        """Predict and update, without evidence."""
+        given = measurement._replace(values=_numbers(measurement, self.xp))
+        predicted = self.bank.predict(memory, given)
+        after = self.bank.act(predicted, given, 0.0 * predicted.action)
+        return after.mean, after.covariance, after, self.bank.records(after, given)["log_likelihood"]
+
+
+class KnownModel:
+    """The Kalman filter, extended where the model is not linear, that is told the true model: functions, Q and R of
+    this episode, and which hypothesis holds.
+    """
+
+    kind = "reference"
+    traceable = True
+    knows = "the true model at every measurement, with its Q and R"
+
+    def __init__(self, task: StateSpace) -> None:
+        self.task, self.xp = task, task.xp
+
+    def start(self, initial: Initial, truth: Truth) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: Initial
+    ) -> tuple[Array, Array, Initial, Likelihood]:
+        """Predict and update with the model in force."""
+        xp, chosen = self.xp, None
+        world: Any = self.task.world
+        for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
+            mean, carried = equations.carry(*memory)
+            P = carried + truth.process_noise * equations.Q[:, :, None]
+            R = truth.measurement_noise * equations.R[:, :, None]
+            result = _update(equations, mean, P, R, measurement, xp)
+            held = truth.hypothesis == float(j)
+            chosen = (
+                result
+                if chosen is None
+                else kalman.Update(*(xp.where(held, a, b) for a, b in zip(result, chosen, strict=True)))
+            )
+        assert chosen is not None
+        after = Initial(chosen.mean, chosen.covariance)
+        return *after, after, _likelihood(chosen, measurement.available, xp)
+
+
+class _Scales(NamedTuple):
+    """What is tuned: lower limit, value without tuning, upper limit."""
+
+    log10_process_noise: tuple[float, float, float] = (-4.0, 0.0, 4.0)
+    log10_measurement_noise: tuple[float, float, float] = (-2.0, 0.0, 2.0)
+
+
+def state_space_baselines(task: type[StateSpace]) -> Baselines:
+    """What a task is compared with.
+
+    Args:
+        task: its class.
+    """
+    several = len(task.definition.filters) > 1
+    linear = all(model.is_linear for model in task.definition.filters)
+    policies: dict[str, Any] = {
+        "kalman": Kalman,
+        "covariance-matching": CovarianceMatching,
+        "random": RandomPolicy,
+    }
+    estimators: dict[str, Any] = {"extended": Extended}
+    if not linear:
+        estimators["unscented"] = Unscented
+    if several:
+        policies = {"imm": InteractingMultipleModel, **policies}
+        estimators["kalman-imm"] = InteractingKalman
+    paper = next(iter(policies))
+    return Baselines(
+        environment=task.id,
+        policies=policies,
+        estimators=estimators,
+        references={"known-model": KnownModel},
+        score_paper=paper,
+        score_reference="known-model",
+        physical=("rmse", task.components[0].name),
+        tunable={name: tunable(make, **_Scales()._asdict()) for name, make in estimators.items()},
+        benchmark=(*policies, *estimators, "known-model"),
+    )

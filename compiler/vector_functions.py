@@ -1,0 +1,118 @@
+"""Functions of a vector with their exact Jacobians, for every kind of array.
+
+A function that somebody has written with NumPy is traced once, on a vector of symbols, and its Jacobian follows by
+reverse mode, one row for each entry of the answer (:mod:`.gradients`). Both are straight lines of arithmetic on one
+lane, which are then computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
+"""
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy
+
+from . import namespace
+from .gradients import pullback
+from .namespace import NotTraceable, Traced
+from .program import Graph, Program, Result, program
+
+_OPERATORS: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "negative": operator.neg,
+}
+"""Operations that take numbers of Python beside arrays."""
+_NAMES = {"absolute": "abs", "rint": "round"}
+"""What the array API standard calls otherwise."""
+
+
+class VectorFunction:
+    """A function from n numbers to m numbers, and its Jacobian.
+
+    Args:
+        function: takes an array ``(n,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
+        size: n.
+
+    Attributes:
+        size: m.
+        matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None.
+        offset: value at zero where that is so, ``(m,)``; else None.
+
+    Raises:
+        NotTraceable: if the function is no straight line of arithmetic.
+        ValueError: if the answer is no vector.
+    """
+
+    def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int) -> None:
+        graph = Graph()
+        with namespace.tracing(graph):
+            rows = [graph.input(0, row) for row in range(size)]
+            x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)
+            answer = namespace.asarray(function(x) if callable(function) else function @ x)
+            shape = answer.shape
+            gradients = [
+                pullback(graph, [answer[i]], [namespace.asarray(1.0)], [x])[0]
+                for i in range(len(answer) if len(shape) == 1 else 0)
+            ]
+        if len(shape) != 1:
+            raise ValueError(
+                f"must return a vector, such as a list of numbers, got an array of shape {shape}"
+            )
+        (self.size,) = shape
+        nodes = [node for gradient in gradients for node in gradient.nodes.tolist()]
+        self._value = _program(graph, answer.nodes.tolist())
+        self._jacobian = _program(graph, nodes)
+        known = [graph.values[node] for node in nodes]
+        self.matrix = self.offset = None
+        if None not in known:
+            self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
+            self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
+
+    def value(self, x: Any, xp: Any) -> Any:
+        """Value at vectors.
+
+        Args:
+            x: ``(n, N)``.
+            xp: array namespace of x.
+
+        Returns:
+            ``(m, N)``.
+        """
+        return xp.stack(_compute(self._value, x, xp))
+
+    def jacobian(self, x: Any, xp: Any) -> Any:
+        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of x; arguments as of :meth:`value`."""
+        entries, n = _compute(self._jacobian, x, xp), len(x)
+        return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
+
+
+def _program(graph: Graph, nodes: Sequence[int]) -> Program:
+    return program(graph, [Result(1, row, node) for row, node in enumerate(nodes)])
+
+
+def _compute(program: Program, x: Any, xp: Any) -> list[Any]:
+    """Results of a program on lanes ``(n, N)``, each ``(N,)``."""
+    values: list[Any] = []
+
+    def array(place: int) -> Any:
+        value = values[place]
+        return value if hasattr(value, "shape") else xp.full_like(x[0], value)
+
+    for name, arguments, logical in program.steps:
+        if name == "input":
+            value: Any = x[arguments[1]]
+        elif name == "constant":
+            value = float(program.constants[arguments[0]])
+            value = xp.full_like(x[0], value) != 0.0 if logical else value
+        elif name in _OPERATORS:
+            value = _OPERATORS[name](*(values[place] for place in arguments))
+        elif name == "number":
+            value = xp.astype(values[arguments[0]], xp.float64)
+        elif hasattr(xp, _NAMES.get(name, name)):
+            value = getattr(xp, _NAMES.get(name, name))(*(array(place) for place in arguments))
+        else:
+            raise NotTraceable(f"{name} has no counterpart in {xp.__name__}")
+        values.append(value)
+    return [array(result.node) for result in program.results]

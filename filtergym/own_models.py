@@ -1,0 +1,213 @@
+"""An environment from a state-space model in a few lines."""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy
+
+from . import register_task
+from .baselines.state_space import state_space_baselines
+from .compiler.namespace import NotTraceable
+from .compiler.vector_functions import VectorFunction
+from .envs.catalogue import nearest
+from .envs.model import Model
+from .envs.state_space import (
+    StateSpace,
+    StateSpaceDefinition,
+    StateSpaceModel,
+    StateSpaceParameters,
+    state_space_attributes,
+)
+from .evaluation.seeds import episode_seeds
+
+Function = Callable[[Any], Any] | Sequence[Sequence[float]] | numpy.ndarray
+"""A function of the state ``(n,)`` that returns a list of numbers, or a matrix."""
+EQUATIONS = ("f", "h", "Q", "R")
+TRIED = 32, 64
+"""Episodes and measurements from which the unit of the reward is estimated."""
+
+
+def state_space(
+    id: str,
+    *,
+    f: Function,
+    h: Function,
+    Q: Any,
+    R: Any,
+    mean: Any,
+    covariance: Any,
+    names: Sequence[str] = (),
+    units: Sequence[str] = (),
+    weights: Any = None,
+    filter_model: Mapping[str, Any] | None = None,
+    hypotheses: Sequence[Mapping[str, Any]] = (),
+    transition: Any = None,
+    switching: bool = True,
+    **parameters: Any,
+) -> type[StateSpace]:
+    """Make an environment of a state-space model and register it: ``x = f(x) + w``, ``z = h(x) + v``.
+
+    Call it where your module is imported, as :func:`filtergym.register_task`. The class is also kept in your module, by
+    the name in its id, where other processes look for it.
+
+    Args:
+        id: with your name and a version, such as ``"mine/Tracker-v0"``.
+        f: the state at the next measurement, from the state ``(n,)`` to a list of n numbers, written with NumPy's
+            functions and without branches on numbers; or a matrix ``(n, n)``.
+        h: likewise what is measured, m numbers; or a matrix ``(m, n)``.
+        Q: covariance of the process noise, ``(n, n)``.
+        R: covariance of the measurement noise, ``(m, m)``, positive definite.
+        mean: of the initial state, ``(n,)``.
+        covariance: of the initial state, ``(n, n)``.
+        names: of the components; default: ``x1``, ``x2`` and so on.
+        units: of the components; default: ``1``.
+        weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
+        filter_model: what the filters believe in place of f, h, Q or R.
+        hypotheses: further models between which the world switches, each by what differs from the first: f, h, Q, R.
+            Filters then are interacting multiple models of all of them.
+        transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
+        switching: whether the world switches; otherwise only the filters take it for possible.
+        **parameters: of :class:`filtergym.envs.state_space.StateSpaceParameters` in the training distribution, such as
+            ``horizon`` and ``process_noise``.
+
+    Returns:
+        The class of the task.
+
+    Raises:
+        ValueError: for arrays that do not fit each other, functions that cannot be traced or do not answer with enough
+            numbers, and whatever :func:`filtergym.register_task` refuses.
+    """
+    allowed = [field.name for field in dataclasses.fields(StateSpaceParameters)]
+    for parameter in parameters:
+        if parameter not in allowed:
+            raise nearest("argument of state_space", parameter, allowed)
+    mean = _array("mean", mean, (None,))
+    n = len(mean)
+    first = {"f": f, "h": h, "Q": Q, "R": R}
+    given = [first, *({**first, **_known("hypotheses", one)} for one in hypotheses)]
+    world = tuple(_model(one, n) for one in given)
+    mistaken = _known("filter_model", filter_model or {})
+    filters = tuple(_model({**one, **mistaken}, n) for one in given) if mistaken else world
+    if len({model.h.size for model in (*world, *filters)}) > 1:
+        raise ValueError("all models must measure as many numbers")
+    count = len(world)
+    definition = StateSpaceDefinition(
+        world,
+        filters,
+        _chain(transition, count),
+        bool(switching),
+        mean,
+        _covariance("covariance", covariance, n),
+        numpy.full(n, 1.0 / n) if weights is None else _array("weights", weights, (n,)),
+    )
+    if not (definition.weights >= 0.0).all() or not definition.weights.any():
+        raise ValueError(f"weights must not be negative, nor all zero, got {definition.weights.tolist()}")
+    names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
+    units = tuple(units) or ("1",) * n
+    if len(names) != n or len(units) != n:
+        raise ValueError(f"names and units must be {n} each, got {names!r} and {units!r}")
+    name = id.rpartition("/")[2].rpartition("-")[0] or id
+    module = sys._getframe(1).f_globals.get("__name__", "__main__")
+    attributes = state_space_attributes(definition, names, units, dict(parameters))
+    attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
+    cls: Any = type(name, (StateSpace,), attributes)
+    cls.reward_unit = _typical_cost(cls, StateSpaceParameters(**parameters))
+    register_task(cls, state_space_baselines(cls))
+    if module in sys.modules:
+        setattr(sys.modules[module], name, cls)
+    made: type[StateSpace] = cls
+    return made
+
+
+def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a mapping, or raise ValueError for what is none of f, h, Q and R."""
+    unknown = [name for name in part if name not in EQUATIONS]
+    if unknown:
+        raise ValueError(f"{what} says f, h, Q or R, got {unknown[0]!r}")
+    return dict(part)
+
+
+def _array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
+    array = numpy.asarray(values, dtype=float)
+    fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+    if not fits or not numpy.isfinite(array).all() or not array.size:
+        words = ", ".join("n" if size is None else str(size) for size in shape)
+        raise ValueError(f"{what} must be finite numbers of shape ({words}), got the shape {array.shape}")
+    return array
+
+
+def _covariance(what: str, values: Any, size: int, definite: bool = False) -> numpy.ndarray:
+    matrix = _array(what, values, (size, size))
+    scale = float(numpy.abs(matrix).max())
+    smallest = float(numpy.linalg.eigvalsh(matrix).min())
+    symmetric = bool((numpy.abs(matrix - matrix.T) <= 1e-12 * scale).all())
+    if not symmetric or smallest < -1e-12 * scale or (definite and smallest <= 0.0):
+        kind = "positive definite" if definite else "without negative eigenvalues"
+        raise ValueError(f"{what} must be symmetric and {kind}, got {matrix.tolist()}")
+    return 0.5 * (matrix + matrix.T)
+
+
+def _function(what: str, function: Function, size: int, answers: int | None) -> VectorFunction:
+    if not callable(function):
+        function = _array(what, function, (answers, size))
+    try:
+        made = VectorFunction(function, size)
+    except NotTraceable as error:
+        raise ValueError(
+            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and let "
+            "numpy.where choose where something depends on numbers"
+        ) from error
+    except ValueError as error:
+        raise ValueError(f"{what} {error}") from error
+    if answers not in (None, made.size):
+        raise ValueError(f"{what} must return {answers} numbers, got {made.size}")
+    return made
+
+
+def _model(given: Mapping[str, Any], size: int) -> StateSpaceModel:
+    h = _function("h", given["h"], size, None)
+    return StateSpaceModel(
+        _function("f", given["f"], size, size),
+        h,
+        _covariance("Q", given["Q"], size),
+        _covariance("R", given["R"], h.size, definite=True),
+    )
+
+
+def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
+    if transition is None:
+        away = 0.05 / max(count - 1, 1)
+        transition = [[0.95 if i == j else away for j in range(count)] for i in range(count)]
+        transition = [[1.0]] if count == 1 else transition
+    matrix = _array("transition", transition, (count, count))
+    if (matrix < 0.0).any() or (numpy.abs(matrix.sum(axis=1) - 1.0) > 1e-9).any():
+        raise ValueError(
+            f"transition must hold probabilities, each row with the sum 1, got {matrix.tolist()}"
+        )
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
+    """Median over some episodes of what the filter as written is charged, to two digits; 1 where that is no unit."""
+    episodes, measurements = TRIED
+    model: Any = Model(cls(parameters), cls.paper_policy.control)
+    generator = numpy.random.default_rng(episode_seeds("train", 0, 1))
+    noise = model.task.noise
+    action = numpy.zeros((*model.action_space.shape, episodes))
+    with numpy.errstate(all="ignore"):
+        episode = model.begin(
+            generator.random((noise.uniforms, episodes)),
+            generator.standard_normal((noise.initial_normals, episodes)),
+        )
+        total: Any = 0.0
+        for _ in range(min(measurements, parameters.horizon)):
+            row = [
+                generator.standard_normal((noise.normals, episodes)),
+                generator.random((noise.row_uniforms, episodes)),
+            ]
+            episode = model.act(model.measure(episode, numpy.concatenate(row)), action)
+            total = total + model.cost(episode)
+        cost = float(numpy.median(total)) / min(measurements, parameters.horizon)
+    return float(f"{cost:.1e}") if numpy.isfinite(cost) and cost > 0.0 else 1.0

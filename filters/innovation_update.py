@@ -1,0 +1,127 @@
+r"""Kalman's update with an innovation and a gain that are given: extended, unscented and learned filters.
+
+    S = H P H^T + R,  K = P H^T S^-1,  x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T       (Joseph form)
+
+with the innovation ``nu = z - h(x')`` and the Jacobian H of h at x'; Bar-Shalom, Li and Kirubarajan, Estimation with
+Applications to Tracking and Navigation (2001), sections 5.2 and 10.3. Joseph's form holds for every gain. Entries
+that were not received take no part: their rows of H and of the innovation become zero, and their noise is of variance
+one and independent of all others.
+
+Arrays have the batch last; a matrix shared by the whole batch is ``(n, n)``.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from .array_namespace import Array, namespace
+from .gaussian import log_density
+from .kalman import Update
+from .ordered_sums import ordered_sum
+from .small_matrices import apply, mirror_lower, product, solve_definite, transpose
+from .unscented import GAUSSIAN, Spread, transform
+
+
+class Received(NamedTuple):
+    """What was received of a measurement."""
+
+    innovation: Array
+    """``(m, N)``, zero where nothing was."""
+    H: Array
+    """``(m, n, N)``, likewise."""
+    R: Array
+    """``(m, m, N)``, of the identity where nothing was."""
+    available: Array
+    """1 where there is a reading and 0 where there is none, ``(m, N)``."""
+
+
+def keep_received(innovation: Array, H: Array, R: Array, available: Array) -> Received:
+    """Take what was not received out of an update.
+
+    Args:
+        innovation: ``(m, N)``, finite.
+        H: ``(m, n)`` or ``(m, n, N)``.
+        R: ``(m, m)`` or ``(m, m, N)``.
+        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
+    """
+    H, R = (part[..., None] if part.ndim == 2 else part for part in (H, R))
+    return Received(available * innovation, available[:, None] * H, _independent(R, available), available)
+
+
+def _independent(S: Array, available: Array) -> Array:
+    """Covariance of ``(m, m, N)`` with rows and columns of the identity where nothing was received."""
+    xp = namespace(available)
+    m = available.shape[0]
+    identity = xp.eye(m, dtype=available.dtype, device=available.device)[..., None]
+    return available[:, None] * available[None] * S + identity * (1.0 - available)
+
+
+def kalman_gain(covariance: Array, received: Received) -> Array:
+    """Gain that is optimal for a predicted covariance ``(n, n, N)``, ``(n, m, N)``."""
+    HP = product(received.H, covariance)
+    return transpose(solve_definite(product(HP, transpose(received.H)) + received.R, HP))
+
+
+def update_with_gain(mean: Array, covariance: Array, received: Received, K: Array) -> Update:
+    """Measurement update with any gain.
+
+    Args:
+        mean: predicted, ``(n, N)``.
+        covariance: predicted, ``(n, n, N)``.
+        received: innovation with its model.
+        K: gain, ``(n, m, N)``.
+
+    Returns:
+        The update, with the likelihood of what was received under the prediction.
+    """
+    xp = namespace(mean)
+    nu, H, R, available = received
+    identity = xp.eye(mean.shape[0], dtype=mean.dtype, device=mean.device)[..., None]
+    rest = identity - product(K, H)
+    joseph = product(product(rest, covariance), transpose(rest)) + product(product(K, R), transpose(K))
+    joseph = 0.5 * (joseph + transpose(joseph))
+    density, nis = log_density(nu, product(product(H, covariance), transpose(H)) + R)
+    return Update(mean + apply(K, nu), joseph, density + _of_missing(available), nis)
+
+
+def _of_missing(available: Array) -> Array:
+    """Takes out of a log-density what entries that were not received have added to it, ``(N,)``."""
+    return 0.5 * math.log(2.0 * math.pi) * ordered_sum(1.0 - available)
+
+
+def unscented_update(
+    mean: Array,
+    covariance: Array,
+    z: Array,
+    h: Callable[[Array], Array],
+    R: Array,
+    available: Array,
+    spread: Spread = GAUSSIAN,
+) -> Update:
+    """Measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
+    Proceedings of the IEEE 92 (2004), 401-422.
+
+    Args:
+        mean: predicted, ``(n, N)``.
+        covariance: predicted, ``(n, n, N)``, positive definite.
+        z: measurement, ``(m, N)``, finite also where it was not received.
+        h: from points ``(n, 2n + 1, N)`` to measurements ``(m, 2n + 1, N)``.
+        R: ``(m, m)`` or ``(m, m, N)``.
+        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
+        spread: parameters of the transform.
+    """
+    xp = namespace(mean)
+    n = mean.shape[0]
+    R = R[..., None] if R.ndim == 2 else R
+    joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
+    nu = available * (z - joint[n:])
+    S = _independent(spread_out[n:, n:] + R, available)
+    cross = available[:, None] * spread_out[n:, :n]
+    K = transpose(solve_definite(S, cross))
+    density, nis = log_density(nu, S)
+    return Update(
+        mean + apply(K, nu),
+        mirror_lower(covariance - product(K, cross)),
+        density + _of_missing(available),
+        nis,
+    )

@@ -1,0 +1,122 @@
+"""The problems of benchmarks/public_problems.py: their equations, the reading of stored sets, and the page."""
+
+import importlib.util
+import json
+import math
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import scipy
+from filtergym.baselines import catalogue as baselines
+from filtergym.envs import registration
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def problems():
+    """The module with its environments; forgotten afterwards."""
+    known = set(registration.USER_TASKS)
+    spec = importlib.util.spec_from_file_location(
+        "benchmarks_public_problems", ROOT / "benchmarks" / "public_problems.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    sys.modules.pop(spec.name)
+    for id in set(registration.USER_TASKS) - known:
+        for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
+            table.pop(id, None)
+
+
+def test_the_page_shows_the_records(problems):
+    """If not: ``python benchmarks/public_problems.py --page docs/public_problems.md``."""
+    page = (ROOT / "docs" / "public_problems.md").read_text(encoding="utf-8")
+    assert problems.page_with_tables(page) == page
+
+
+def test_records_hold_the_tables_of_their_figures(problems):
+    for name, table in ((problems.PROBLEMS, problems.problem_table), (problems.DRIVES, problems.drive_table)):
+        data = json.loads((problems.RECORDS / f"{name}.json").read_text(encoding="utf-8"))["data"]
+        assert table(data.pop("figures")) == data
+
+
+def test_equations_of_the_attractor(problems):
+    """Against SciPy's integration, and the matrix series as KalmanNet writes it."""
+    x = np.array([3.0, -4.0, 20.0])
+
+    def slope(_, y):
+        return [10.0 * (y[1] - y[0]), y[0] * (28.0 - y[2]) - y[1], y[0] * y[1] - 8.0 / 3.0 * y[2]]
+
+    solved = scipy.integrate.solve_ivp(slope, (0.0, 0.02), x, rtol=1e-11, atol=1e-11).y[:, -1]
+    # Of fourth order: half the step is a 16th of the error.
+    coarse, fine = (np.abs(np.array(problems.flow(x, steps)) - solved).max() for steps in (2, 4))
+    assert coarse / 24.0 < fine < coarse / 10.0
+    A = np.array([[-10.0, 10.0, 0.0], [28.0, -1.0, -x[0]], [0.0, x[0], -8.0 / 3.0]])
+    frozen = np.array([[-10.0, 10.0, 0.0], [28.0 - x[2], -1.0, 0.0], [x[1], 0.0, -8.0 / 3.0]])
+    np.testing.assert_allclose(A @ x, frozen @ x)  # both give the derivative; KalmanNet's is the second
+    for order in (2, 5):
+        series = sum(np.linalg.matrix_power(0.02 * frozen, j) / math.factorial(j) for j in range(order + 1))
+        np.testing.assert_allclose(problems.taylor(x, order), series @ x, rtol=1e-13)
+
+
+def test_a_stored_linear_set_is_judged_as_a_naive_filter_judges_it(problems, tmp_path, capsys):
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(0)
+    target = np.zeros((6, 2, 20))
+    x = np.zeros((6, 2))
+    for k in range(20):
+        x = x @ problems.F.T + 0.1 * rng.standard_normal((6, 2))
+        target[:, :, k] = x
+    z = (target + rng.standard_normal(target.shape)).astype(np.float32)
+    file = tmp_path / "Simulations" / "Linear_canonical" / "data" / "2x2_rq020_T100.pt"
+    file.parent.mkdir(parents=True)
+    nothing = torch.zeros(1)
+    torch.save(
+        [nothing] * 4 + [torch.tensor(z), torch.tensor(target.astype(np.float32))] + [nothing] * 3, file
+    )
+    squares = []
+    for i in range(6):
+        mean, P = np.zeros(2), np.zeros((2, 2))
+        for k in range(20):
+            mean, P = problems.F @ mean, problems.F @ P @ problems.F.T + 0.01 * np.eye(2)
+            K = P @ np.linalg.inv(P + np.eye(2))
+            mean, P = mean + K @ (z[i, :, k] - mean), P - K @ P
+            squares.append((mean - target[i, :, k].astype(np.float32)) ** 2)
+    recording = problems.stored_linear(tmp_path, problems.Linear.id)
+    [row] = problems.judge("linear", problems.Linear.id, {"extended": "extended"}, recording, timed=False)
+    assert row.mse_db == pytest.approx(10.0 * math.log10(np.mean(squares)), abs=1e-4)  # rounded
+    assert row.low_db < row.mse_db < row.high_db
+
+
+def test_stored_drives_are_read(problems, tmp_path):
+    torch = pytest.importorskip("torch")
+    file = tmp_path / "data" / "nclt_fusion" / "test.pt"
+    file.parent.mkdir(parents=True)
+    rows = 4
+    gps = torch.tensor([[1.0, 2.0], [math.nan, math.nan], [3.0, 4.0], [5.0, 6.0]], dtype=torch.float64)
+    wheel = torch.arange(16, dtype=torch.float64).reshape(4, 4)
+    drive = {
+        "filtered_gps": gps,
+        "gps": torch.nan_to_num(gps, nan=1.0),
+        "wheel": wheel,
+        "ground_truth": torch.zeros(rows, 2, dtype=torch.float64),
+        "initial_state": torch.tensor([7.0, 8.0, 0.0, 0.0, 0.5, 0.0], dtype=torch.float64),
+        "data_date": "today",
+    }
+    torch.save([drive], file)
+    recording, held = problems.stored_drives(tmp_path, "test")
+    assert held["today"] == pytest.approx(math.sqrt((1 + 4 + 1 + 1 + 9 + 16 + 25 + 36) / 8.0))
+    values, available = (recording.measurements[name][0] for name in ("values", "available"))
+    np.testing.assert_array_equal(available[:, 0], [1.0, 0.0, 1.0, 1.0])
+    np.testing.assert_array_equal(
+        values[:, 2], [4.5, 8.5, 12.5, 12.5]
+    )  # of the next row; the last one's is its own
+    np.testing.assert_allclose(values[:, 3], np.cos([6.0, 10.0, 14.0, 14.0]))
+    np.testing.assert_array_equal(values[:, 5], [7.0, 11.0, 15.0, 15.0])
+    np.testing.assert_array_equal(recording.initial["mean"][0], [7.0, 8.0, 0.0, 0.5, 0.0, 0.0])
+    recording.scenario(problems.Drives, {})

@@ -1,0 +1,436 @@
+"""Environments made of a state-space model, against naive loops and known solutions."""
+
+import functools
+import importlib.util
+import math
+import pickle
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import scipy
+from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.problem import import_problem
+from filtergym.compiler import namespace as traced_namespace
+from filtergym.compiler.functions import Function
+from filtergym.compiler.program import Graph
+from filtergym.compiler.vector_functions import VectorFunction
+from filtergym.envs import registration
+from filtergym.envs.backend import make_model
+from filtergym.envs.catalogue import task_class
+from filtergym.envs.state_space import Measurement
+from gymnasium.utils.env_checker import check_env
+
+import filtergym
+from filtergym.exports.c_source import export_c
+from filtergym.exports.request import request_export
+
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+BLOCKS = re.findall(
+    r"```(python|sh)\n(.*?)```", (EXAMPLES.parent / "state_space.md").read_text(encoding="utf-8"), re.S
+)
+F, H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+Q, R = np.array([[0.25, 0.5], [0.5, 1.0]]), np.array([[1.0]])
+PLAIN = {"f": F, "h": H, "Q": Q, "R": R, "mean": [0, 1], "covariance": np.eye(2)}
+
+
+@pytest.fixture
+def make():
+    """Make an environment with a name of this test's own; forgotten afterwards."""
+    made = []
+
+    def state_space(**keywords):
+        id = f"mine/Model{len(made)}-v0"
+        made.append(id)
+        return filtergym.state_space(id, **{**PLAIN, **keywords})
+
+    yield state_space
+    for id in made:
+        forget(id)
+
+
+@pytest.fixture
+def example(request, tmp_path_factory):
+    """One of the modules of the page; forgotten afterwards."""
+    name, id = request.param
+    file = EXAMPLES / f"{name}.py"
+    if name == "tracker":
+        file = tmp_path_factory.mktemp("page") / "tracker.py"
+        file.write_text(BLOCKS[0][1], encoding="utf-8")
+    spec = importlib.util.spec_from_file_location(name, file)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    yield id
+    sys.modules.pop(name)
+    forget(id)
+
+
+def forget(id):
+    for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
+        table.pop(id, None)
+
+
+def lorenz(x, order=5, T=0.02):
+    """KalmanNet's transition: the Taylor series of the matrix exponential, applied to the state."""
+    A = [[-10.0, 10.0, 0.0], [28.0 - x[2], -1.0, 0.0], [x[1], 0.0, -8.0 / 3.0]]
+    answer, term = list(x), list(x)
+    for j in range(1, order + 1):
+        term = [sum(A[i][k] * term[k] for k in range(3)) * (T / j) for i in range(3)]
+        answer = [a + b for a, b in zip(answer, term, strict=True)]
+    return answer
+
+
+def simulate(cls, steps, episodes, seed=0, backend="numpy", control=None, **keywords):
+    """Truths and measurements of some episodes and the final state of the bank's filter at every one."""
+    model = make_model(cls, control, backend=backend, **keywords)
+    rng = np.random.default_rng(seed)
+    noise = model.task.noise
+    episode = model.begin(
+        rng.random((noise.uniforms, episodes)), rng.standard_normal((noise.initial_normals, episodes))
+    )
+    start, kept = episode, []
+    action = np.zeros((*model.action_space.shape, episodes))
+    for _ in range(steps):
+        row = [rng.standard_normal((noise.normals, episodes)), rng.random((noise.row_uniforms, episodes))]
+        episode = model.act(model.measure(episode, np.concatenate(row)), action)
+        kept.append((episode.truth, episode.measurement, model.mean(episode), model.covariance(episode)))
+    return start, kept
+
+
+def begin(cls):
+    """The initial estimate of eight episodes."""
+    model = make_model(cls)
+    noise = model.task.noise
+    return model.begin(np.zeros((noise.uniforms, 8)), np.zeros((noise.initial_normals, 8))).measurement
+
+
+def naive_filter(mean, P, measurements, f, F_of, h, H_of, Q, R):
+    """Extended Kalman filter of one episode with NumPy's inverse."""
+    found = []
+    for z, there in measurements:
+        A = F_of(mean)
+        mean, P = np.asarray(f(mean), float), A @ P @ A.T + Q
+        C = H_of(mean)[there]
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(there, there)])
+        mean = mean + K @ (z - np.asarray(h(mean), float))[there]
+        P = (np.eye(len(mean)) - K @ C) @ P
+        found.append((mean, P))
+    return found
+
+
+def compare_with_naive(cls, steps, tolerance, f, F_of, h, H_of, Q, R, **keywords):
+    start, kept = simulate(cls, steps, 8, **keywords)
+    for lane in range(8):
+        z = [(m.values[:, lane], m.available[:, lane] > 0.0) for _, m, _, _ in kept]
+        mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
+        naive = naive_filter(mean, P, z, f, F_of, h, H_of, Q, R)
+        for (x, P), (_, _, mean, covariance) in zip(naive, kept, strict=True):
+            np.testing.assert_allclose(mean[:, lane], x, rtol=tolerance, atol=tolerance)
+            np.testing.assert_allclose(covariance[:, :, lane], P, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+@pytest.mark.parametrize("availability", [1.0, 0.7])
+def test_a_linear_model_gives_the_kalman_filter(make, backend, availability):
+    cls = make(h=np.eye(2), R=[[1.0, 0.3], [0.3, 2.0]])
+    functions = [lambda x: F @ x, lambda _: F, lambda x: x, lambda _: np.eye(2)]
+    given = {"backend": backend, "availability": availability}
+    compare_with_naive(cls, 40, 1e-10, *functions, Q, np.array([[1.0, 0.3], [0.3, 2.0]]), **given)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+def test_a_nonlinear_model_gives_the_extended_kalman_filter(make, backend):
+    T = 0.1
+
+    def f(x):
+        return [x[0] + T * x[1], x[1] - T * 9.81 * np.sin(x[0]) - T * x[1]]
+
+    cls = make(
+        f=f, h=lambda x: [np.sin(x[0])], Q=np.diag([1e-5, 1e-2]), R=[[0.01]], covariance=0.01 * np.eye(2)
+    )
+    compare_with_naive(
+        cls, 40, 1e-10, f, lambda x: np.array([[1.0, T], [-T * 9.81 * np.cos(x[0]), 1.0 - T]]),
+        lambda x: [np.sin(x[0])], lambda x: np.array([[np.cos(x[0]), 0.0]]), np.diag([1e-5, 1e-2]), np.array([[0.01]]),
+        backend=backend,
+    )  # fmt: skip
+
+
+def test_jacobians_are_those_of_the_formulas():
+    x = np.random.default_rng(0).standard_normal((3, 5))
+    order_two = VectorFunction(functools.partial(lorenz, order=1), 3)
+    expected = np.array(  # x + T A(x) x
+        [[0.8 + 0 * x[0], 0.2 + 0 * x[0], 0 * x[0]],
+         [0.02 * (28.0 - x[2]), 0.98 + 0 * x[0], -0.02 * x[0]],
+         [0.02 * x[1], 0.02 * x[0], 1.0 - 0.02 * 8.0 / 3.0 + 0 * x[0]]]
+    )  # fmt: skip
+    np.testing.assert_allclose(order_two.jacobian(x, np), expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(order_two.value(x, np), np.stack(lorenz(x, 1)), rtol=1e-13)
+    polar = VectorFunction(lambda x: np.stack([np.hypot(x[0], x[1]), np.arctan2(x[1], x[0])]), 2)
+    a, b = x[0], x[1]
+    r = np.hypot(a, b)
+    expected = np.array([[a / r, b / r], [-b / r**2, a / r**2]])
+    np.testing.assert_allclose(polar.jacobian(x[:2], np), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_a_function_is_the_same_on_every_kind_of_array(torch):
+    function = VectorFunction(
+        lambda x: [np.where(x[0] > 0.0, np.exp(-x[1]), np.maximum(x[1], 0.5)), np.abs(x[0]) ** 1.5, 2.0], 2
+    )
+    x = np.random.default_rng(1).standard_normal((2, 16))
+    value, jacobian = function.value(x, np), function.jacobian(x, np)
+    np.testing.assert_allclose(value[0], np.where(x[0] > 0.0, np.exp(-x[1]), np.maximum(x[1], 0.5)))
+    tensor = torch.asarray(x)
+    np.testing.assert_allclose(function.value(tensor, torch).numpy(), value, rtol=1e-14)
+    np.testing.assert_allclose(function.jacobian(tensor, torch).numpy(), jacobian, rtol=1e-14)
+    compiled = Function(
+        lambda x: (function.value(x, traced_namespace), function.jacobian(x, traced_namespace)), Graph()
+    )
+    for answer, expected in zip(compiled(x), (value, jacobian), strict=True):
+        np.testing.assert_allclose(answer, expected, rtol=1e-13)
+
+
+def test_the_jacobian_of_a_matrix_is_known_beforehand():
+    linear, shifted = VectorFunction(F, 2), VectorFunction(lambda x: [x[0] + 2.0 * x[1] - 3.0], 2)
+    np.testing.assert_array_equal(linear.matrix, F)
+    np.testing.assert_array_equal(shifted.matrix, [[1.0, 2.0]])
+    np.testing.assert_array_equal(shifted.offset, [-3.0])
+    assert VectorFunction(lambda x: [x[0] * x[1]], 2).matrix is None
+
+
+def test_the_hypotheses_are_mixed_as_in_the_golden_example(make):
+    """Two models that differ in Q; computed with 40 digits and with another library from the same numbers."""
+    cls = make(Q=np.zeros((2, 2)), hypotheses=[{"Q": Q}], transition=[[0.9, 0.1], [0.2, 0.8]])
+    bank = make_model(cls, "evidence", backend="numpy").filter
+    one = np.ones(8)
+    mean, P = np.array([[0.0, 0.5], [1.0, 1.5]]), np.stack([np.eye(2), 2.0 * np.eye(2)], axis=2)
+    start = bank.start(begin(cls))
+    state = start._replace(
+        means=mean[:, :, None] * one,
+        covariances=P[..., None] * one,
+        probabilities=np.array([[0.6], [0.4]]) * one,
+    )
+    states = []
+    for z in (1.5, 3.5, 6.5):
+        measurement = Measurement(z * one[None], one[None])
+        state = bank.act(bank.predict(state, measurement), measurement, np.zeros((2, 8)))
+        states.append(state)
+    first, last = states[0], states[2]
+    np.testing.assert_allclose(np.exp(first.log_likelihood[:, 0]), [0.2129119583, 0.175190966], rtol=1e-9)
+    np.testing.assert_allclose(first.probabilities[:, 0], [0.664753530759, 0.335246469241], rtol=1e-11)
+    np.testing.assert_allclose(first.mean[:, 0], [1.4494678454, 1.21624623534], rtol=1e-10)
+    expected = [[0.743637116228, 0.395626782245], [0.395626782245, 1.07317641199]]
+    np.testing.assert_allclose(first.covariance[..., 0], expected, rtol=1e-11)
+    np.testing.assert_allclose(last.probabilities[0, 0], 0.670469141704, rtol=1e-11)
+    np.testing.assert_allclose(last.mean[:, 0], [5.9803866254, 2.15776662366], rtol=1e-10)
+
+
+def test_the_covariance_ends_at_the_solution_of_riccatis_equation(make):
+    _, kept = simulate(make(), 200, 8)
+    predicted = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
+    K = predicted @ H.T / (H @ predicted @ H.T + R)
+    np.testing.assert_allclose(kept[-1][3][..., 0], (np.eye(2) - K @ H) @ predicted, rtol=1e-9)
+
+
+def test_errors_are_as_large_as_the_covariance_says(make):
+    """The sum of normalised squared errors of M episodes is chi-square with 2 M degrees of freedom."""
+    M = 4000
+    _, kept = simulate(make(covariance=[[1.0, 0.5], [0.5, 2.0]]), 20, M)
+    for truth, _, mean, P in (kept[0], kept[-1]):
+        error = mean - truth.state
+        nees = np.einsum("in,ijn,jn->n", error, np.moveaxis(np.linalg.inv(np.moveaxis(P, 2, 0)), 0, 2), error)
+        low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 2 * M)
+        assert low < nees.sum() < high
+
+
+def test_the_unscented_filter_is_the_extended_one_where_the_model_is_linear(make):
+    cls = make(f=lambda x: F @ x + 0.0 * np.sin(x[0]), h=lambda x: [x[0] + 1e-12 * x[1] ** 2])
+    dataset = filtergym.evaluate(cls.id, ["extended", "unscented"], episodes=16, horizon=30)
+    first, second = dataset.error.values
+    np.testing.assert_allclose(second, first, rtol=1e-6, atol=1e-6)
+
+
+def test_what_was_not_received_changes_nothing(make):
+    cls = make(h=np.eye(2), R=[[1.0, 0.3], [0.3, 2.0]])
+    bank = make_model(cls, "noise", backend="numpy").filter
+    start = bank.start(begin(cls))
+    one = np.ones(8)
+    nothing, first = (
+        Measurement(np.zeros((2, 8)), np.zeros((2, 8))),
+        Measurement(np.stack([3.0 * one, 0.0 * one]), np.stack([one, 0.0 * one])),
+    )
+    kept = bank.act(bank.predict(start, nothing), nothing, np.zeros((2, 8)))
+    np.testing.assert_allclose(kept.mean, F @ start.mean)
+    np.testing.assert_allclose(kept.covariance[..., 0], F @ F.T + Q)
+    assert np.isnan(bank.records(kept, nothing)["log_likelihood"]).all()
+    partly = bank.predict(start, first)
+    variance = (F @ F.T + Q)[0, 0] + 1.0
+    expected = -0.5 * (math.log(2.0 * math.pi * variance) + (3.0 - 1.0) ** 2 / variance)
+    np.testing.assert_allclose(bank.records(partly, first)["log_likelihood"], expected)
+
+
+@pytest.mark.parametrize("control", ["noise", "gain", "kalman-net"])
+def test_zero_is_the_filter_as_written_and_other_actions_are_not(make, control):
+    cls = make(h=np.eye(2), R=np.eye(2))
+    model = make_model(cls, control, backend="numpy")
+    _, zero = simulate(cls, 10, 8, control=control)
+    _, plain = simulate(cls, 10, 8)
+    np.testing.assert_allclose(zero[-1][2], plain[-1][2], rtol=1e-12)
+    np.testing.assert_allclose(zero[-1][3], plain[-1][3], rtol=1e-12)
+    start = model.begin(np.zeros((0, 8)), np.zeros((2, 8)))
+    episode = model.measure(start, np.ones((4, 8)))
+    for entry in range(model.action_space.shape[0]):
+        action = np.zeros((model.action_space.shape[0], 8))
+        action[entry] = 1.0
+        after, plain = (model.act(episode, a).filter for a in (action, 0.0 * action))
+        following = [
+            model.measure(episode._replace(filter=f), np.ones((4, 8))).filter for f in (after, plain)
+        ]
+        assert not np.allclose(*[np.concatenate([f.mean, f.covariance.reshape(4, 8)]) for f in following])
+
+
+def test_noise_scales_q_and_r(make):
+    cls, scaled = make(), make(Q=100.0 * Q, R=0.01 * R)
+    model, other = (make_model(c, "noise", backend="numpy") for c in (cls, scaled))
+    start = model.begin(np.zeros((0, 8)), np.zeros((2, 8)))
+    episode = model.measure(start, np.ones((3, 8)))
+    after = model.act(episode, np.stack([np.ones(8), -np.ones(8)]))
+    expected = other.act(episode, np.zeros((2, 8)))
+    np.testing.assert_allclose(model.covariance(after), other.covariance(expected), rtol=1e-12)
+    np.testing.assert_allclose(model.mean(after), other.mean(expected), rtol=1e-12)
+
+
+def test_a_filter_with_another_model_is_worse_than_one_that_is_told(make):
+    cls = make(
+        h=np.eye(2), R=np.eye(2), filter_model={"f": [[1.0, 0.9], [-0.1, 1.0]]}, process_noise=(0.1, 10.0)
+    )
+    dataset = filtergym.evaluate(cls.id, ["kalman", "known-model"], episodes=200)
+    episodes = dataset.cost.mean("time")
+    difference = (episodes.sel(policy="kalman") - episodes.sel(policy="known-model")).values
+    assert difference.mean() > 4.0 * difference.std() / math.sqrt(200)
+    anees = dataset.nees.sel(policy="known-model").mean().item() / 2.0
+    assert 0.9 < anees < 1.1
+
+
+def test_the_world_switches_as_the_chain_says(make):
+    cls = make(
+        hypotheses=[{"Q": 100.0 * Q}, {"f": np.eye(2)}],
+        transition=[[0.8, 0.2, 0.0], [0.0, 0.5, 0.5], [0.1, 0.0, 0.9]],
+    )
+    _, kept = simulate(cls, 400, 64)
+    path = np.stack([truth.hypothesis for truth, *_ in kept]).astype(int)
+    counts = np.zeros((3, 3))
+    np.add.at(counts, (path[:-1].ravel(), path[1:].ravel()), 1)
+    rows = counts.sum(axis=1, keepdims=True)
+    expected = np.array(cls.definition.transition)
+    deviation = np.sqrt(expected * (1.0 - expected) / rows)
+    assert (np.abs(counts / rows - expected) <= 5.0 * deviation).all()
+    _, still = simulate(make(hypotheses=[{"Q": 100.0 * Q}], switching=False), 30, 8)
+    assert not np.any([truth.hypothesis for truth, *_ in still])
+
+
+@pytest.mark.parametrize(
+    "example",
+    [("tracker", "mine/Tracker-v0"), ("mixed_motion", "mine/Target-v0")],
+    indirect=True,
+    ids=lambda pair: pair[0],
+)
+class TestExamples:
+    """What holds for every registered task holds for these."""
+
+    def test_environments(self, example):
+        cls = task_class(example)
+        for control in (*cls.controls, "kalman-net"):
+            env = gymnasium.make(example, control=control, horizon=6)
+            check_env(env.unwrapped, skip_render_check=True)
+            vector = gymnasium.make_vec(example, num_envs=3, control=control, horizon=6)
+            shown, _ = vector.reset(seed=4)
+            single, _ = env.reset(seed=6)
+            np.testing.assert_array_equal(shown[2], single)
+            copy = pickle.loads(pickle.dumps(env.unwrapped))
+            action = 0.1 * np.ones(env.action_space.shape, np.float32)
+            np.testing.assert_array_equal(copy.step(action)[0], env.step(action)[0])
+
+    def test_compiled_and_numpy_give_the_same(self, example):
+        names = [name for name in baselines.baselines_of(example).names if name != "random"]
+        first, second = (
+            filtergym.evaluate(example, names, episodes=16, horizon=30, backend=backend)
+            for backend in ("compiled", "numpy")
+        )
+        np.testing.assert_allclose(first.error.values, second.error.values, rtol=1e-7, atol=1e-7)
+        assert not first.lost.fillna(0.0).values.any()
+
+    def test_policies_and_estimators_of_one_filter_agree(self, example):
+        pairs = [("kalman", "extended")]
+        pairs += [("imm", "kalman-imm")] if "imm" in baselines.baselines_of(example).names else []
+        for names in pairs:
+            first, second = filtergym.evaluate(example, list(names), episodes=16, horizon=30).error.values
+            np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-9)
+
+    @pytest.mark.skipif(shutil.which("cc") is None, reason="no compiler")
+    def test_filters_are_exported(self, example, tmp_path):
+        problem = import_problem(example)
+        for name in (problem.paper, *problem.baselines.estimators):
+            figures = export_c(request_export(problem, name), tmp_path / name)
+            assert figures.difference < 1e-6
+            assert figures.test
+
+    def test_a_filter_runs_online(self, example):
+        filter = filtergym.online(example, "extended")
+        cls = task_class(example)
+        own = cls.definition
+        filter.start(mean=own.mean, covariance=own.covariance)
+        count = own.world[0].h.size
+        z = own.world[0].h.value(own.mean[:, None], np)[:, 0]
+        assert np.isfinite(filter.update(values=z).mean).all()
+        assert np.isfinite(filter.update(values=[np.nan] * count).mean).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"f": np.eye(3)}, "f must be finite numbers of shape"),
+        ({"f": lambda x: [x[0]]}, "f must return 2 numbers, got 1"),
+        ({"f": lambda x: [x[0] if x[0] > 0.0 else x[1], x[1]]}, "f cannot be traced"),
+        ({"f": lambda x: x[0]}, "f must return a vector"),
+        ({"h": lambda x: np.array([x[0], x[1]])}, "h cannot be traced"),
+        ({"Q": [[1.0, 0.0], [0.5, 1.0]]}, "Q must be symmetric"),
+        ({"Q": -np.eye(2)}, "Q must be symmetric and without negative eigenvalues"),
+        ({"R": [[0.0]]}, "R must be symmetric and positive definite"),
+        ({"R": np.eye(2)}, r"R must be finite numbers of shape \(1, 1\)"),
+        ({"names": ["one"]}, "names and units must be 2 each"),
+        ({"weights": [0.0, 0.0]}, "weights must not be negative, nor all zero"),
+        ({"filter_model": {"F": F}}, "filter_model says f, h, Q or R, got 'F'"),
+        ({"hypotheses": [{"h": np.eye(2), "R": np.eye(2)}]}, "all models must measure as many numbers"),
+        ({"hypotheses": [{"Q": Q}], "transition": [[0.9, 0.2], [0.5, 0.5]]}, "transition must hold probabilities"),
+        ({"horizon": 0}, "horizon must be"),
+        ({"orizon": 5}, "did you mean 'horizon'"),
+    ],
+)  # fmt: skip
+def test_what_is_no_model_is_refused(make, wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make(**wrong)
+
+
+@pytest.mark.slow
+def test_the_page_runs(tmp_path, command, capsys, monkeypatch):
+    """One block after the other in an empty folder, with a short search and training."""
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "tracker.py").write_text(BLOCKS[0][1], encoding="utf-8")
+    try:
+        for line in BLOCKS[1][1].splitlines():
+            _, *words = shlex.split(re.sub(r"--steps \d+", "--steps 12800 --no-compare", line))
+            code, shown, errors = command(*words)
+            assert (code, bool(shown)) == (0, True), errors
+        exec(compile(BLOCKS[2][1], "page", "exec"), {})
+        assert "x1" in capsys.readouterr().out
+    finally:
+        sys.modules.pop("tracker", None)
+        forget("mine/Tracker-v0")
