@@ -47,6 +47,7 @@ html_use_index = html_domain_indices = False  # the search finds names
 html_theme_options = {
     "logo": {"text": "filtergym"},
     "navbar_align": "left",
+    "header_links_before_dropdown": 7,
     "navbar_end": ["theme-switcher"],
     "show_nav_level": 1,
     "show_toc_level": 2,
@@ -113,7 +114,7 @@ figures and agents are made again together.
 """
 """Said at the top of pages whose numbers come from runs, until they are made again."""
 MOVED_PAGES = re.compile(
-    "comparison|results|training_seeds|agents|speed|compiled|plan|report|evaluation|live|device|own_data|own_estimator"
+    "comparison|training_seeds|agents|speed|compiled|plan|report|evaluation|live|device|own_data|own_estimator"
     "|log_file|filter_designer|rl_researcher|recipes|offline_data|many_cores|environments|environments/.*|reproductions/.*"
 )
 
