@@ -3,12 +3,10 @@
     git clone https://github.com/KalmanNet/KalmanNet_TSP
     git clone https://github.com/SongJgit/filternet
     python benchmarks/public_problems.py --kalmannet KalmanNet_TSP --filternet filternet --runs runs/public
-    python benchmarks/public_problems.py --page docs/public_problems.md
 
-The first call tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and
-tuned values of an earlier call in ``--runs`` are taken as they are. The second puts the tables of these records into
-the page. Nothing of these repositories is imported, and nothing of them is kept but figures; tensors are read with
-``torch.load(weights_only=True)``.
+It tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and tuned values
+of an earlier call in ``--runs`` are taken as they are. Nothing of these repositories is imported, and nothing of them is
+kept but figures; tensors are read with ``torch.load(weights_only=True)``.
 
 Tuning and training see simulated episodes of the training split alone (NCLT: the two validation drives). Judged are the
 stored test sets, or simulated episodes of the test split.
@@ -35,7 +33,6 @@ from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.catalogue import short_name
 from filtergym.envs.recording import Recording
 from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.papers.grid import markdown_table
 
 import filtergym
 
@@ -496,7 +493,7 @@ def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[s
 
 RECORDS = Path(__file__).parent.parent / "docs" / "records"
 PROBLEMS, DRIVES = "public_problems", "public_drives"
-"""Names of the records, and of the markers of their tables on the page."""
+"""Names of the records."""
 DATES = ("2012-11-04", "2012-11-16", "2013-04-05")
 PUBLISHED = {
     "receiver alone": (46.141, 19.500, 34.538),
@@ -557,19 +554,8 @@ def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECOR
             (folder / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
-def page_with_tables(page: str, folder: Path = RECORDS) -> str:
-    """Return a page with the tables of the records between their markers."""
-    for name in (PROBLEMS, DRIVES):
-        data = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["data"]
-        table = "\n".join(markdown_table(data["columns"], data["rows"]))
-        before, begin, rest = page.partition(f"<!-- {name}: begin -->")
-        _, end, after = rest.partition(f"<!-- {name}: end -->")
-        page = f"{before}{begin}\n\n{table}\n\n{end}{after}"
-    return page
-
-
 def main() -> None:
-    """Tune, train, judge and write; or write the page."""
+    """Tune, train, judge and write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -578,12 +564,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/public"), help="tuned values and agents")
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side")
     parser.add_argument("--steps", type=int, default=200_000, help="measurements of a training")
-    parser.add_argument("--page", type=Path, help="only put the tables of the records into this page")
     options = parser.parse_args()
-    if options.page:
-        text = page_with_tables(options.page.read_text(encoding="utf-8"))
-        options.page.write_text(text, encoding="utf-8")
-        return
     # Agents name the module in which their training has found the environment.
     sys.modules[MODULE] = sys.modules["__main__"]
     options.runs.mkdir(parents=True, exist_ok=True)

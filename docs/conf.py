@@ -55,6 +55,7 @@ html_use_index = html_domain_indices = False  # the search finds names
 html_theme_options = {
     "logo": {"text": "filtergym"},
     "navbar_align": "left",
+    "header_links_before_dropdown": 7,
     "navbar_end": ["theme-switcher"],
     "show_nav_level": 1,
     "show_toc_level": 2,
@@ -109,34 +110,9 @@ def _intervals_in_one_piece(app: Any, document: nodes.document) -> None:
                 text.parent.replace(text, nodes.Text(kept))
 
 
-MOVED = """
-:::{admonition} These numbers are of earlier distributions
-:class: note
-
-Since they were made the random numbers of an episode have become a function of its seed and of the time alone,
-sensors have coloured errors in training, motion is drawn anew for every episode, and references are told the whole
-draw. Whoever runs a command again gets other numbers. Agents have not been trained for it yet; then all tables,
-figures and agents are made again together.
-:::
-"""
-"""Said at the top of pages whose numbers come from runs, until they are made again."""
-MOVED_PAGES = re.compile(
-    "comparison|results|training_seeds|agents|speed|compiled|plan|report|evaluation|live|device|own_data|own_estimator"
-    "|log_file|filter_designer|rl_researcher|recipes|offline_data|many_cores|environments|environments/.*|reproductions/.*"
-)
-
-
-def _say_what_moved(app: Any, page: str, source: list[str]) -> None:
-    """Put the notice below the first heading."""
-    if MOVED_PAGES.fullmatch(page):
-        heading, rest = source[0].split("\n", 1)
-        source[0] = f"{heading}\n{MOVED}\n{rest}"
-
-
 def setup(app: Any) -> None:
     """Register what is done to docstrings before and after Google's style is read, and to pages."""
     app.connect("autodoc-process-docstring", _hide_colons, priority=400)
     for change in (_show_colons, _formulas_as_they_stand, _without_counted_fields):
         app.connect("autodoc-process-docstring", change, priority=600)
-    app.connect("source-read", _say_what_moved)
     app.connect("doctree-read", _intervals_in_one_piece)

@@ -19,7 +19,7 @@ from models import make_model
 from records import FOLDER, read_record, short_name
 
 DOCS = Path(__file__).parent.parent / "docs"
-AUDIENCES = ("filter_designer.md", "rl_researcher.md", "log_file.md")
+AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
     "Scenarios", "Room table", "References", "Version History",

@@ -1,4 +1,4 @@
-"""The problems of benchmarks/public_problems.py: their equations, the reading of stored sets, and the page."""
+"""The problems of benchmarks/public_problems.py: their equations, the reading of stored sets."""
 
 import importlib.util
 import json
@@ -31,12 +31,6 @@ def problems():
     for id in set(registration.USER_TASKS) - known:
         for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
             table.pop(id, None)
-
-
-def test_the_page_shows_the_records(problems):
-    """If not: ``python benchmarks/public_problems.py --page docs/public_problems.md``."""
-    page = (ROOT / "docs" / "public_problems.md").read_text(encoding="utf-8")
-    assert problems.page_with_tables(page) == page
 
 
 def test_records_hold_the_tables_of_their_figures(problems):

@@ -9,9 +9,9 @@ import sys
 import zipfile
 from pathlib import Path
 
-from board import board_markdown, read_entries
 import numpy as np
 import pytest
+from board import board_markdown, read_entries
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
