@@ -5,8 +5,8 @@
     python benchmarks/public_problems.py --kalmannet KalmanNet_TSP --filternet filternet --runs runs/public
 
 It tunes, trains and judges, and writes the records ``public_problems`` and ``public_drives``; agents and tuned
-values of an earlier call in ``--runs`` are taken as they are. Nothing of these repositories is imported, and nothing of them
-is kept but figures; tensors are read with ``torch.load(weights_only=True)``.
+values of an earlier call in ``--runs`` are taken as they are. Nothing of these repositories is imported, and nothing of
+them is kept but figures; tensors are read with ``torch.load(weights_only=True)``.
 
 Tuning and training see simulated episodes of the training split alone (NCLT: the two validation drives). Judged are the
 stored test sets, or simulated episodes of the test split.

@@ -32,6 +32,7 @@ from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
 from records import ResultRecord, round_number, short_name
 from scipy.special import stdtrit
+from sentence_numbers import Number
 
 from filtergym.names import find_competitor
 from filtergym.reports.tables import select_components, with_interval
@@ -571,7 +572,7 @@ def seeds_overview(records: Sequence[ResultRecord]) -> str:
 
 
 def _percent(values: Sequence[float | None]) -> str:
-    return with_interval(Estimate(*values), 100.0)
+    return with_interval(Number(*values), 100.0)
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[Trained], origin: str) -> str:
