@@ -294,7 +294,6 @@ BASELINES = Baselines(
     score_paper="plain-reduced",
     score_reference="matched",
     tunable=TUNABLE,
-    fallback="fault-bank-vague",
     alarm=FusionAlarm,
     best_constant="best-constant",
     compared=("augmented",),
