@@ -47,7 +47,6 @@ NOT_CONVERTED = {
     "docs/device.md",
     "docs/environments/loosely_coupled_navigation.md",
     "docs/environments/maneuvering_target.md",
-    "docs/environments/radar_esm_tracking.md",
     "docs/environments/tightly_coupled_navigation.md",
     "docs/live.md",
     "docs/log_file.md",
