@@ -46,7 +46,6 @@ NOT_CONVERTED = {
     "docs/compiled.md",
     "docs/device.md",
     "docs/environments/loosely_coupled_navigation.md",
-    "docs/environments/maneuvering_target.md",
     "docs/environments/tightly_coupled_navigation.md",
     "docs/live.md",
     "docs/log_file.md",
