@@ -22,7 +22,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
-    "Scenarios", "Room table", "References", "Version History",
+    "Scenarios", "What to expect", "References", "Version History",
 )  # fmt: skip
 
 
