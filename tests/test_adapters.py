@@ -176,6 +176,7 @@ def test_every_example_is_tried():
         "inverted_pendulum",
         "flights",
         "live_track",
+        "mixed_motion",
         "nclt_odometry",
         "plots",
     }

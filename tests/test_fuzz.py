@@ -170,7 +170,7 @@ def test_results(tmp_path, command):
     for i in range(30):
         file.write_bytes(whole)
         file.write_bytes(broken_json(file, rng))
-        command("comparison", file, program=commands.main)
+        command("record", file, "--into", tmp_path / "records", program=commands.main)
         if i % 3 == 0:
             command("report", file, "--out", tmp_path / "report.html")
 

@@ -105,6 +105,7 @@ CALLS = [
     (small_matrices.cholesky, (P4,)),
     (small_matrices.mirror_lower, (P4,)),
     (small_matrices.solve_lower, (small_matrices.cholesky(P4), X4)),
+    (small_matrices.solve_definite, (P4, X4)),
     (unscented.sigma_points, (X5, P5)),
     (unscented.transform, (X5, P5, lambda points: points * points)),
 ]

@@ -17,9 +17,7 @@ SNIPPETS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer", "live", "index"]
-)
+@pytest.mark.parametrize("snippet", SNIPPETS, ids=["filter designer", "live", "RL researcher", "index"])
 def test_snippet_runs(snippet, capsys):
     if "stable_baselines3" in snippet:
         pytest.importorskip("stable_baselines3")

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import training_seeds
-from filtergym.agents.learned_policy import PRETRAINED, read_header
+from filtergym.agents.learned_policy import ENVELOPE, PRETRAINED, read_header
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.store import Store
 from filtergym.papers.grid import markdown_table
@@ -200,7 +200,9 @@ def test_the_best_of_an_algorithm_is_shipped(folders, tmp_path, make_page):
     exported, trained = load_file(file), load_file(best)
     assert set(trained) == set(exported)
     for name, array in trained.items():
-        np.testing.assert_array_equal(exported[name], array)
+        # The envelope is measured again, and rounded outwards.
+        steps = 1 if name in ENVELOPE else 0
+        np.testing.assert_array_max_ulp(exported[name], array, steps)
     shipped = json.loads(file.with_suffix(".json").read_text())
     assert (shipped["seed"], shipped["exported"]["episodes"]) == (1, 32)
 
