@@ -45,7 +45,6 @@ NOT_CONVERTED = {
     "docs/attitude.md",
     "docs/agents.md",
     "docs/device.md",
-    "docs/environments/tightly_coupled_navigation.md",
     "docs/live.md",
     "docs/log_file.md",
     "docs/offline_data.md",
