@@ -1,20 +1,27 @@
 """What every competitor has estimated, as a file that other programs read."""
 
+import re
 from pathlib import Path
 
 import numpy
 import xarray
 
-from .files import whole_file
+from .files import whole_file, whole_files
 
 SERIES = ("seconds", "nis", "nis_degrees", "log_likelihood")
 """Written beside the estimates, where they are known."""
 
 
+AXES = ("position_x", "position_y", "position_z")
+"""Components of a position, of which a trajectory has two or three."""
+
+
 def check_estimates(path: Path) -> None:
     """Raise ValueError for a file of another kind."""
-    if path.suffix not in (".csv", ".nc"):
-        raise ValueError(f"estimates are written as .csv or .nc, got {str(path)!r}")
+    if path.suffix not in (".csv", ".nc", ".tum"):
+        raise ValueError(
+            f"estimates are written as .csv or .nc, or as trajectories into a folder .tum, got {str(path)!r}"
+        )
 
 
 def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
@@ -41,13 +48,16 @@ def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
     """Write what every competitor has estimated, a line or an entry for each measurement of each episode.
 
     Args:
-        path: ending in ``.csv`` or ``.nc``.
+        path: ending in ``.csv`` or ``.nc``; or a folder ending in ``.tum``, see :func:`write_trajectories`.
         dataset: from an evaluation with ``tracks=True``.
 
     Raises:
         ValueError: if it cannot be written.
     """
     check_estimates(path)
+    if path.suffix == ".tum":
+        write_trajectories(path, dataset)
+        return
     found = estimates_of(dataset)
     with whole_file(path) as partial:
         if path.suffix == ".nc":
@@ -71,3 +81,42 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
     # Beyond the end of a shorter episode there is no estimate.
     there = numpy.isfinite(table[next(name for name in columns if name.startswith("estimate_"))])
     table[there].to_csv(path, columns=["policy", "recording", "measurement", *columns], index=False)
+
+
+def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
+    """Write positions as trajectories in the format of the TUM RGB-D benchmark, which ``evo`` reads.
+
+    A file has the lines ``seconds x y z qx qy qz qw``, m; the orientation is none, and a z that is not estimated zero.
+    There is a file for each competitor and episode, ``NAME.EPISODE.tum``, and one for the truth where it is known,
+    ``truth.NAME.EPISODE.tum``: in a closed loop every competitor has a truth of its own.
+
+    Args:
+        folder: whose files of these names are replaced.
+        dataset: from an evaluation with ``tracks=True``.
+
+    Raises:
+        ValueError: if no position is estimated, or nothing can be written there.
+    """
+    components = dataset["component"].values.tolist()
+    axes = [components.index(name) for name in AXES if name in components]
+    if len(axes) < 2 or "seconds" not in dataset:
+        raise ValueError(
+            "a trajectory needs estimates of position_x and position_y, and the time of each in seconds"
+        )
+    with whole_files(folder) as waiting:
+        for policy in dataset["policy"].values.tolist():
+            for episode in dataset["episode"].values.tolist():
+                own = dataset.sel(policy=policy, episode=episode)
+                name = f"{re.sub(r'[^A-Za-z0-9_.-]', '_', policy)}.{episode}.tum"
+                for prefix, kind in (("", "estimate"), ("truth.", "truth")):
+                    if kind in own:
+                        _write_trajectory(
+                            waiting / f"{prefix}{name}", own["seconds"], own[kind].values[:, axes]
+                        )
+
+
+def _write_trajectory(path: Path, seconds: xarray.DataArray, positions: numpy.ndarray) -> None:
+    rows = numpy.zeros((len(positions), 8))
+    rows[:, 0], rows[:, 1 : 1 + positions.shape[1]], rows[:, 7] = seconds.values, positions, 1.0
+    # Beyond the end of a shorter episode, or where nobody knows the truth, there is no position.
+    numpy.savetxt(path, rows[numpy.isfinite(rows).all(axis=1)], fmt="%.9f")

@@ -340,6 +340,19 @@ def test_estimates_are_written(known, recordings, tmp_path):
     assert float(row["nis"]) == dataset["nis"].values[1, 1, 1]
     assert float(row["estimate_position_y"]) == dataset["estimate"].values[1, 1, 1, 1]
     assert float(row["seconds"]) == 12.0
+    write_estimates(tmp_path / "tracks.tum", dataset)
+    kinds = ("", "truth.") if known else ("",)
+    names = {
+        f"{kind}{policy}.{i}.tum" for kind in kinds for policy in ("imm", "kalman-imm") for i in range(3)
+    }
+    assert {path.name for path in (tmp_path / "tracks.tum").iterdir()} == names
+    rows = np.loadtxt(tmp_path / "tracks.tum" / "imm.1.tum")
+    np.testing.assert_allclose(rows[:, 0], dataset["seconds"].values[0, 1], atol=1e-9)
+    np.testing.assert_allclose(rows[:, 1:3], dataset["estimate"].values[0, 1, :, :2], atol=1e-9)
+    np.testing.assert_array_equal(rows[:, 3:], np.tile([0.0, 0, 0, 0, 1], (len(rows), 1)))
+    if known:
+        truth = np.loadtxt(tmp_path / "tracks.tum" / "truth.imm.1.tum")
+        np.testing.assert_allclose(truth[:, 1:3], dataset["truth"].values[0, 1, :, :2], atol=1e-9)
     with pytest.raises(ValueError, match=r"estimates are written as \.csv or \.nc"):
         write_estimates(tmp_path / "estimates.txt", dataset)
 

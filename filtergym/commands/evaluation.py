@@ -94,7 +94,7 @@ class Outputs(NamedTuple):
             writable_file(self.records)
         if self.estimates is not None:
             check_estimates(self.estimates)
-            writable_file(self.estimates)
+            (writable_folder if self.estimates.suffix == ".tum" else writable_file)(self.estimates)
 
 
 def find_data(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..agents.export import export_run
-from ..baselines.problem import problem_of
+from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import check_names, nearest
 from ..envs.scenario_choice import read_recording
 from ..evaluation.files import whole_file, writable_file, writable_folder
@@ -27,7 +27,7 @@ from .terminal import (
 if TYPE_CHECKING:
     from ..exports.request import ExportRequest
 
-FORMS = ("safetensors", "c", "python", "onnx")
+FORMS = ("safetensors", "c", "python", "onnx", "hub")
 """What can be written."""
 
 
@@ -53,7 +53,7 @@ def export(
         str,
         typer.Option(
             help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; python, a filter as one "
-            "file that needs NumPy only; onnx, the network of an agent.",
+            "file that needs NumPy only; onnx, the network of an agent; hub, a folder with an agent and its card.",
             autocompletion=one_of(*FORMS),
         ),
     ] = "safetensors",
@@ -103,6 +103,7 @@ def export(
     allowed = {
         "safetensors": (),
         "onnx": ("a filter's name",),
+        "hub": ("a filter's name",),
         "python": tuple(o for o in options if o != "--float"),
     }
     for option, given in options.items():
@@ -116,6 +117,9 @@ def export(
     if name is None:
         raise ValueError(f"name the filter: filtergym export {environment} NAME --to {to}")
     problem = problem_of(environment)
+    if to == "hub":
+        _export_hub(problem, name, out)
+        return
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
     data: Any = scenario
@@ -167,3 +171,20 @@ def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
     path = out or folder / "agent.safetensors"
     run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
+
+
+def _export_hub(problem: Problem, name: str, out: Path | None) -> None:
+    """Write a folder that a model hub takes: a shipped agent, or a file of one, with its card."""
+    from ..agents.hub_folder import write_hub_folder
+    from ..agents.learned_policy import pretrained_path
+    from ..agents.named_policies import pretrained_agents
+
+    file = Path(name)
+    if file.suffix != ".safetensors":
+        shipped = pretrained_agents(problem.id)
+        if name not in shipped:
+            raise nearest("agent, or file .safetensors of one", name, shipped)
+        file = pretrained_path(problem.id, name)
+    folder = writable_folder(out or Path(file.stem))
+    write_hub_folder(file, folder)
+    console.print(f"saved in {folder}: README.md, config.json, model.safetensors", soft_wrap=True)

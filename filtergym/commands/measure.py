@@ -112,7 +112,10 @@ def evaluate_policies(
     truth_offset: TruthOffset = 0.0,
     estimates: Annotated[
         Path | None,
-        typer.Option(help="File (CSV or NetCDF) for every estimate with its sigma, NIS and log-likelihood."),
+        typer.Option(
+            help="File (CSV or NetCDF) for every estimate with its sigma, NIS and log-likelihood; or folder NAME.tum "
+            "for trajectories that evo reads."
+        ),
     ] = None,
     trust: Trust = False,
     strict: Annotated[
