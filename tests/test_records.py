@@ -408,7 +408,7 @@ def test_sphinx_renders_what_a_page_names(tmp_path):
         "front_ManeuveringTarget.svg",
         "ManeuveringTarget.json",
         "<td><p>ManeuveringTarget</p></td>",
-        "-12.8",
+        number_text("plain_ppo/ManeuveringTarget/mean"),
     ):
         assert word in page
     assert len(list((tmp_path / "site" / "_images").iterdir())) == 1
