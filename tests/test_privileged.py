@@ -286,12 +286,12 @@ def test_a_policy_that_is_corrected_sees_the_observation_only():
 
 def test_snippet_of_an_asymmetric_critic(capsys):
     pytest.importorskip("stable_baselines3")
-    text = (Path(__file__).parent.parent / "docs" / "agents.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parent.parent / "docs" / "agents_learning.md").read_text(encoding="utf-8")
     (snippet,) = [s for s in re.findall(r"```python\n(.*?)```", text, re.S) if "asymmetric" in s]
     short = snippet.replace("20_000", "256").replace("episodes=200", "episodes=8")
     assert short != snippet
     names: dict = {"__name__": "snippet"}
-    exec(compile(short, "agents.md", "exec"), names)
+    exec(compile(short, "agents_learning.md", "exec"), names)
     assert capsys.readouterr().out.strip()
     # The actor's actions do not depend on what is privileged; the critic's values do.
     model = names["model"]

@@ -43,7 +43,6 @@ COMMAND = re.compile(r"`(filtergym|python) [^`]+`")
 """How a section of an appendix says so too: its measurements were made once, and stand in no record."""
 NOT_CONVERTED = {
     "docs/attitude.md",
-    "docs/agents.md",
     "docs/device.md",
     "docs/live.md",
     "docs/log_file.md",
