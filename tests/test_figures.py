@@ -238,12 +238,32 @@ def test_svg_holds_text_and_pdf_its_fonts(curves, tmp_path):
 
 
 def test_other_figures_are_as_wide(tmp_path):
-    curve = {"ppo": [([0.0, 1e6], [1.0, -0.1])]}
+    curve = {"ppo": [([1e5, 1e6], [1.0, -0.1])]}
     differences = {"paper": {"ppo": (-10.0, -12.0, -8.0)}}
     for columns in (1, 2):
         learning = draw_learning_curves(curve, "title", "imm", columns=columns)
         compared = draw_differences(differences, ["ppo"], ["ppo"], [], "title", "imm", columns=columns)
         assert learning.get_figwidth() == compared.get_figwidth() == WIDTHS[columns]
+
+
+def test_learning_curves_are_median_and_range_over_runs():
+    steps = [100_000, 200_000, 400_000]
+    runs = [(steps, [0.5, 0.0, -0.3]), (steps, [0.1, -0.2, -0.4]), (steps, [0.3, -0.5, -0.1])]
+    # A run that went on longer, and was validated elsewhere, counts as far as all go.
+    longer = [(steps, [0.0, 0.0, 0.0]), ([100_000, 300_000, 500_000], [0.2, 0.4, 0.6])]
+    [axis] = draw_learning_curves({"ppo": runs, "bptt": longer}, "title", "imm").axes
+    first, second = named(axis).values()
+    assert (first.get_label(), second.get_label()) == ("ppo, 3 runs", "bptt, 2 runs")
+    np.testing.assert_allclose(first.get_xdata(), [0.1, 0.2, 0.4])
+    np.testing.assert_allclose(first.get_ydata(), [30.0, -20.0, -30.0])
+    np.testing.assert_allclose(second.get_xdata(), [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(second.get_ydata(), [10.0, 15.0, 20.0, 25.0])
+    bands = [collection.get_paths()[0].vertices for collection in axis.collections]
+    for step, low, high in ((0.1, 10.0, 50.0), (0.2, -50.0, 0.0), (0.4, -40.0, -10.0)):
+        ends = bands[0][np.isclose(bands[0][:, 0], step), 1]
+        assert (ends.min(), ends.max()) == pytest.approx((low, high))
+    assert "millions" in axis.get_xlabel()
+    assert "%" in axis.get_ylabel()
 
 
 def test_recordings_without_truth_have_figures_too():

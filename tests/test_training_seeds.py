@@ -19,6 +19,7 @@ from training_seeds import (
     compare,
     comparison_grids,
     episode_means,
+    learning_curves,
     load_runs,
     seeds_markdown,
     spread,
@@ -183,6 +184,18 @@ def test_command_makes_the_record_and_the_record_the_tables(folders, tmp_path, m
     for part in folded:
         assert re.match(r"<summary>[^`]*<code>random</code></summary>\n\n\| ", part)
     assert (tmp_path / "curves.png").stat().st_size > 10_000
+    # The record has the validations of every run, from which the site draws the same picture.
+    validation = json.loads((folders[0] / "run.json").read_text())["validation"]
+    steps, differences = record.data["curves"]["bptt seed 0"]
+    assert steps == [entry["steps"] for entry in validation]
+    # Four digits are kept.
+    expected = [entry["relative_cost_difference"][0] for entry in validation]
+    assert differences == pytest.approx(expected, rel=5e-4)
+    [axis] = learning_curves(record.data).axes
+    assert len(axis.get_legend_handles_labels()[0]) == len(axis.collections) == 1
+    del record.data["curves"]["bptt seed 1"]
+    with pytest.raises(ValueError, match="record of bptt seed 1 has no validations against 'imm' to draw"):
+        learning_curves(record.data)
     assert not (tmp_path / "unfinished").exists()
     assert {each.statistic for each in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 

@@ -172,7 +172,7 @@ def seeds(
             writable_file(file)
     store = Store(None if out is None else out.with_name(UNFINISHED))
     if curves is not None:
-        save(training_seeds.learning_curves(found, columns), curves)
+        save(training_seeds.learning_curves(training_seeds.runs_data(found), columns), curves)
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         study = training_seeds.Study(found, opponents, episodes, seed, split, trust)

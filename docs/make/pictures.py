@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 from filtergym.evaluation.looks import styles
-from filtergym.evaluation.print_layout import add_title, figure_with_axes, in_print
+from filtergym.evaluation.print_layout import add_title, figure_with_axes, in_print, logarithmic
 
 
 @in_print
@@ -16,7 +16,8 @@ def draw_learning_curves(
     *,
     columns: int = 2,
 ) -> Any:
-    """Cost of validations against the paper's algorithm over training, one line for each run.
+    """Cost of validations against the paper's algorithm over training: of each algorithm the median over its runs,
+    and a band from the lowest to the highest.
 
     Args:
         curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
@@ -27,13 +28,14 @@ def draw_learning_curves(
     figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
     axis = axes[0]
     for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
-        for i, (steps, differences) in enumerate(runs):
-            plural = "s" if len(runs) > 1 else ""
-            label = f"{name}, {len(runs)} run{plural}" if i == 0 else None
-            millions, percent = numpy.array(steps) / 1e6, 100.0 * numpy.array(differences)
-            axis.plot(millions, percent, label=label, **style | {"linewidth": 1.1})
-            best = percent.argmin()
-            axis.plot(millions[best], percent[best], "o", ms=4, color=style["color"])
+        # Runs of one algorithm are validated at the same steps; where one is shorter, all are shown as far as it goes.
+        steps = numpy.unique(numpy.concatenate([own for own, _ in runs]))
+        steps = steps[(steps >= max(own[0] for own, _ in runs)) & (steps <= min(own[-1] for own, _ in runs))]
+        percent = 100.0 * numpy.array([numpy.interp(steps, *own) for own in runs])
+        label = f"{name}, {len(runs)} run{'s' if len(runs) > 1 else ''}"
+        axis.plot(steps / 1e6, numpy.median(percent, axis=0), label=label, **style | {"linewidth": 1.3})
+        ends = percent.min(axis=0), percent.max(axis=0)
+        axis.fill_between(steps / 1e6, *ends, color=style["color"], alpha=0.2, lw=0)
     axis.axhline(0.0, color="0.3", lw=1.0)
     everything = numpy.concatenate([values for runs in curves.values() for _, values in runs])
     if everything.max() > 1.0:
@@ -41,9 +43,38 @@ def draw_learning_curves(
         axis.set_yscale("symlog", linthresh=10.0, linscale=1.5)
         axis.yaxis.set_major_formatter("{x:g}")
         axis.set_ylim(bottom=min(1.2 * 100.0 * everything.min(), -2.0))
-    axis.set_xlim(left=0.0)
+    # Budgets differ by factors, and most is learned early.
+    axis.set_xscale("log", nonpositive="mask")
+    logarithmic(axis.xaxis)
     axis.set_xlabel("environment steps, millions")
     axis.set_ylabel(f"validation cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4)
+    return add_title(figure, title)
+
+
+@in_print
+def draw_profiles(
+    limits: numpy.ndarray, profiles: Mapping[str, numpy.ndarray], title: str, *, columns: int = 2
+) -> Any:
+    """Share of training runs with a score above each limit, with pointwise 95 % bands.
+
+    Args:
+        limits: of the score, ``(limits,)``.
+        profiles: algorithm -> share, lower and upper end of its interval, ``(3, limits)``.
+        title: of the figure.
+        columns: of a paper, as wide as which it is.
+    """
+    figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.0}[columns])
+    axis = axes[0]
+    for (name, (share, low, high)), style in zip(
+        profiles.items(), styles(list(profiles)).values(), strict=True
+    ):
+        axis.plot(limits, share, label=name, drawstyle="steps-post", **style | {"linewidth": 1.3})
+        axis.fill_between(limits, low, high, step="post", color=style["color"], alpha=0.2, lw=0)
+    axis.set_xlim(limits[0], limits[-1])
+    axis.set_ylim(0.0, 1.02)
+    axis.set_xlabel("score: 0 is the paper's algorithm, 1 the reference")
+    axis.set_ylabel("share of runs with a higher score")
     axis.grid(alpha=0.25, lw=0.4)
     return add_title(figure, title)
 

@@ -31,10 +31,11 @@ from records import (
     recorded_environments,
 )
 from results_table import chosen_markdown, results_markdown
+from seed_profiles import interquartile_table, profile_figure, recorded_scores
 from sentence_numbers import number_text, record_of
 from sphinx.addnodes import download_reference
 from sphinx.util.docutils import SphinxDirective, SphinxRole
-from training_seeds import seeds_markdown, seeds_overview
+from training_seeds import learning_curves, seeds_markdown, seeds_overview
 
 SUBMISSIONS = Path(__file__).parent.parent.parent / "leaderboard"
 
@@ -166,6 +167,45 @@ class SeedsTables(_Rendered):
         return seeds_markdown(self.record(f"{SEEDS}/{self.name_given}"))
 
 
+class SeedProfiles(_Rendered):
+    """``{seed-profiles} ALGORITHM ...``: interquartile means and performance profiles; default: all algorithms."""
+
+    def markdown(self) -> str:
+        """Return one table."""
+        records = [self.record(f"{SEEDS}/{name}") for name in recorded_environments(SEEDS)]
+        self.scores = recorded_scores(records, self.name_given.split())
+        return interquartile_table(self.scores)
+
+    def figure(self) -> tuple[str, str, Any]:
+        """Return the profiles."""
+        words = f"Share of training runs above each score: {', '.join(self.scores)}"
+        return "_".join(["profiles", *self.scores]), words, profile_figure(self.scores)
+
+
+class TrainingCurves(_Rendered):
+    """``{training-curves} ENVIRONMENT``: validation cost over training, of the record; of one without curves the
+    picture that was kept.
+    """
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Of the record."""
+        environment_id(self.name_given)
+        return self.record(f"{SEEDS}/{self.name_given}").data
+
+    def markdown(self) -> str:
+        """Return the picture that was kept."""
+        kept = f"![Validation cost over training, every seed](/images/training_{self.name_given}.png)"
+        return "" if self.data.get("curves") else kept
+
+    def figure(self) -> tuple[str, str, Any] | None:
+        """Return the curves of the record."""
+        if not self.data.get("curves"):
+            return None
+        words = f"Validation cost over training, median and range over training seeds, {self.name_given}"
+        return f"training_{self.name_given}", words, learning_curves(self.data)
+
+
 class RecordTable(_Rendered):
     """``{record-table} NAME``: a table of text, or some of its columns."""
 
@@ -261,6 +301,8 @@ DIRECTIVES = {
     "comparison-overview": ComparisonOverview,
     "front-figure": FrontFigure,
     "seeds": SeedsTables,
+    "seed-profiles": SeedProfiles,
+    "training-curves": TrainingCurves,
     "record-table": RecordTable,
     "environment-table": EnvironmentTable,
     "command-line": CommandLine,

@@ -9,7 +9,7 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -194,21 +194,33 @@ def _algorithm(run: TrainingRun) -> str:
     return run.algorithm + around + (" gated" if run.gated else "")
 
 
-def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
-    """Picture of every run's validations, 1 or 2 columns of a paper wide; a dot marks its best agent."""
-    first = runs[0].run
-    paper = first.problem.paper
-    for member in runs:
-        entries = member.run.validation
-        if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
-            raise ValueError(f"the record of {member.name} has no validations against {paper!r} to draw")
+def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
+    """Return environment steps and relative cost differences of a run's validations; None: it has none."""
+    entries = run.validation
+    if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
+        return None
+    differences = [float(f"{entry['relative_cost_difference'][0]:.4g}") for entry in entries]
+    return [int(entry["steps"]) for entry in entries], differences
+
+
+def learning_curves(data: Mapping[str, Any], columns: int = 2) -> Any:
+    """Picture of the validations of every algorithm, 1 or 2 columns of a paper wide.
+
+    Args:
+        data: of a record of training seeds, or what :func:`runs_data` has of runs.
+        columns: of a paper, as wide as which it is.
+
+    Raises:
+        ValueError: if a run has no validations.
+    """
     curves: dict[str, list[tuple[list[float], list[float]]]] = {}
-    for member in runs:
-        steps = [float(entry["steps"]) for entry in member.run.validation]
-        values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
-        curves.setdefault(member.algorithm, []).append((steps, values))
-    title = f"{first.environment}, scenario {first.scenario}; dots: best agents"
-    return draw_learning_curves(curves, title, paper, columns=columns)
+    for name, algorithm, *_ in data["runs"]:
+        if name not in data["curves"]:
+            raise ValueError(f"the record of {name} has no validations against {data['paper']!r} to draw")
+        steps, differences = data["curves"][name]
+        curves.setdefault(algorithm, []).append((steps, differences))
+    title = f"{data['environment']}, median and range over training seeds"
+    return draw_learning_curves(curves, title, data["paper"], columns=columns)
 
 
 def default_opponents(problem: Problem) -> list[str]:
@@ -509,6 +521,17 @@ def trained_of(runs: Sequence[SeedRun]) -> list[Trained]:
     ]
 
 
+def runs_data(runs: Sequence[SeedRun]) -> dict[str, Any]:
+    """Return what a record holds of the runs alone: who they are, and their validation curves."""
+    curves = {member.name: validation_curve(member.run) for member in runs}
+    return {
+        "environment": runs[0].run.problem.id,
+        "paper": runs[0].run.problem.paper,
+        "runs": [list(each) for each in trained_of(runs)],
+        "curves": {name: list(curve) for name, curve in curves.items() if curve is not None},
+    }
+
+
 def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Return what a record holds of training seeds: the runs, and every number by scenario."""
     scenarios: dict[str, list[list[Any]]] = {}
@@ -518,13 +541,11 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
             [c.policy, c.statistic, c.against, c.metric, c.component, *numbers]
         )
     return {
-        "environment": study.problem.id,
         "split": study.split,
         "seed": study.seed,
         "episodes": study.episodes,
-        "paper": study.problem.paper,
         "units": {c.component: c.unit for c in comparisons if c.unit != "1"},
-        "runs": [list(each) for each in trained_of(study.runs)],
+        **runs_data(study.runs),
         "scenarios": scenarios,
     }
 
