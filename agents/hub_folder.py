@@ -8,31 +8,29 @@ import json
 import shutil
 from pathlib import Path
 
-from ..baselines.problem import problem_of
+from ..baselines.problem import Problem
 from ..evaluation.files import whole_files
 from ..evaluation.metrics import mean_cost
 from .learned_policy import load_policy, read_header
 
 
-def write_hub_folder(agent: Path, folder: Path, episodes: int = 200) -> None:
+def write_hub_folder(problem: Problem, agent: Path, folder: Path, episodes: int = 200) -> None:
     """Write ``README.md``, ``model.safetensors`` and ``config.json`` of an agent into a folder.
 
     The agent is evaluated beside the paper's algorithm, on the test split of its training distribution.
 
     Args:
+        problem: that the agent was trained for.
         agent: file of plain arrays, as ``filtergym export`` writes it.
         folder: where the files are put; those of these names are replaced.
         episodes: of the evaluation.
 
     Raises:
-        ValueError: if the file is no agent, or the folder cannot be written to.
+        ValueError: if the file is no agent of this environment, or the folder cannot be written to.
     """
-    header = read_header(agent)
-    problem, run = problem_of(header["environment"]), header["run"]
-    paper = problem.baselines.score_paper
-    results = problem.evaluate(
-        {"agent": load_policy(problem.task, agent), paper: problem.competitor(paper)}, None, episodes
-    )
+    policy, header = load_policy(problem.task, agent), read_header(agent)
+    run, paper = header["run"], problem.baselines.score_paper
+    results = problem.evaluate({"agent": policy, paper: problem.competitor(paper)}, None, episodes)
     own, others = (mean_cost(results, each).mean() for each in ("agent", paper))
     name = f"{problem.short_name}-{run.get('algorithm', 'agent')}"
     relative = round(float(100.0 * (own / others - 1.0)), 2)
@@ -40,14 +38,14 @@ def write_hub_folder(agent: Path, folder: Path, episodes: int = 200) -> None:
     metadata = {
         "library_name": "filtergym",
         "license": "mit",
-        "tags": ["reinforcement-learning", "adaptive-filter", header["environment"]],
+        "tags": ["reinforcement-learning", "adaptive-filter", problem.id],
         "model-index": [
             {
                 "name": name,
                 "results": [
                     {
                         "task": {"type": "reinforcement-learning", "name": "adaptive filtering"},
-                        "dataset": {"type": header["environment"], "name": header["environment"]},
+                        "dataset": {"type": problem.id, "name": problem.id},
                         "metrics": [metric],
                     }
                 ],
@@ -60,11 +58,11 @@ def write_hub_folder(agent: Path, folder: Path, episodes: int = 200) -> None:
 
 # {name}
 
-An agent that steers the filter of `{header["environment"]}` under control `{header["control"]}`, as plain
+An agent that steers the filter of `{problem.id}` under control `{header["control"]}`, as plain
 arrays: it needs NumPy, and loading it executes nothing.
 
 ```sh
-filtergym evaluate {header["environment"]} --policy model.safetensors --policy {paper}
+filtergym evaluate {problem.id} --policy model.safetensors --policy {paper}
 ```
 
 * Cost against `{paper}`: {relative:+.1f} %, {episodes} episodes of `{problem.task.default_scenario}`, test split.

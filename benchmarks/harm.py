@@ -21,11 +21,10 @@ from filtergym.evaluation.metrics import mean_cost
 from stresses import STRESSES
 
 from filtergym.names import GATED, find_competitor
+from filtergym.reports.ranking import HARM
 
 LOST = 10.0
 """Cost over the paper's from which on a track is lost."""
-HARM = 0.02
-"""Cost against the paper's above which it is counted."""
 CONSISTENT = (0.5, 2.0)
 """Limits of an ANEES that says how accurate a filter is."""
 

@@ -156,7 +156,7 @@ def main() -> None:
 
         shown = table(runs)
         shown.box, shown.title = MARKDOWN, None
-        Console(width=240 if chosen.markdown else 160).print(shown)
+        Console(width=240).print(shown)
     else:
         console.print(table(runs))
 

@@ -103,10 +103,11 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
         raise ValueError(
             "a trajectory needs estimates of position_x and position_y, and the time of each in seconds"
         )
+    found = estimates_of(dataset)
     with whole_files(folder) as waiting:
-        for policy in dataset["policy"].values.tolist():
-            for episode in dataset["episode"].values.tolist():
-                own = dataset.sel(policy=policy, episode=episode)
+        for policy in found["policy"].values.tolist():
+            for episode in found["episode"].values.tolist():
+                own = found.sel(policy=policy, episode=episode)
                 name = f"{re.sub(r'[^A-Za-z0-9_.-]', '_', policy)}.{episode}.tum"
                 for prefix, kind in (("", "estimate"), ("truth.", "truth")):
                     if kind in own:

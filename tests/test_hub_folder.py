@@ -32,7 +32,8 @@ def test_a_shipped_agent_becomes_a_folder(command, tmp_path):
 
 def test_what_is_no_agent_is_refused(command, tmp_path):
     (tmp_path / "agent.safetensors").write_bytes(b"nothing")
-    for name in ("kalman", tmp_path / "agent.safetensors"):
+    other = pretrained_path("filtergym/ManeuveringTarget-v0", "bptt-linear")
+    for name in ("kalman", tmp_path / "agent.safetensors", other):
         code, _, errors = command("export", ENV, name, "--to", "hub", "--out", tmp_path / "hub")
         assert (code, errors.count("\n")) == (2, 1), errors
         assert not (tmp_path / "hub").exists()

@@ -399,7 +399,11 @@ def test_estimates_of_several_logs_have_their_own_times(tmp_path):
         rows = [(row["recording"], row["log_time"], float(row["seconds"])) for row in csv.DictReader(lines)]
     assert rows[0] == ("a", PARIS[2].isoformat(), 10.0)
     assert rows[COUNT - 2] == ("b", "10.5", 10.0)
-    write_estimates(tmp_path / "estimates.nc", evaluate(TARGET, ["imm"], scenario=recording, tracks=True))
+    dataset = evaluate(TARGET, ["imm"], scenario=recording, tracks=True)
+    write_estimates(tmp_path / "estimates.nc", dataset)
+    write_estimates(tmp_path / "tracks.tum", dataset)
+    for episode in range(2):
+        assert np.loadtxt(tmp_path / "tracks.tum" / f"imm.{episode}.tum")[0, 0] == 10.0
 
 
 # --- agents are shown deviations over the log's own

@@ -9,7 +9,9 @@ from filtergym.envs.catalogue import catalogue
 from filtergym.evaluation.rollout import ProcessorTime
 from filtergym.evaluation.times import PYTHON_MARK, time_text
 from filtergym.papers.grid import markdown_table
+from records import short_name
 
+from filtergym.reports.ranking import HARM
 from filtergym.submission import (
     TIME,
     TOLERANCE,
@@ -30,8 +32,6 @@ HEADER = (
     "submission", "by", "cost vs paper, %", "it said", "worst scenario, %", "harm", "ANEES", "ns", "trained for",
     "SHA-256",
 )  # fmt: skip
-HARM = 0.02
-"""Cost against the paper's algorithm above which it is harm, as in benchmarks/harm.py."""
 NOTE = (
     "*cost vs paper*: in the training distribution, over the fresh episodes of the round, with 95 % intervals; every "
     "file has episodes of its own, so that rows are not paired. *it said*: over the known episodes of the protocol. "
@@ -91,7 +91,7 @@ def board_markdown(entries: Sequence[Entry]) -> str:
         own = sorted((e for e in entries if e.submission.environment == id), key=lambda entry: entry.cost)
         if own:
             protocol = own[0].submission.protocol
-            lines += [f"## {id.removeprefix('filtergym/').removesuffix('-v0')}", ""]
+            lines += [f"## {short_name(id)}", ""]
             lines += [*markdown_table(HEADER, [_row(entry) for entry in own]), ""]
             lines += [f"{len(protocol.scenarios)} scenarios, {protocol.episodes} episodes of each.", ""]
     rounds = ", ".join(f"`{value}`" for value in dict.fromkeys(e.verification.round for e in entries))

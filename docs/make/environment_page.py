@@ -174,8 +174,7 @@ TABLES = {
 
 def environment_tables(problem: Problem) -> dict[str, str]:
     """Make the tables of an environment, by their names, in Markdown."""
-    tables = {name: make(problem.task) for name, make in TABLES.items()}
-    return {name: "\n".join(lines) for name, lines in {**tables, "policies": _policies(problem)}.items()}
+    return {name: environment_table(problem, name) for name in (*TABLES, "policies")}
 
 
 def environment_table(problem: Problem, name: str) -> str:

@@ -186,5 +186,5 @@ def _export_hub(problem: Problem, name: str, out: Path | None) -> None:
             raise nearest("agent, or file .safetensors of one", name, shipped)
         file = pretrained_path(problem.id, name)
     folder = writable_folder(out or Path(file.stem))
-    write_hub_folder(file, folder)
+    write_hub_folder(problem, file, folder)
     console.print(f"saved in {folder}: README.md, config.json, model.safetensors", soft_wrap=True)
