@@ -8,7 +8,9 @@ from pathlib import Path
 import comparison
 import pytest
 from comparison import compared_policies
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors import RANKED
 from front import panels_of
 from made_results import results_of
 from readme import with_numbers
@@ -107,6 +109,20 @@ def test_what_a_page_names_is_there(page):
             assert read_record(path).command
         else:
             assert number_text(path)
+
+
+@pytest.mark.parametrize("name", recorded_environments())
+def test_the_strongest_classical_competitor_is_in_the_quick_benchmark(name):
+    """Else its verdict would name another as the best."""
+    found, _ = read_benchmark(name)
+    training, learned = found.problem.task.default_scenario, pretrained_agents(found.problem.id)
+    cost = {
+        r.policy: r.value
+        for r in found.records
+        if (r.scenario, r.metric) == (training, "cost") and r.kind in RANKED and r.policy not in learned
+    }
+    best = min(cost, key=cost.get)
+    assert best.removesuffix("-tuned") in found.problem.baselines.benchmark
 
 
 def test_every_record_is_small_and_shown():

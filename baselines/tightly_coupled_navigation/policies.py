@@ -262,7 +262,14 @@ BASELINES = Baselines(
     alarm=SensorAlarm,
     best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
-    benchmark=("multi-hypothesis", "nis-adaptive", "singer", "known-mode", "known-mode-bound"),
+    benchmark=(
+        "multi-hypothesis",
+        "nis-adaptive",
+        "singer",
+        "fault-hypotheses",
+        "known-mode",
+        "known-mode-bound",
+    ),
     physical=("rmse", "velocity"),
     measurement_seconds=4e-5,
     metrics=METRICS,

@@ -196,6 +196,7 @@ BASELINES = Baselines(
         "raw-sensors",
         "innovation-adaptive",
         "gust-imm",
+        "level-bank",
         "random",
         "true-state",
         "matched",
