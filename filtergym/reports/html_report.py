@@ -201,10 +201,13 @@ def _front(result: Result) -> list[list[Any]]:
 
 
 def _dots(group: Sequence[Result]) -> dict[str, Any]:
-    """What the picture over all scenarios of an environment shows: the competitors of the first one's curves."""
+    """What the picture over all scenarios of an environment shows: the competitors of the curves of the training
+    distribution, of which the verdict speaks; where it was not run, of the first scenario.
+    """
+    shown = next((result for result in group if result.default), group[0])
     return {
         "paper": group[0].paper,
-        "lines": [line for line in _lines(group[0], group) if line["origin"] not in ("bound", "smoother")],
+        "lines": [line for line in _lines(shown, group) if line["origin"] not in ("bound", "smoother")],
         "scenarios": [
             [result.scenario, "training" if result.training else "held out", _differences(result)]
             for result in group
