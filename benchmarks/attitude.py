@@ -9,7 +9,7 @@ Without BROAD the same competitors are run over simulated episodes of every scen
 
 Example: python benchmarks/attitude.py --broad broad --agent bptt=runs/bptt --out docs/data/attitude_broad.csv
          python benchmarks/attitude.py --agent bptt=runs/bptt --out docs/data/attitude_simulated.csv
-         python benchmarks/attitude.py --render docs/data/attitude_broad.csv --into docs/attitude.md
+         python benchmarks/attitude.py --render docs/data/attitude_broad.csv
 """
 
 import argparse
@@ -248,10 +248,10 @@ def read_results(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(line for line in file if not line.startswith("#")))
 
 
-def render(path: Path) -> tuple[str, str]:
-    """Name and table of a file of results."""
+def render(path: Path) -> str:
+    """Table of a file of results, in Markdown."""
     rows = read_results(path)
-    return ("simulated", _simulated_table(rows)) if "scenario" in rows[0] else ("broad", _broad_table(rows))
+    return _simulated_table(rows) if "scenario" in rows[0] else _broad_table(rows)
 
 
 def _broad_table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -290,14 +290,6 @@ def _simulated_table(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def put_into(page: Path, name: str, table: str) -> None:
-    """Replace what stands between the lines of the page that mark the table."""
-    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    before, _, rest = page.read_text().partition(begin)
-    _, _, after = rest.partition(end)
-    page.write_text(f"{before}{begin}\n{table}\n{end}{after}")
-
-
 def write_results(
     path: Path, agents: Mapping[str, Sequence[str]], columns: Sequence[str], rows: Sequence[Any]
 ) -> None:
@@ -323,13 +315,9 @@ def main() -> None:
     parser.add_argument("--no-peer", action="store_true", help="without the package vqf")
     parser.add_argument("--out", type=Path, help="file of results, CSV")
     parser.add_argument("--render", type=Path, help="print the table of a file of results")
-    parser.add_argument("--into", type=Path, help="page to put it into")
     asked = parser.parse_args()
     if asked.render is not None:
-        name, table = render(asked.render)
-        print(table)
-        if asked.into is not None:
-            put_into(asked.into, name, table)
+        print(render(asked.render))
         return
     agents: dict[str, list[str]] = {}
     for agent in asked.agent:

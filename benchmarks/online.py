@@ -17,11 +17,13 @@ from pathlib import Path
 import numpy
 from filtergym.envs.recording import Recording
 from filtergym.envs.scenario_choice import read_recording
+from filtergym.papers.grid import markdown_table
 
 import filtergym
 
 ID = "filtergym/ManeuveringTarget-v0"
 COMPETITORS = ("imm", "kalman-imm", "kalman-imm-turn", "adaptive-rearm", "sage-husa", "bptt", "kalman-net")
+PEER = "filterpy, IMM of two Kalman filters"
 T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
 
 
@@ -154,19 +156,21 @@ def main() -> None:
         path = Path(folder) / "log.csv"
         table = write_log(path, asked.tracks, asked.plots)
         recording = read_recording(path, ID, speeds=(0.001, 1000.0), sampling_interval=T)
-        print(f"{'':32} {'updates':>8} {'other bits than a replay':>25}")
-        for name in COMPETITORS:
-            count, differing = differing_updates(name, recording, table)
-            print(f"{name:32} {count:8,} {differing:25,}", flush=True)
-    cases = {name: own_update(name, "auto") for name in COMPETITORS}
-    cases |= {"kalman-imm, NumPy": own_update("kalman-imm", "numpy")}
-    cases |= {"filterpy, IMM of two": filterpy_update(), "Stone Soup, one Kalman filter": stone_soup_update()}
+        rows = [
+            (f"`{name}`", *(f"{count:,}" for count in differing_updates(name, recording, table)))
+            for name in COMPETITORS
+        ]
+    print("\n".join(markdown_table(("", "updates", "other bits than a replay"), rows)), end="\n\n")
+    cases = {f"`{name}`": own_update(name, "auto") for name in COMPETITORS}
+    cases |= {'`kalman-imm` with `backend="numpy"`': own_update("kalman-imm", "numpy")}
+    cases |= {PEER: filterpy_update(), "Stone Soup, one Kalman filter": stone_soup_update()}
     found = {name: latencies(update, asked.updates) for name, update in cases.items()}
-    peer = float(numpy.median(found["filterpy, IMM of two"]))
-    print(f"\n{'one track, us an update':32} {'median':>8} {'99.9 %':>8} {'filterpy / this':>16}")
+    rows = []
     for name, seconds in found.items():
         median, late = numpy.median(seconds), numpy.quantile(seconds, 0.999)
-        print(f"{name:32} {1e6 * median:8.0f} {1e6 * late:8.0f} {peer / median:16.1f}")
+        ratio = numpy.median(found[PEER]) / median
+        rows.append((name, f"{1e6 * median:.0f}", f"{1e6 * late:.0f}", f"{ratio:.1f}"))
+    print("\n".join(markdown_table(("", "median, µs", "99.9 %, µs", "filterpy's median over it"), rows)))
 
 
 if __name__ == "__main__":

@@ -43,18 +43,6 @@ NAMED = re.compile(r"\{record\}`|docs/records/")
 """How a section says where its numbers are from; README, which nobody renders, by a link."""
 COMMAND = re.compile(r"`(filtergym|python) [^`]+`")
 """How a section of an appendix says so too: its measurements were made once, and stand in no record."""
-NOT_CONVERTED = {
-    "docs/attitude.md",
-    "docs/device.md",
-    "docs/live.md",
-    "docs/log_file.md",
-    "docs/offline_data.md",
-    "docs/own_data.md",
-    "docs/own_estimator.md",
-    "docs/real_data.md",
-    "docs/recipes.md",
-}
-"""Pages with numbers that name no record yet. Whoever converts a page takes it out; nothing is put in."""
 MOST_BYTES = 300_000
 
 
@@ -97,9 +85,7 @@ def test_numbers_of_an_appendix_name_a_command():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_a_sentence_with_a_number_names_its_record(page):
-    """If a page needs no entry in ``NOT_CONVERTED`` any more, take it out."""
-    found = unnamed_numbers(PAGES[page], appendix=page.startswith("docs/appendix/"))
-    assert bool(found) == (page in NOT_CONVERTED), found
+    assert unnamed_numbers(PAGES[page], appendix=page.startswith("docs/appendix/")) == []
 
 
 @pytest.mark.parametrize("page", PAGES)

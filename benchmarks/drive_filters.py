@@ -1,0 +1,87 @@
+"""Filters and agents on the real drive of ``drive.py``: a table in Markdown.
+
+    python benchmarks/drive_filters.py docs/data/drive.nc
+
+Each runs on one axis by itself, as agents were trained, with the two sets of levels that ``drive.py`` finds likeliest:
+of any correlation time, and of that of the environment.
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from filtergym.envs.recording import Recording
+from filtergym.evaluation.metrics import Record
+from filtergym.papers.grid import markdown_table
+
+import filtergym
+
+ID = "filtergym/LooselyCoupledNavigation-v0"
+LEVELS: dict[str, dict[str, float]] = {
+    "30 s": {},
+    "1 s": {"correlation_time": 1.0, "drift": 0.75, "coloured": 0.83},
+}
+"""Parameters by the correlation time of the INS error; those of the file are of the first."""
+COMPETITORS = (
+    "augmented",
+    "augmented-gain",
+    "augmented-sage-husa",
+    "augmented-variational-bayes-tuned",
+    "best-constant",
+    "bptt",
+    "bptt-linear",
+    "bptt-small",
+    "fault-bank",
+    "fault-bank-vague",
+    "gated:bptt",
+    "gated:ppo",
+    "gnss-only",
+    "innovation-adaptive",
+    "ins-only",
+    "kalman-net",
+    "plain-reduced",
+    "ppo",
+)
+
+
+def one_axis(drive: Recording, axis: int) -> Recording:
+    """Keep one axis, as if the vehicle moved along it."""
+    if drive.truth is None:
+        raise ValueError("the drive needs its truth")
+    mean, covariance = drive.initial["mean"], drive.initial["covariance"]
+    return dataclasses.replace(
+        drive,
+        measurements={
+            key: values[..., [axis]] if values.ndim == 3 else values
+            for key, values in drive.measurements.items()
+        },
+        initial={"mean": mean[:, [axis]], "covariance": covariance[:, [axis]][..., [axis]]},
+        truth=drive.truth[..., [axis]],
+        parameters={**drive.parameters, "axes": 1},
+    )
+
+
+def main() -> None:
+    """Print the errors of the position, m, with their intervals, lowest first."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("drive", type=Path, help="file of recordings that drive.py has made")
+    drive = filtergym.read_recording(parser.parse_args().drive, ID)
+    header = ["competitor"]
+    found: dict[str, list[Record]] = {name: [] for name in COMPETITORS}
+    for level, parameters in LEVELS.items():
+        for axis, direction in enumerate(("east", "north")):
+            header.append(f"{direction}, {level}")
+            alone = one_axis(drive, axis)
+            results = filtergym.evaluate(alone.environment, list(COMPETITORS), scenario=alone, **parameters)
+            for record in filtergym.tidy_records(results):
+                if record.window == "all" and record.metric == "rmse":
+                    found[record.policy].append(record)
+    ranked = sorted(found.items(), key=lambda item: item[1][0].value)
+    rows = [
+        [f"`{name}`", *(f"{r.value:.3f} [{r.low:.3f}, {r.high:.3f}]" for r in own)] for name, own in ranked
+    ]
+    print("\n".join(markdown_table(header, rows)))
+
+
+if __name__ == "__main__":
+    main()
