@@ -116,3 +116,61 @@ def update_coordinates(
         squared_distance = distance if squared_distance is None else squared_distance + distance
         determinant = volume if determinant is None else determinant * volume
     return Update(mean, covariance, -0.5 * (squared_distance + xp.log(determinant)), squared_distance)
+
+
+class GainModel(NamedTuple):
+    """What a Kalman gain is computed from where that is not what the covariance is computed from."""
+
+    covariance: Array
+    """Predicted, packed, ``(n (n + 1) / 2, N)``."""
+    R: Array
+    """Variances of the readings, ``(m, N)``."""
+
+
+class UpdateWithGain(NamedTuple):
+    """Result of measurements of single coordinates with the gain of another covariance."""
+
+    mean: Array
+    """``(n, N)``."""
+    covariance: Array
+    """Packed, ``(n (n + 1) / 2, N)``."""
+    gain_covariance: Array
+    """The one that the gain is of, updated by it, likewise."""
+
+
+def update_coordinates_with_gain(
+    mean: Array,
+    covariance: Array,
+    z: Array,
+    coordinates: Sequence[int],
+    R: Array,
+    available: Array,
+    gain_model: GainModel,
+) -> UpdateWithGain:
+    """Take in measurements of single coordinates with the Kalman gain K of another covariance M and other variances.
+
+    One after the other, with k = M_:i / (M_ii + R'):
+
+        x = x + k (z - x_i),  P = P - k u^T - u k^T,  u = P_:i - k (P_ii + R) / 2,  M = M - k M_i:
+
+    which is ``x + K nu`` and ``(I - K H) P (I - K H)^T + K R K^T`` with the joint gain of M and R'.
+
+    Args:
+        mean: predicted, ``(n, N)``.
+        covariance: predicted, packed, ``(n (n + 1) / 2, N)``.
+        z: readings, ``(m, N)``; where not available any finite number.
+        coordinates: which coordinate each sensor reads, m of them.
+        R: variances of the readings, ``(m, N)``.
+        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
+        gain_model: M and R'.
+    """
+    xp = namespace(mean)
+    n, M = mean.shape[0], gain_model.covariance
+    for k, i in enumerate(coordinates):
+        p, q = covariance[column(n, i)], M[column(n, i)]
+        gain = q * (available[k] / (q[i] + gain_model.R[k]))
+        mean = mean + gain * (z[k] - mean[i])
+        u = p - gain * (0.5 * (p[i] + R[k]))
+        covariance = covariance - xp.concat([gain[j:] * u[j] + u[j:] * gain[j] for j in range(n)], axis=0)
+        M = M - xp.concat([gain[j:] * q[j] for j in range(n)], axis=0)
+    return UpdateWithGain(mean, covariance, M)

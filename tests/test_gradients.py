@@ -129,6 +129,7 @@ def random_policy(env, dtype, network="recurrent"):
         ("LooselyCoupledNavigation", "kalman-net", {}, None, "recurrent"),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
         ("UavAutopilot", "gain", {}, None, "recurrent"),
+        ("UavAutopilot", "kalman-net", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
         # Of ten measurements each; its gradient takes longest to compile.
         pytest.param(

@@ -11,13 +11,15 @@ from filtergym.envs.catalogue import catalogue
 from filtergym.envs.draws import Draws
 from filtergym.envs.maneuvering_target import kalman_net as radar
 from filtergym.envs.model import Episode
+from filtergym.envs.uav_autopilot import kalman_net as aircraft
 from filtergym.evaluation.competitors import kind_of
-from filtergym.filters import coordinated_turn, kalman, loosely_coupled
+from filtergym.filters import coordinated_turn, kalman, loosely_coupled, packed_covariance
 from models import make_model
 
 import filtergym
 
 RADAR, FUSION = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
+AIRCRAFT, ESM = "filtergym/UavAutopilot-v0", "filtergym/RadarEsmTracking-v0"
 NAME = "kalman-net"
 HAVING = [id for id, cls in catalogue().items() if NAME in cls.trained_banks]
 
@@ -46,19 +48,20 @@ def episodes(id, count, steps, **keywords):
     rng = np.random.default_rng(2)
     draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
     truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
-    found = []
+    # A loop that is closed by the initial estimate, as no filter is here.
+    found, feedback = [], model.task.feedback(initial.mean, initial) if id == AIRCRAFT else None
     for _ in range(steps):
         noise = (
             rng.normal(size=(model.task.noise.normals, count)),
             rng.random((model.task.noise.row_uniforms, count)),
         )
-        truth, measurement = model.task.world.advance(truth, np.concatenate(noise), None)
+        truth, measurement = model.task.world.advance(truth, np.concatenate(noise), feedback)
         found.append(measurement)
     return model, initial, found
 
 
 def test_who_has_one():
-    assert HAVING == [FUSION, RADAR]
+    assert HAVING == [FUSION, RADAR, AIRCRAFT]
 
 
 def test_of_a_radar_zero_answers_are_a_kalman_filter():
@@ -89,6 +92,55 @@ def test_of_an_ins_zero_answers_are_the_augmented_filter():
     for name in ("error", "nees"):
         augmented, net = dataset[name].values
         np.testing.assert_allclose(net, augmented, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("plant", ["U", "P"])
+def test_of_an_aircraft_zero_answers_are_the_papers_filter(plant):
+    """In a closed loop: what the autopilot is told is the same, too."""
+    competitors = {"kalman": "kalman", "net": EstimatorMaker(NAME, network)}
+    dataset = filtergym.evaluate(AIRCRAFT, competitors, episodes=8, horizon=300, plant=plant)
+    for name in ("error", "nees", "control_signal"):
+        paper, net = dataset[name].values
+        np.testing.assert_allclose(net, paper, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("plant", ["U", "P"])
+def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
+    """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
+    model, initial, measurements = episodes(AIRCRAFT, 16, 60, plant=plant)
+    design, p, task = model.task.design, model.task.parameters, model.task
+    assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
+    F, B, H = design.model.F, design.model.B[:, 0], design.H
+    parts = [Q for Q in (design.model.scaled_noise, design.model.other_noise) if Q.any()]
+    L, m = len(parts), len(task.sensors)
+    assert model.action_space.shape == (2 * (L + m),)
+    rng, bank = np.random.default_rng(0), model.filter
+    state = bank.start(initial)
+    for measurement in measurements:
+        before, state = state, bank.predict(state, measurement)
+        action = rng.uniform(-1.2, 1.2, (2 * (L + m), 16))
+        P_before, M_before = bank.covariance(before), packed_covariance.unpack(before.gain_covariance, len(F))
+        state = bank.act(state, measurement, action)
+        for i, a in enumerate(np.clip(action, -1.0, 1.0).T):
+            x = F @ before.mean[:, i] + B * measurement.control[i]
+            noises = [10.0 ** (p.process_decades * number) * Q for number, Q in zip(a, parts, strict=False)]
+            R = np.diag(10.0 ** (2.0 * p.sensor_decades * a[L : L + m])) @ design.R
+            P = F @ P_before[:, :, i] @ F.T + sum(noises)
+            b, c = a[L + m : 2 * L + m], a[2 * L + m :]
+            M = F @ M_before[:, :, i] @ F.T + sum(
+                aircraft.AGILITY ** (2.0 * number) * Q for number, Q in zip(b, noises, strict=True)
+            )
+            rows = measurement.available[:, i] > 0.0
+            h, W = H[rows], (np.diag(aircraft.CAUTION ** (2.0 * c)) @ R)[np.ix_(rows, rows)]
+            K = M @ h.T @ np.linalg.inv(h @ M @ h.T + W)
+            rest = np.eye(len(F)) - K @ h
+            # Scalar steps against an inverse; condition numbers of S up to 1e4.
+            mean = x + K @ (measurement.reading[rows, i] - h @ x)
+            np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-9, atol=1e-9)
+            joseph = rest @ P @ rest.T + K @ R[np.ix_(rows, rows)] @ K.T
+            np.testing.assert_allclose(bank.covariance(state)[:, :, i], joseph, rtol=1e-9, atol=1e-9)
+            of_gain = packed_covariance.unpack(state.gain_covariance[:, i], len(F))
+            np.testing.assert_allclose(of_gain, rest @ M, rtol=1e-9, atol=1e-9)
 
 
 def test_of_a_radar_any_answer_is_what_the_description_says():
@@ -215,9 +267,12 @@ def test_a_file_that_does_not_fit(stored, change, message):
 
 def test_training_of_an_environment_without_one(command, tmp_path):
     pytest.importorskip("stable_baselines3")
-    code, _, error = command("train", "filtergym/UavAutopilot-v0", "--algo", NAME, "--out", tmp_path / "run")
+    code, _, error = command("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
     assert code == 2
-    assert f"has no filter for '{NAME}' to steer: choose another algorithm, or {FUSION}, {RADAR}" in error
+    assert (
+        f"has no filter for '{NAME}' to steer: choose another algorithm, or {FUSION}, {RADAR}, {AIRCRAFT}"
+        in error
+    )
     code, _, error = command("train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run")
     assert code == 2
     assert "unknown control 'gain'" in error

@@ -109,8 +109,7 @@ def test_shipped_estimators_never_use_what_was_not_received(id, monkeypatch):
     bits.
     """
     names, (scenario, horizon, _) = [*baselines_of(id).estimators], UNRELIABLE[id]
-    if id in (RADAR, "filtergym/LooselyCoupledNavigation-v0"):
-        names.append("kalman-net")
+    names += catalogue()[id].trained_banks
     keywords = {"episodes": 4, "horizon": horizon, "backend": "numpy" if "Tightly" in id else "auto"}
     found = evaluate(id, names, scenario, **keywords)
     monkeypatch.setattr(catalogue()[id].World, "mask_missing", lambda world, measurement: measurement)

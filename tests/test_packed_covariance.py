@@ -55,6 +55,32 @@ def test_one_after_the_other_is_the_joint_update_of_the_sensors_that_answered(se
         assert numpy.linalg.eigvalsh(covariance[..., k]).min() > 0.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_gain_of_another_model_is_that_of_its_joint_update_in_josephs_form(seed: int) -> None:
+    _, P, mean = system(seed)
+    _, M, _ = system(seed + 50)
+    rng = numpy.random.default_rng(seed + 100)
+    coordinates, R, cautious = (2, 1, 4), rng.uniform(0.1, 1.0, (3, 16)), rng.uniform(0.1, 1.0, (3, 16))
+    z, available = 3 * rng.standard_normal((3, 16)), (rng.random((3, 16)) < 0.6).astype(float)
+    model = packed_covariance.GainModel(packed_covariance.pack(M), cautious)
+    found = packed_covariance.update_coordinates_with_gain(
+        mean, packed_covariance.pack(P), z, coordinates, R, available, model
+    )
+    covariance, of_gain = (packed_covariance.unpack(part, 5) for part in found[1:])
+    for k in range(16):
+        rows = [i for i in range(3) if available[i, k]]
+        H = numpy.eye(5)[[coordinates[i] for i in rows]]
+        K = M[:, :, k] @ H.T @ numpy.linalg.inv(H @ M[:, :, k] @ H.T + numpy.diag(cautious[rows, k]))
+        rest = numpy.eye(5) - K @ H
+        joseph = rest @ P[:, :, k] @ rest.T + K @ numpy.diag(R[rows, k]) @ K.T
+        # Scalar steps against an inverse; condition numbers up to 1e4.
+        numpy.testing.assert_allclose(
+            found.mean[:, k], mean[:, k] + K @ (z[rows, k] - H @ mean[:, k]), rtol=1e-9, atol=1e-9
+        )
+        numpy.testing.assert_allclose(of_gain[..., k], rest @ M[:, :, k], rtol=1e-9, atol=1e-9)
+        numpy.testing.assert_allclose(covariance[..., k], joseph, rtol=1e-9, atol=1e-9)
+
+
 def test_torch_agrees_and_differentiates(torch: Any) -> None:
     _, P, mean = system(3)
     packed, z = packed_covariance.pack(P), numpy.ones((2, 16))

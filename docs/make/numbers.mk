@@ -20,13 +20,13 @@ room_LooselyCoupledNavigation := loosely_coupled_navigation
 room_TightlyCoupledNavigation := tightly_coupled_navigation
 
 agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dqn kalman-net
-agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac
+agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear
 
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
-shipped_UavAutopilot := bptt bptt-small bptt-linear ppo
+shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
 shipped_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear

@@ -185,9 +185,13 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             ),
         )
 
+    def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
+        """Process noise under a scale ``(N,)``, at some packed entries, ``(entries, N)``."""
+        return scale * self.process_noise[entries]
+
     def log_trace(self, state: Filter) -> Array:
         """Log of the predicted covariance's trace, with the process noise of the last action."""
-        variances = state.covariance[self.diagonal] + state.scale * self.process_noise[self.diagonal]
+        variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> Filter:
@@ -217,7 +221,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         mean = xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = xp.matmul(self.propagator, state.covariance)
         residual = available * (measurement.reading - self.task.readings_of(mean))
-        predicted = covariance[self.sensor_entries] + state.scale * self.process_noise[self.sensor_entries]
+        predicted = covariance[self.sensor_entries] + self.scaled_noise(state.scale, self.sensor_entries)
         S = xp.reshape(predicted, (m, m, -1)) + self.R
         # A sensor without a reading counts as one with unit variance that agrees with the prediction.
         S = S * (available[:, None] * available[None]) + self.sensor_identity * (1.0 - available[None])

@@ -25,6 +25,7 @@ from ..task import PaperPolicy, Task
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
+from .kalman_net import KalmanNetBank
 from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
@@ -117,8 +118,13 @@ class UavAutopilot(Task):
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
         "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
     }
-    reach = {"noise": ("noise_reach", "process_decades", "sensor_decades"), "gain": ("gain_decades",)}
+    reach = {
+        "noise": ("noise_reach", "process_decades", "sensor_decades"),
+        "gain": ("gain_decades",),
+        "kalman-net": ("process_decades", "sensor_decades"),
+    }
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": ModeBank}
+    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
     causes = CAUSES

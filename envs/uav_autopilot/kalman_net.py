@@ -1,0 +1,125 @@
+r"""The filter of UavAutopilot that a recurrent network steers from inside: the learned estimator ``kalman-net``.
+
+The Kalman filter of the paper with two covariances: that of its errors, P, and the one that its gain is computed from,
+M. At every measurement the network answers with numbers in [-1, 1]: a_l for each part l of the process noise (what the
+level of the disturbance multiplies, and the rest), a_i for each sensor i, and as many again, b_l and b_i:
+
+    noise    Q_l = 10^(process_decades a_l) Q_l,  R_i = 10^(2 sensor_decades a_i) R_i,  P' = F P F^T + sum_l Q_l
+    gain     M' = F M F^T + sum_l agility^(2 b_l) Q_l,  K = M' H^T (H M' H^T + diag(caution^(2 b_i) R_i))^-1,
+             M = (I - K H) M'
+    update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
+
+All zero is the paper's filter: M is P. Of a sensor in a dropout the column of K is zero. What the autopilot uses is x.
+M follows the Riccati equation of noises between limits, so that the filter is stable whatever is answered; with P in
+the place of M it is not. References and reading stand in ``maneuvering_target/kalman_net.py``; the dynamics are left
+alone, because they are known here.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import packed_covariance
+from ..observation import ACTION, Array, Block
+from .banks import NoiseBank
+from .world import Measurement, Start
+
+if TYPE_CHECKING:
+    from .task import UavAutopilot
+
+AGILITY = 5.0
+"""Largest factor and divisor of the disturbances' deviations in the gain alone."""
+CAUTION = 5.0
+"""Likewise of the sensors'."""
+
+
+class NetFilter(NamedTuple):
+    """As :class:`~.banks.Filter`, with the covariance of the gain."""
+
+    mean: Array
+    covariance: Array
+    estimate: Array
+    estimate_covariance: Array
+    scale: Array
+    """Factors on the parts of the process noise in the last update, ``(L, N)``."""
+    action: Array
+    innovation: Array
+    nis: Array
+    log_likelihood: Array
+    mean_innovation: Array
+    mean_square: Array
+    mean_nis: Array
+    gain_covariance: Array
+    """M as a packed triangle, after an update."""
+
+
+class KalmanNetBank(NoiseBank):
+    """The paper's filter, whose noises and gain the action sets."""
+
+    def __init__(self, task: "UavAutopilot", control: str) -> None:
+        super().__init__(task, control)
+        model, sensors = task.design.model, task.sensors
+        parts = {"disturbance": model.scaled_noise, "other": model.other_noise}
+        parts = {name: Q for name, Q in parts.items() if Q.any()}
+        self.noise_parts = [task.constant(packed_covariance.pack(Q)[:, None]) for Q in parts.values()]
+        self.answers = (
+            *parts,
+            *sensors,
+            *(f"agility_{name}" for name in parts),
+            *(f"caution_{s}" for s in sensors),
+        )
+        self.no_action = (0.0,) * len(self.answers)
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """Parts of the process noise, sensors, and what the gain alone takes for them."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+
+    @property
+    def action_block(self) -> Block:
+        """Last answer."""
+        return Block("action", lambda f, _: f.action, "last action", self.answers, ACTION)
+
+    def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
+        """Process noise, its parts scaled by ``(L, N)``, at some packed entries, ``(entries, N)``."""
+        total = scale[0] * self.noise_parts[0][entries]
+        for factor, part in zip(scale[1:], self.noise_parts[1:], strict=True):
+            total = total + factor * part[entries]
+        return total
+
+    def start(self, initial: Start) -> Any:
+        """Start as the paper's filter, a :class:`NetFilter`."""
+        fields = super().start(initial)._asdict()
+        fields["scale"] = self.xp.stack([fields["scale"]] * len(self.noise_parts))
+        return NetFilter(**fields, gain_covariance=fields["covariance"])
+
+    def act(self, state: Any, measurement: Measurement, action: Array) -> Any:
+        """Update a :class:`NetFilter` by the gain that was answered."""
+        xp, p, parts = self.xp, self.parameters, len(self.noise_parts)
+        count = parts + len(self.task.sensors)
+        a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
+        scale = xp.exp(p.process_decades * math.log(10.0) * a[:parts])
+        R = self.nominal_variances * xp.exp(2.0 * p.sensor_decades * math.log(10.0) * a[parts:count])
+        agile = scale * xp.exp(2.0 * math.log(AGILITY) * a[count : count + parts])
+        cautious = R * xp.exp(2.0 * math.log(CAUTION) * a[count + parts :])
+        every, carried = slice(None), xp.matmul(self.propagator, state.gain_covariance)
+        update = packed_covariance.update_coordinates_with_gain(
+            state.mean,
+            state.covariance + self.scaled_noise(scale, every),
+            measurement.reading,
+            self.task.measured,
+            R,
+            measurement.available,
+            packed_covariance.GainModel(carried + self.scaled_noise(agile, every), cautious),
+        )
+        return state._replace(
+            mean=update.mean,
+            covariance=update.covariance,
+            estimate=update.mean,
+            estimate_covariance=update.covariance,
+            scale=scale,
+            action=a,
+            gain_covariance=update.gain_covariance,
+        )
