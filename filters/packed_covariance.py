@@ -149,7 +149,7 @@ def update_coordinates_with_gain(
 ) -> UpdateWithGain:
     """Take in measurements of single coordinates with the Kalman gain K of another covariance M and other variances.
 
-    One after the other, with k = M_:i / (M_ii + R'):
+    One after the other, with ``k = M_:i / (M_ii + R')``::
 
         x = x + k (z - x_i),  P = P - k u^T - u k^T,  u = P_:i - k (P_ii + R) / 2,  M = M - k M_i:
 
