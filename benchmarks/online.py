@@ -156,11 +156,10 @@ def main() -> None:
         path = Path(folder) / "log.csv"
         table = write_log(path, asked.tracks, asked.plots)
         recording = read_recording(path, ID, speeds=(0.001, 1000.0), sampling_interval=T)
-        rows = [
-            (f"`{name}`", *(f"{count:,}" for count in differing_updates(name, recording, table)))
-            for name in COMPETITORS
-        ]
-    print("\n".join(markdown_table(("", "updates", "other bits than a replay"), rows)), end="\n\n")
+        for name in COMPETITORS:
+            count, differing = differing_updates(name, recording, table)
+            print(f"{name}: {count:,} updates, {differing:,} with other bits than the replay", flush=True)
+    print()
     cases = {f"`{name}`": own_update(name, "auto") for name in COMPETITORS}
     cases |= {'`kalman-imm` with `backend="numpy"`': own_update("kalman-imm", "numpy")}
     cases |= {PEER: filterpy_update(), "Stone Soup, one Kalman filter": stone_soup_update()}

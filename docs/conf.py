@@ -52,6 +52,7 @@ html_css_files = ["filtergym.css"]
 html_show_sourcelink = False
 html_copy_source = False
 html_use_index = html_domain_indices = False  # the search finds names
+html_sidebars = {"log_file": []}  # no page stands below it
 html_theme_options = {
     "logo": {"text": "filtergym"},
     "navbar_align": "left",

@@ -56,7 +56,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -120,6 +120,17 @@ $(DONE)/exported: $(shipped)
 	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
 	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
+	$(finish)
+
+$(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation
+	$(BIN)/python benchmarks/drive_filters.py docs/data/drive.nc > build/drive.txt
+	$(table) build/drive.txt --name drive_filters \
+	  --command "python benchmarks/drive_filters.py docs/data/drive.nc"
+	$(finish)
+
+$(DONE)/online: $(DONE)/ship-ManeuveringTarget
+	$(BIN)/python benchmarks/online.py > build/online.txt
+	$(table) build/online.txt --name online_time --command "python benchmarks/online.py"
 	$(finish)
 
 $(DONE)/paper-%:
