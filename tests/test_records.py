@@ -6,16 +6,19 @@ import sys
 from pathlib import Path
 
 import comparison
+import front
 import pytest
 from comparison import compared_policies
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors import RANKED
+from filtergym.evaluation.metrics import Record
 from front import panels_of
 from made_results import results_of
 from readme import with_numbers
 from records import (
     FOLDER,
+    BenchmarkRecords,
     ResultRecord,
     markdown_tables,
     read_benchmark,
@@ -421,3 +424,27 @@ def test_sphinx_renders_what_a_page_names(tmp_path):
         (8, "option environment"),
     ):
         assert re.search(rf"index\.md:{line}: WARNING: .*{words}", warnings), (line, words, warnings)
+
+
+def test_budgets_of_time_name_who_costs_least_in_each(monkeypatch):
+    """Bold is whose whole interval lies below the other's; who takes longer than a budget is not in its column."""
+    problem = problem_of(ENV)
+    monkeypatch.setattr(front, "pretrained_agents", lambda id: {"quick agent", "agent"})
+    shared = (ENV, "gain", problem.task.default_scenario)
+    records = []
+    for name, time, *cost in (
+        ("imm", 90.0, -0.1, -0.12, -0.08),
+        ("quick agent", 95.0, -0.2, -0.22, -0.18),
+        ("slow", 800.0, -0.3, -0.35, -0.25),
+        ("agent", 900.0, -0.31, -0.36, -0.26),
+    ):
+        for metric, part, values in (
+            ("nanoseconds", "compiled", (time, None, None)),
+            ("relative_cost_difference", "", cost),
+        ):
+            records.append(Record(*shared, name, "policy", metric, part, "all", *values, "", 10, 0, "test"))
+    lines = front.budgets_markdown([BenchmarkRecords(problem, records)]).splitlines()
+    classical, learned = ([cell.strip() for cell in line.split("|")[3:-1]] for line in lines[2:])
+    assert (classical[0], learned[0]) == ("`imm` -10.0", "**`quick agent` -20.0**")
+    assert (classical[2], learned[2]) == (classical[0], learned[0])
+    assert (classical[3], learned[3]) == ("`slow` -30.0", "`agent` -31.0")

@@ -1,13 +1,19 @@
-"""The front of cost and time of every environment, drawn from the records of a benchmark in one picture."""
+"""The front of cost and time of every environment, from the records of a benchmark: a picture, and a table."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from filtergym.agents.named_policies import pretrained_agents
+from filtergym.evaluation.competitors import RANKED
 from filtergym.evaluation.front_figure import Panel, draw_panel, legend_of, name_points
+from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.print_layout import figure_with_pairs, in_print
-from filtergym.evaluation.times import points_of_records
+from filtergym.evaluation.times import points_of_records, times_of_records
+from filtergym.papers.grid import markdown_table
 from records import BenchmarkRecords, short_name
+
+BUDGETS = (100, 200, 500, 1000, 2000, 5000)
+"""Nanoseconds that a measurement may take."""
 
 
 def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
@@ -40,3 +46,37 @@ def draw_fronts(panels: Sequence[Panel], *, columns: int = 2) -> Any:
     cells[len(panels)].legend(handles=legend_of(panels), loc="center", frameon=False)
     name_points(figure, dict(zip(cells, panels, strict=False)))
     return figure
+
+
+def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
+    """Return who costs least in so much time, of classical and of learned competitors, in Markdown.
+
+    A learned one is bold where its whole interval lies below that of the classical one, a classical one likewise.
+    """
+    rows = []
+    for problem, records in found:
+        own = [r for r in records if r.scenario == problem.task.default_scenario]
+        times, learned = times_of_records(own), pretrained_agents(problem.id)
+        costs = [
+            r
+            for r in own
+            if r.metric == "relative_cost_difference" and r.kind in RANKED and r.value is not None
+        ]
+        best: list[list[Record | None]] = [[], []]
+        for budget in BUDGETS:
+            quick = [r for r in costs if r.policy in times and times[r.policy].nanoseconds <= budget]
+            for kind, line in enumerate(best):
+                mine = [r for r in quick if (r.policy in learned) == bool(kind)]
+                line.append(min(mine, key=lambda r: r.value, default=None))
+        for kind, title in enumerate(("classical", "learned")):
+            cells = [_cell(own, rival) for own, rival in zip(best[kind], best[1 - kind], strict=True)]
+            rows.append([short_name(problem.id) if not kind else "", title, *cells])
+    return "\n".join(markdown_table(["", "", *(f"{budget:,} ns" for budget in BUDGETS)], rows))
+
+
+def _cell(own: Record | None, rival: Record | None) -> str:
+    if own is None or own.value is None:
+        return "-"
+    text = f"`{own.policy}` {100.0 * own.value:+.1f}"
+    below = rival is None or (own.high is not None and rival.low is not None and own.high < rival.low)
+    return f"**{text}**" if below else text

@@ -18,7 +18,7 @@ from environment_page import environment_table
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.print_layout import save
 from filtergym.papers.grid import markdown_table
-from front import draw_fronts, panels_of
+from front import budgets_markdown, draw_fronts, panels_of
 from records import (
     BENCHMARK,
     SEEDS,
@@ -154,6 +154,14 @@ class FrontFigure(_Rendered):
             raise ValueError(f"the records of {', '.join(names)} hold no times")
         words = f"Cost against processor time of every competitor: {', '.join(names)}"
         return "_".join(["front", *self.name_given.split()]), words, draw_fronts(panels)
+
+
+class BudgetsTable(_Rendered):
+    """``{budgets-table}``: who costs least in so much time, classical and learned, in all environments."""
+
+    def markdown(self) -> str:
+        """Return one table."""
+        return budgets_markdown([self.benchmark(name)[0] for name in recorded_environments()])
 
 
 class SeedsTables(_Rendered):
@@ -300,6 +308,7 @@ DIRECTIVES = {
     "comparison": ComparisonTables,
     "comparison-overview": ComparisonOverview,
     "front-figure": FrontFigure,
+    "budgets-table": BudgetsTable,
     "seeds": SeedsTables,
     "seed-profiles": SeedProfiles,
     "training-curves": TrainingCurves,
