@@ -130,6 +130,7 @@ def random_policy(env, dtype, network="recurrent"):
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
         ("UavAutopilot", "gain", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
+        pytest.param("LooselyCoupledNavigation", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
         # Of ten measurements each; its gradient takes longest to compile.
         pytest.param(
             "TightlyCoupledNavigation",
