@@ -20,11 +20,12 @@ import math
 from typing import Any
 
 import numpy
-from filtergym.baselines.uav_autopilot.level_bank import VAGUE, LevelBank
+from filtergym.baselines.uav_autopilot.level_bank import LevelBank
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.envs.backend import make_model
 from filtergym.envs.draws import Draws
 from filtergym.envs.schedules import Steps
+from filtergym.envs.uav_autopilot.level_bank import VAGUE
 from filtergym.envs.uav_autopilot.task import TASK
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds

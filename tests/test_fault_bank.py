@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.loosely_coupled_navigation import fault_bank
-from filtergym.baselines.loosely_coupled_navigation.fault_bank import TRAINING, FaultBank
+from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.table import Variant
 from filtergym.envs.filter import Initial
+from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.evaluation.filters import put_in_loop
 from filtergym.evaluation.rollout import rollout
@@ -204,7 +204,7 @@ def test_probabilities_stay_probabilities_and_covariances_positive():
 
 def test_it_compiles_and_gives_the_same():
     pytest.importorskip("llvmlite")
-    competitor = Variant(FaultBank, "small", prior=fault_bank.VAGUE, points=1, onsets=2)
+    competitor = Variant(FaultBank, "small", prior=VAGUE, points=1, onsets=2)
     answers = []
     for backend in ("numpy", "compiled"):
         model = make_model(ID, "gain", "random", backend=backend, horizon=80)
@@ -214,3 +214,116 @@ def test_it_compiles_and_gives_the_same():
         answers.append(np.stack([state.filter.mean for state in states]))
     # Exponentials of two libraries over 80 measurements.
     np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-9)
+
+
+# --- control hypotheses
+
+
+@pytest.fixture(scope="module")
+def steered():
+    """The bank of control hypotheses, for every fix its state as predicted and the measurement, and the estimator's
+    answers.
+    """
+    outage = {"outage_probability": 1.0, "outage_start": (0.4, 0.4), "outage_duration": (0.1, 0.3)}
+    model = make_model(ID, "hypotheses", "random", axes=2, horizon=120, **outage)
+    bank, estimator, scans, answers = model.filter, FaultBank(model.task), [], []
+
+    class Watched:
+        kind = "estimator"
+
+        def start(self, initial, N):
+            self.state = bank.start(initial)
+            return estimator.start(initial, N)
+
+        def update(self, measurement, memory):
+            # A bank is given zero where there is no fix, an estimator NaN.
+            given = measurement._replace(fix=np.nan_to_num(measurement.fix))
+            self.state = bank.predict(self.state, given)
+            scans.append((self.state, given))
+            self.state = act(bank, self.state, given, np.zeros(6))
+            answers.append(estimator.update(measurement, memory))
+            return answers[-1]
+
+    for _ in rollout(model, Watched(), episode_seeds("train", 3, 8)):
+        pass
+    assert 0.0 < np.mean([measurement.available for _, measurement in scans]) < 1.0
+    assert sum(state.memory.pulled.weights.max() > 0.01 for state, _ in scans) > 10
+    return bank, scans, answers
+
+
+def act(bank, state, measurement, action):
+    return bank.act(state, measurement, np.array(action)[:, None] + np.zeros(len(measurement.available)))
+
+
+def weights_after(bank, state, measurement, action):
+    memory = act(bank, state, measurement, action).memory
+    return bank.bank.join([memory.free.weights, memory.pulled.weights], 0)
+
+
+def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
+    bank, scans, answers = steered
+    for (state, measurement), (mean, covariance, _, likelihood) in zip(scans, answers, strict=True):
+        after = act(bank, state, measurement, np.zeros(6))
+        np.testing.assert_array_equal(bank.mean(after), mean)
+        np.testing.assert_array_equal(bank.covariance(after), covariance)
+        for name, found in bank.records(after, measurement).items():
+            np.testing.assert_array_equal(found, getattr(likelihood, name))
+
+
+@pytest.mark.parametrize(("index", "factor"), [(0, 1.05), (1, 1.05)])
+def test_hypotheses_multiplies_odds(steered, index, factor):
+    bank, scans, _ = steered
+    points = bank.bank.prior.points
+    for state, measurement in scans[::7]:
+        before = weights_after(bank, state, measurement, np.zeros(6))
+        after = weights_after(bank, state, measurement, 0.7 * np.eye(6)[index])
+        raised = np.zeros(len(before), dtype=bool)
+        raised[[slice(points + 1, None), slice(1)][index]] = True
+        # Odds of sums, whatever the hypotheses weigh.
+        odds = [p[raised].sum(axis=0) / p[~raised].sum(axis=0) for p in (before, after)]
+        there = measurement.available > 0.0
+        np.testing.assert_allclose(odds[1], np.where(there, factor**0.7, 1.0) * odds[0], rtol=1e-9)
+
+
+def test_hypotheses_scales_noises(steered):
+    """As if the hypotheses had been predicted with other noises, and the fix weighed with other levels."""
+    bank, scans, _ = steered
+    inner, action = bank.bank, np.array([0.0, 0.0, 0.6, -0.5, 0.8, -0.9])
+    level, receiver, inertial, wandering = np.array([1.5, 1.25, 2.0, 2.0]) ** action[2:]
+    noises = inner.noises._replace(
+        coloured_growth=inertial * inner.noises.coloured_growth,
+        white_growth=inertial * inner.noises.white_growth,
+        wandering=math.sqrt(wandering) * inner.noises.wandering,
+    )
+    # Measurements at which every lane has a fix and which are not the first.
+    chosen = [k for k in range(1, len(scans)) if (scans[k][1].available > 0.0).all()]
+    assert len(chosen) > 20
+    for k in chosen[::4]:
+        state, measurement = scans[k]
+        before = act(bank, *scans[k - 1], np.zeros(6)).memory
+        free, pulled = inner.change(before.free, before.pulled, measurement.number)
+        free = inner.predict_part(free, noises)
+        pulled = inner.predict_part(pulled, type(noises)(*(each[1:] for each in noises)))
+        variances = np.array(inner.prior.levels)[:, None]
+        levels = state.memory.levels * level ** (np.log(variances) / math.log(variances[-1, 0]))
+        predicted = state.memory._replace(
+            free=free,
+            pulled=pulled,
+            levels=levels / levels.sum(axis=0),
+            reported=receiver * state.memory.reported,
+        )
+        expected = inner.update_bank(predicted, measurement, inner.weigh(predicted, measurement))
+        found = act(bank, state, measurement, action)
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(found.memory.levels, expected.memory.levels, rtol=1e-8, atol=1e-12)
+
+
+def test_groups_of_hypotheses_are_probabilities(steered):
+    bank, scans, _ = steered
+    for state, _ in scans[::10]:
+        for groups in (state.predicted, state.probabilities):
+            assert (groups >= 0.0).all()
+            np.testing.assert_allclose(groups[: len(bank.noise_names)].sum(axis=0), 1.0, rtol=1e-12)
+        pulled = state.memory.pulled.weights.sum(axis=(0, 1))
+        np.testing.assert_allclose(state.predicted[-2:].sum(axis=0), pulled, rtol=1e-12)

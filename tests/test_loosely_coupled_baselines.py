@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedEstimator
-from filtergym.baselines.loosely_coupled_navigation.fault_bank import VAGUE, FaultBank
+from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.loosely_coupled_navigation.metrics import (
     FALSE_ALARM,
     RISK,
@@ -20,6 +20,7 @@ from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.envs.catalogue import task_class
+from filtergym.envs.loosely_coupled_navigation.fault_bank import VAGUE
 from filtergym.envs.schedules import within
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds

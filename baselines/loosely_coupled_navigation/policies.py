@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
+from ...envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
 from ...envs.model import Model
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import loosely_coupled as ins_gnss
@@ -19,7 +20,7 @@ from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
 from .estimators import AugmentedEstimator
-from .fault_bank import TRAINING, VAGUE, FaultBank
+from .fault_bank import FaultBank
 from .metrics import METRICS
 from .references import Matched, MatchedCovariance
 

@@ -107,8 +107,8 @@ class Schemes(NamedTuple):
     """In force, ``(3, N)``."""
 
 
-class _KalmanBucyBank(Bank[Task, Measurement, Any]):
-    """What both banks share: the innovations that are shown, and the end of the observation."""
+class KalmanBucyBank(Bank[Task, Measurement, Any]):
+    """What the banks share: the innovations that are shown, and the end of the observation."""
 
     parameters: LooselyCoupledNavigationParameters
     filters: tuple[str, ...] = ()
@@ -262,7 +262,7 @@ NOISES = ("receiver", "coloured", "white")
 """What the action scales under ``noise``."""
 
 
-class NoiseBank(_KalmanBucyBank):
+class NoiseBank(KalmanBucyBank):
     """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
@@ -361,7 +361,7 @@ class NoiseBank(_KalmanBucyBank):
         return self.consistency(state, measurement)
 
 
-class GainBank(_KalmanBucyBank):
+class GainBank(KalmanBucyBank):
     """Control ``gain``: the plain scheme, whose gain on every axis the action sets."""
 
     def __init__(self, task: Task, control: str) -> None:
@@ -442,7 +442,7 @@ class GainBank(_KalmanBucyBank):
         return found
 
 
-class SchemeBank(_KalmanBucyBank):
+class SchemeBank(KalmanBucyBank):
     """Controls ``mode`` and ``weights``: three filters run side by side without mixing; the action reports."""
 
     filters = SCHEMES

@@ -25,6 +25,7 @@ from ..rendering import (
     grown,
 )
 from .banks import NOISES, Augmented, Schemes, Steered
+from .hypotheses import ACTIONS, SteeredBank
 from .task import LooselyCoupledNavigation
 
 TRACK = (0.06, 0.075, 0.43, 0.80)
@@ -64,10 +65,11 @@ class LooselyCoupledNavigationPicture(Picture):
             # A gain of zero has no logarithm: it is drawn at the smallest one that an action can set.
             smallest = self.task.parameters.smallest_gain
             values["log_gain"] = math.log10(max(float(filters.gain[0, 0]), smallest))
-        elif isinstance(filters, Augmented):
+        elif isinstance(filters, Augmented | SteeredBank):
             values["innovation"] = math.nan if missing else normalised[0, 0]
-            for name, action in zip(NOISES, filters.action[:, 0], strict=True):
-                values[f"noise.{name}"] = action
+            names = NOISES if isinstance(filters, Augmented) else ACTIONS
+            for name, action in zip(names, filters.action[:, 0], strict=True):
+                values[f"action.{name}"] = action
         else:
             assert isinstance(filters, Schemes)
             for i, weight in enumerate(filters.weights[:, 0]):
@@ -101,10 +103,13 @@ class LooselyCoupledNavigationPicture(Picture):
             low = math.log10(self.task.parameters.smallest_gain)
             innovations = {"innovation": "innovation"}
             steered = Strip(f"log10 of the gain{suffix}", {"gain": "log_gain"}, (low, 0.2), steps=True)
-        elif self.model.control == "noise":
+        elif self.model.control in ("noise", "hypotheses"):
             innovations = {"innovation": "innovation"}
-            noises = {name: f"noise.{name}" for name in NOISES}
-            steered = Strip("action: noises", noises, (-1.08, 1.08), guides=(0.0,), steps=True)
+            names = NOISES if self.model.control == "noise" else ACTIONS
+            actions = {name: f"action.{name}" for name in names}
+            steered = Strip(
+                f"action: {self.model.control}", actions, (-1.08, 1.08), guides=(0.0,), steps=True
+            )
         else:
             names = self.task.modes
             innovations = {names[2]: "innovation.2"}

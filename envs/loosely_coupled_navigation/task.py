@@ -18,6 +18,7 @@ from ..task import Component, PaperPolicy, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES
+from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .live import PositionInput
 from .logs import LOG_FORMAT
@@ -115,6 +116,10 @@ class LooselyCoupledNavigation(Task):
         "gain": "gain of this sample, logarithmic from the settled gain of the paper's reduced tuning (0.042, "
         "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
         "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
+        "hypotheses": "factors r^a in the bank over faults at this fix: odds that the receiver is pulled off (r = 1.05), "
+        "that all noises are as modelled (1.05), probability of the receiver's highest level (1.1); variance of the fix "
+        "(1.25), process noise of the INS and of the receiver's coloured error (1.25 each); **0 is the estimator "
+        "`fault-bank`**",
         "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
@@ -123,7 +128,13 @@ class LooselyCoupledNavigation(Task):
         "gain": ("smallest_gain",),
         "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
     }
-    banks = {"noise": NoiseBank, "gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
+    banks = {
+        "noise": NoiseBank,
+        "gain": GainBank,
+        "hypotheses": HypothesesBank,
+        "mode": SchemeBank,
+        "weights": SchemeBank,
+    }
     trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     modes = SCHEMES

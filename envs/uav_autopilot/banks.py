@@ -1,4 +1,4 @@
-"""The Kalman filter of UavAutopilot that is steered; equations (10) to (12), packed as ``packed_covariance``."""
+"""The Kalman filters of UavAutopilot that are steered; equations (10) to (12), packed as ``packed_covariance``."""
 
 import math
 from collections.abc import Sequence
@@ -64,8 +64,8 @@ class Filter(NamedTuple):
     """Short average of the NIS, ``(N,)``."""
 
 
-class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
-    """What both controls share: a subclass says what an action does to the process noise."""
+class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
+    """What all controls share: the innovations that are shown, and what comes with them."""
 
     parameters: UavAutopilotParameters
     action_block: Any
@@ -74,20 +74,10 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
 
     def __init__(self, task: "UavAutopilot", control: str) -> None:
         super().__init__(task, control)
-        constant, design, n, m = task.constant, task.design, len(task.components), len(task.sensors)
-        model, pack = design.model, packed_covariance.pack
-        self.F, self.B = constant(model.F), constant(model.B)
-        self.propagator = constant(packed_covariance.propagator(model.F))
-        scaled, other = (constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise))
-        self.process_noise = scaled + other
-        self.R = constant(design.R[:, :, None])
+        constant, n, m = task.constant, len(task.components), len(task.sensors)
         self.sensor_identity = constant(numpy.eye(m)[:, :, None])
         self.sensor_sigmas = constant(self.parameters.value("sensor_sigmas"))[:, None]
-        self.sensor_entries = [
-            packed_covariance.position(n, i, j) for i in task.measured for j in task.measured
-        ]
-        self.diagonal = packed_covariance.diagonal(n)
-        self.trace_weights = constant(1.0 / (n * numpy.diag(design.steady.posterior))[:, None])
+        self.trace_weights = constant(1.0 / (n * numpy.diag(task.design.steady.posterior))[:, None])
         self.forget = 1.0 / self.parameters.averaging_measurements
 
     @property
@@ -185,6 +175,69 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             ),
         )
 
+    def log_trace(self, state: Any) -> Array:
+        """Log of the predicted covariance's trace."""
+        raise NotImplementedError
+
+    def compare(self, state: Any, measurement: Measurement, readings: Array, S: Array) -> Any:
+        """Return the state with innovations, and their averages, of readings as predicted.
+
+        Args:
+            state: before the measurement.
+            measurement: that arrives.
+            readings: predicted, ``(m, N)``.
+            S: covariance of their innovations if all sensors answer, ``(m, m, N)``.
+        """
+        xp, available, m = self.xp, measurement.available, len(self.task.sensors)
+        residual = available * (measurement.reading - readings)
+        # A sensor without a reading counts as one with unit variance that agrees with the prediction.
+        S = S * (available[:, None] * available[None]) + self.sensor_identity * (1.0 - available[None])
+        density, squared_distance = gaussian.log_density(residual, S)
+        innovation = residual / xp.sqrt(xp.stack([S[i, i] for i in range(m)]))
+        count = ordered_sum(available[i] for i in range(m))
+        nis = xp.where(count > 0.0, squared_distance / xp.clip(count, 1.0, None), state.mean_nis)
+        forget = self.forget
+        return state._replace(
+            innovation=innovation,
+            nis=nis,
+            log_likelihood=density + 0.5 * math.log(2.0 * math.pi) * (m - count),
+            mean_innovation=state.mean_innovation + forget * available * (innovation - state.mean_innovation),
+            mean_square=state.mean_square + forget * available * (innovation**2 - state.mean_square),
+            mean_nis=state.mean_nis + forget * (nis - state.mean_nis),
+        )
+
+    def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
+        """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the
+        innovation over its sigma of the output's sensor (of the first where the output is not measured).
+        """
+        task, xp = self.task, self.xp
+        count = ordered_sum(measurement.available)
+        shown = task.measured.index(task.output) if task.output in task.measured else 0
+        return {
+            "nis": xp.where(count > 0.0, state.nis * count, math.nan),
+            "nis_degrees": count,
+            "log_likelihood": xp.where(count > 0.0, state.log_likelihood, math.nan),
+            "innovation": state.innovation[shown],
+        }
+
+
+class _KalmanBank(AutopilotBank):
+    """One Kalman filter: a subclass says what an action does to its noises."""
+
+    def __init__(self, task: "UavAutopilot", control: str) -> None:
+        super().__init__(task, control)
+        constant, n = task.constant, len(task.components)
+        model, pack = task.design.model, packed_covariance.pack
+        self.F, self.B = constant(model.F), constant(model.B)
+        self.propagator = constant(packed_covariance.propagator(model.F))
+        scaled, other = (constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise))
+        self.process_noise = scaled + other
+        self.R = constant(task.design.R[:, :, None])
+        self.sensor_entries = [
+            packed_covariance.position(n, i, j) for i in task.measured for j in task.measured
+        ]
+        self.diagonal = packed_covariance.diagonal(n)
+
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
         """Process noise under a scale ``(N,)``, at some packed entries, ``(entries, N)``."""
         return scale * self.process_noise[entries]
@@ -217,29 +270,13 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
 
     def predict(self, state: Filter, measurement: Measurement) -> Filter:
         """Equation (10), and the innovations, with the process noise of the last action."""
-        xp, available, m = self.xp, measurement.available, len(self.task.sensors)
-        mean = xp.matmul(self.F, state.mean) + self.B * measurement.control
-        covariance = xp.matmul(self.propagator, state.covariance)
-        residual = available * (measurement.reading - self.task.readings_of(mean))
+        m = len(self.task.sensors)
+        mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
+        covariance = self.xp.matmul(self.propagator, state.covariance)
         predicted = covariance[self.sensor_entries] + self.scaled_noise(state.scale, self.sensor_entries)
-        S = xp.reshape(predicted, (m, m, -1)) + self.R
-        # A sensor without a reading counts as one with unit variance that agrees with the prediction.
-        S = S * (available[:, None] * available[None]) + self.sensor_identity * (1.0 - available[None])
-        density, squared_distance = gaussian.log_density(residual, S)
-        innovation = residual / xp.sqrt(xp.stack([S[i, i] for i in range(m)]))
-        count = ordered_sum(available[i] for i in range(m))
-        nis = xp.where(count > 0.0, squared_distance / xp.clip(count, 1.0, None), state.mean_nis)
-        forget = self.forget
-        return state._replace(
-            mean=mean,
-            covariance=covariance,
-            innovation=innovation,
-            nis=nis,
-            log_likelihood=density + 0.5 * math.log(2.0 * math.pi) * (m - count),
-            mean_innovation=state.mean_innovation + forget * available * (innovation - state.mean_innovation),
-            mean_square=state.mean_square + forget * available * (innovation**2 - state.mean_square),
-            mean_nis=state.mean_nis + forget * (nis - state.mean_nis),
-        )
+        S = self.xp.reshape(predicted, (m, m, -1)) + self.R
+        compared: Filter = self.compare(state, measurement, self.task.readings_of(mean), S)
+        return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Return the action as shown, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
@@ -284,22 +321,8 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         """Covariance reported for it, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
-    def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
-        """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the
-        innovation over its sigma of the output's sensor (of the first where the output is not measured).
-        """
-        task, xp = self.task, self.xp
-        count = ordered_sum(measurement.available)
-        shown = task.measured.index(task.output) if task.output in task.measured else 0
-        return {
-            "nis": xp.where(count > 0.0, state.nis * count, math.nan),
-            "nis_degrees": count,
-            "log_likelihood": xp.where(count > 0.0, state.log_likelihood, math.nan),
-            "innovation": state.innovation[shown],
-        }
 
-
-class GainBank(_AutopilotFilter):
+class GainBank(_KalmanBank):
     """Control ``gain``: the action scales the process noise."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
@@ -322,7 +345,7 @@ class GainBank(_AutopilotFilter):
         return super().covariance(state) * factor
 
 
-class NoiseBank(_AutopilotFilter):
+class NoiseBank(_KalmanBank):
     """Control ``noise``: the action scales the process noise and the noise of every sensor."""
 
     def __init__(self, task: "UavAutopilot", control: str) -> None:
@@ -353,7 +376,7 @@ class NoiseBank(_AutopilotFilter):
         return self.nominal_variances * scale
 
 
-class ModeBank(_AutopilotFilter):
+class ModeBank(_KalmanBank):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
     action_space = gymnasium.spaces.Discrete(len(MODES))

@@ -5,10 +5,13 @@ from collections.abc import Sequence
 
 from ..model import Episode, Model
 from ..rendering import Picture, Strip, error_strip
-from .banks import MODES, Filter
+from .banks import MODES, AutopilotBank, Filter
+from .hypotheses import SteeredLevels
 from .task import UavAutopilot
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
+BY_NAME = ("noise", "hypotheses")
+"""Controls whose actions are drawn, each with its name."""
 LEAST = 1.5
 """Half of the smallest range of the output, in units of the output: a unit step and some noise."""
 
@@ -26,25 +29,31 @@ class UavAutopilotPicture(Picture):
             self.task.measured.index(self.task.output) if self.task.output in self.task.measured else 0
         )
         self.sensor = self.task.sensors[self.shown]
+        assert isinstance(model.filter, AutopilotBank)
+        self.actions = model.filter.action_block.parts
 
     def records(self, state: Episode) -> dict[str, float]:
         """Signals of the loop, NIS, and the levels of the noise."""
         task, truth, estimator = self.task, state.truth, state.filter
-        assert isinstance(estimator, Filter)
+        assert isinstance(estimator, Filter | SteeredLevels)
         answered = state.measurement.available[self.shown, 0] > 0.0
         values = {
             "command": truth.command[0],
             "output": truth.state[task.output, 0],
-            "estimate": estimator.estimate[task.output, 0],
+            "estimate": self.model.mean(state)[task.output, 0],
             "control": self.model.filter.feedback(estimator, state.measurement)[0],
             # A line breaks off where there is no reading.
             "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
             "mean_nis": estimator.mean_nis[0],
             "level": truth.level[0],
-            "log10_scale": math.log10(estimator.scale[0]),
         }
         if self.model.control == "mode":
             values["mode"] = float(estimator.action[:, 0].argmax())
+        elif self.model.control in BY_NAME:
+            for name, action in zip(self.actions, estimator.action[:, 0], strict=True):
+                values[f"action.{name}"] = action
+        else:
+            values["log10_scale"] = math.log10(estimator.scale[0])
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
     def strips(self) -> Sequence[Strip]:
@@ -61,6 +70,11 @@ class UavAutopilotPicture(Picture):
                 {"action": "log10_scale"},
                 (-1.05 * reach, 1.05 * reach),
                 guides=(0.0,),
+            )
+        elif self.model.control in BY_NAME:
+            actions = {name: f"action.{name}" for name in self.actions}
+            steered = Strip(
+                f"action: {self.model.control}", actions, (-1.08, 1.08), guides=(0.0,), steps=True
             )
         else:
             legend = ", ".join(f"{i} {mode}" for i, mode in enumerate(MODES))

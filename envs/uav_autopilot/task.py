@@ -25,6 +25,7 @@ from ..task import PaperPolicy, Task
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
+from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
@@ -115,6 +116,9 @@ class UavAutopilot(Task):
         "was just shown; **0 is the paper's filter**",
         "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
         "update by the measurement that was just shown; **0 is the paper's filter**",
+        "hypotheses": "factors r^a in the bank over levels at this measurement: probability of the highest level of the "
+        "gusts (r = 1.1), that all noise is as designed (1.25), the process noise (2), the variance of each sensor (1.5); "
+        "**0 is the estimator `level-bank`**",
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
         "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
     }
@@ -123,7 +127,7 @@ class UavAutopilot(Task):
         "gain": ("gain_decades",),
         "kalman-net": ("process_decades", "sensor_decades"),
     }
-    banks = {"noise": NoiseBank, "gain": GainBank, "mode": ModeBank}
+    banks = {"noise": NoiseBank, "gain": GainBank, "hypotheses": HypothesesBank, "mode": ModeBank}
     trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]

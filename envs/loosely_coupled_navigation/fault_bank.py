@@ -1,0 +1,488 @@
+r"""A bank of Kalman filters over what nobody says of LooselyCoupledNavigation: noise levels, coloured error, spoofing.
+
+Every hypothesis is a pair: what the noises are (J points of the INS's drift, coloured and white noise and of the
+receiver's coloured error; the first is what the task models), and since when the receiver is pulled off (not at all, or
+since one of B onsets). Its filter estimates the INS error, the receiver's coloured error and the rate of the pull
+(``filters/receiver_faults.py``). The level of the receiver's white noise is a Markov chain of L levels, which all
+hypotheses share; it enters each filter as a Gaussian sum.
+
+Before each measurement, every ``spacing`` measurements, each hypothesis without a pull gives birth to one that is
+pulled from here on, in the place of the oldest. A pull ends with the hazard of a duration that is uniform between
+``shortest`` and ``longest``; what ends is merged with the hypothesis of the same noises that knows of no pull, by its
+moments. What is as modelled is never pulled off: nothing befalls an undisturbed episode, and a drift of the INS looks
+like a slow pull. So there are J + (J - 1) B filters.
+
+Reading: one pull and one chain of levels serve all axes, but the rate of the pull is estimated on each axis alone.
+
+It is the estimator ``fault-bank`` of the baselines, and what the control ``hypotheses`` steers.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...filters import imm
+from ...filters import receiver_faults as faults
+from ...filters.loosely_coupled import AugmentedCovariance
+from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ..filter import Initial
+from ..observation import Array
+from ..task import Task
+from .world import Measurement
+
+LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))
+"""Variances of the receiver over the reported one that are told apart."""
+
+SAME_REPORT = 1e-9
+"""Share by which the reported variance may change without being another report: more than rounding does."""
+
+
+class FaultPrior(NamedTuple):
+    """What a bank expects before it has seen anything; times in s."""
+
+    points: int = 6
+    """Points of noises beside the modelled one."""
+    modelled: float = 0.5
+    """Probability that all noises are as modelled and nothing is pulled off. Ours, as likely as not: in the training
+    distribution one of six, of which a bank is a percent better there, and pays for it where nothing is wrong."""
+    drift: tuple[float, float] = (0.05, 10**0.5)
+    """Limits of the drift's standard deviation over the modelled one."""
+    intensity: tuple[float, float] = (0.005, 10**0.5)
+    """Limits of the intensities of coloured and white noise over the modelled ones."""
+    wandering: tuple[float, float] = (0.0, 0.5)
+    """Limits of the standard deviation of the receiver's coloured error, m."""
+    lasting: tuple[float, float] = (0.5, 5.0)
+    """Limits of the correlation time of that error."""
+    onset: tuple[float, float] = (0.5, 3.5)
+    """When a pull may begin."""
+    onset_rate: float = 0.07
+    """Pulls expected in a second of that time."""
+    onsets: int = 6
+    """B, hypotheses of a pull that are kept."""
+    shortest: float = 0.5
+    longest: float = 2.0
+    rate: float = 3**0.5
+    """Standard deviation of the rate of a pull, m/s."""
+    levels: tuple[float, ...] = LEVELS
+    """Variances of the receiver over the reported one, ascending, one of them 1."""
+    level_rate: float = 0.3
+    """Changes of the level expected in a second."""
+    distrust: float = 0.05
+    """Probability that a report is wrong from the start."""
+    outlier: float = 0.0
+    """Probability of an outlier."""
+    outlier_factor: float = 100.0
+    """Its variance over that of the others."""
+
+
+TRAINING = FaultPrior()
+VAGUE = FaultPrior(
+    drift=(0.02, 5.0),
+    intensity=(0.002, 10.0),
+    wandering=(0.0, 1.5),
+    lasting=(0.5, 20.0),
+    onset=(0.0, math.inf),
+    onset_rate=0.05,
+    shortest=0.0,
+    longest=3.0,
+    rate=3.0,
+    outlier=0.01,
+)
+
+
+def spread_points(points: int, dimensions: int) -> numpy.ndarray:
+    """Points that fill the unit cube evenly, ``(points, dimensions)``: the Kronecker sequence of the powers of the
+    root of ``x^(d + 1) = x + 1`` (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
+    """
+    root = 2.0
+    for _ in range(60):
+        root = (1.0 + root) ** (1.0 / (dimensions + 1))
+    steps = root ** -numpy.arange(1.0, dimensions + 1)
+    return (0.5 + numpy.arange(points)[:, None] * steps) % 1.0
+
+
+class Hypotheses(NamedTuple):
+    """Hypotheses of J noises and M onsets, with S = 4 states (delta, beta, eta, e) or 5 (and the rate of a pull)."""
+
+    mean: Array
+    """``(S, A, J, M, N)``."""
+    covariance: faults.FaultCovariance
+    """``(..., J, M, N)``."""
+    weights: Array
+    """Probabilities, ``(J, M, N)``."""
+
+
+class Memory(NamedTuple):
+    """Memory of the bank."""
+
+    free: Hypotheses
+    """Those without a pull, M = 1."""
+    pulled: Hypotheses
+    """Those of all noises but the modelled ones, M = B."""
+    levels: Array
+    """Probabilities of the receiver's levels, ``(L, N)``."""
+    reported: Array
+    """Variance last reported, m^2, ``(N,)``."""
+
+
+class Noises(NamedTuple):
+    """Noises of the hypotheses, ``(J, 1, 1)`` each."""
+
+    drift: Array
+    """Standard deviation, m/s."""
+    coloured: Array
+    """Stationary standard deviation of the coloured rate error, m/s."""
+    coloured_growth: Array
+    """Variance that it gains in a step, m^2/s^2."""
+    white_growth: Array
+    """Variance of the displacement in a step that this gain does not explain, m^2."""
+    wandering: Array
+    """Stationary standard deviation of the receiver's coloured error, m."""
+    decay: Array
+    """What is left of that error after a step."""
+
+
+class Weighing(NamedTuple):
+    """What a measurement says of predicted hypotheses, those without a pull first, H of both together."""
+
+    log_likelihood: Array
+    """Of the measurement, ``(N,)``."""
+    weights: Array
+    """Probabilities of the hypotheses after it, ``(H, N)``."""
+    levels: Array
+    """Those of the receiver's levels, ``(L, N)``."""
+    expected: Array
+    """INS less receiver as it was predicted, m, ``(A, N)``."""
+    own: Array
+    """Mean of the hypotheses' variances of that without the receiver's noise, m^2, ``(N,)``."""
+    nis: Array
+    """Normalised innovation squared of all together, ``(N,)``."""
+    innovations: tuple[Array, Array]
+    """Of the hypotheses without and with a pull, m, ``(A, J, M, N)`` each."""
+    directions: tuple[faults.Direction, faults.Direction]
+    """Along which they are updated."""
+    noises: tuple[faults.NoiseMixture, faults.NoiseMixture]
+    """What their innovations say."""
+
+
+class Posterior(NamedTuple):
+    """What a measurement leaves of the hypotheses."""
+
+    mean: Array
+    """Position of all together, m, ``(A, N)``."""
+    covariance: Array
+    """m^2, ``(A, A, N)``."""
+    memory: Memory
+
+
+class FaultFilter:
+    """Bank.
+
+    Args:
+        task: the problem.
+        prior: what it expects.
+        **changed: fields of the prior.
+    """
+
+    def __init__(self, task: Task, prior: FaultPrior = TRAINING, **changed: Any) -> None:
+        self.prior = prior = prior._replace(**changed)
+        p = self.parameters = task.parameters
+        self.xp, self.step = task.xp, p.sampling_interval
+        self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
+        self.spacing = max(round(prior.longest / (prior.onsets * self.step)), 1)
+        self.noises = Noises(*(task.constant(each)[:, None, None] for each in self.draw_noises()))
+        self.others = Noises(*(each[1:] for each in self.noises))
+        self.noise_weights = task.constant(
+            numpy.array([prior.modelled] + [(1.0 - prior.modelled) / prior.points] * prior.points)
+        )[:, None, None]
+        self.factors = task.constant(numpy.array([*prior.levels]))[:, None]
+        uniform = numpy.full(len(prior.levels), 1.0 / len(prior.levels))
+        exact = numpy.isclose(prior.levels, 1.0).astype(float)
+        self.uniform = task.constant(uniform)[:, None]
+        self.fresh = task.constant((1.0 - prior.distrust) * exact + prior.distrust * uniform)[:, None]
+        self.onsets = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
+
+    def draw_noises(self) -> Noises:
+        """Points of noises, the modelled one first, ``(J,)`` each."""
+        prior, p = self.prior, self.parameters
+        unit = spread_points(prior.points, 5).T
+
+        def between(limits: tuple[float, float], where: numpy.ndarray) -> numpy.ndarray:
+            return limits[0] * (limits[1] / limits[0]) ** where
+
+        def after(first: float, others: numpy.ndarray) -> numpy.ndarray:
+            return numpy.concatenate([[first], others])
+
+        low, high = prior.wandering
+        coloured = p.coloured * numpy.sqrt(after(1.0, between(prior.intensity, unit[1])))
+        white = p.white_intensity * after(1.0, between(prior.intensity, unit[2]))
+        return Noises(
+            p.drift * after(1.0, between(prior.drift, unit[0])),
+            coloured,
+            (coloured * p.sampling.coloured) ** 2,
+            white * self.step + p.sampling.residual * coloured**2,
+            after(0.0, low + (high - low) * unit[3]),
+            numpy.exp(-self.step / after(prior.lasting[0], between(prior.lasting, unit[4]))),
+        )
+
+    def start_bank(self, initial: Initial) -> Memory:
+        """Start where INS and reference agree, without a pull."""
+        xp, noises = self.xp, self.noises
+        none = 0.0 * initial.mean[0]
+        zero = none + 0.0 * noises.drift
+        ins = AugmentedCovariance(zero, zero, zero, zero + noises.drift**2, zero, zero + noises.coloured**2)
+        P = faults.FaultCovariance(ins, xp.stack([zero[None]] * 3), (zero + noises.wandering**2)[None, None])
+        still = xp.stack([0.0 * initial.mean[:, None, None] + zero[None]] * 4)
+        free = Hypotheses(still, P, zero + self.noise_weights)
+        born = self.give_birth(free)
+        others = [
+            xp.stack([values[..., 0, :]] * self.prior.onsets, axis=-2) for values in (born.mean, *_flat(born))
+        ]
+        pulled = Hypotheses(others[0], _covariance(others[1:]), 0.0 * others[0][0, 0])
+        return Memory(free, pulled, self.fresh + none, none)
+
+    def give_birth(self, free: Hypotheses) -> Hypotheses:
+        """Hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
+        xp = self.xp
+        none = 0.0 * free.weights[1:]
+        P = faults.FaultCovariance(
+            AugmentedCovariance(*(values[1:] for values in free.covariance.ins)),
+            free.covariance.cross[:, :, 1:],
+            free.covariance.faults[:, :, 1:],
+        )
+        return Hypotheses(
+            xp.concat([free.mean[:, :, 1:], 0.0 * free.mean[:1, :, 1:]]),
+            faults.add_fault(P, self.prior.rate**2 + none),
+            free.weights[1:],
+        )
+
+    def since_onset(self, number: Array) -> Array:
+        """Measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a measurement."""
+        cycle = float(self.spacing * self.prior.onsets)
+        since = number - self.onsets
+        return since - cycle * self.xp.floor(since / cycle)
+
+    def age(self, number: Array) -> Array:
+        """Age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
+        return self.step * (self.since_onset(number) + 0.5 * (self.spacing + 1))
+
+    def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
+        """End pulls and let others begin."""
+        xp, prior, T = self.xp, self.prior, self.step
+        since, age = self.since_onset(number), self.age(number)
+        born = (since == 0.0) & (number >= self.onsets)
+        left = xp.clip(prior.longest - age, T, None)
+        hazard = xp.where(age > prior.shortest, T / left, 0.0)
+        hazard = xp.where(since == 0.0, 1.0, xp.clip(hazard, None, 1.0))
+        begins = (number * T >= prior.onset[0]) & (number * T <= prior.onset[1])
+        share = prior.onset_rate * self.spacing * T
+        # At most one of the onsets is born at a measurement.
+        given = xp.where(born & begins, share / (1.0 + share), 0.0)
+        begun = self.give_birth(free)
+        merged = self.merge(begun, pulled, 1.0 - ordered_sum(given), hazard)
+        replaced = [xp.where(born, new, old) for new, old in zip(_flat(begun), _flat(pulled), strict=True)]
+        free = Hypotheses(
+            xp.concat([free.mean[:, :, :1], merged.mean], axis=2),
+            _covariance(
+                [
+                    xp.concat([old[..., :1, :, :], new], axis=-3)
+                    for old, new in zip(_flat(free), _flat(merged), strict=True)
+                ]
+            ),
+            xp.concat([free.weights[:1], merged.weights]),
+        )
+        pulled = Hypotheses(
+            xp.where(born, begun.mean, pulled.mean),
+            _covariance(replaced),
+            pulled.weights * (1.0 - hazard) + begun.weights * given,
+        )
+        return free, pulled
+
+    def merge(self, begun: Hypotheses, pulled: Hypotheses, staying: Array, hazard: Array) -> Hypotheses:
+        """What knows of no pull together with what ends, by their moments; S = 4, ``(J - 1, 1)``."""
+        xp = self.xp
+        weights = xp.concat([begun.weights * staying, pulled.weights * hazard], axis=1)
+        mean = xp.concat([begun.mean, pulled.mean], axis=3)[:4]
+        P = [xp.concat([a, b], axis=-2) for a, b in zip(_flat(begun), _flat(pulled), strict=True)]
+        P = faults.matrix(_covariance(P))[:4, :4]
+        total = ordered_sum(xp.moveaxis(weights, 1, 0))
+        certain = total > 0.0
+        shares = xp.moveaxis(weights, 1, 0) / xp.where(certain, total, 1.0)
+        mean, P = xp.moveaxis(mean, 3, 2), xp.moveaxis(P, 3, 2)  # (4, A, M, J, N), (4, 4, M, J, N)
+        centre = weighted_sum(shares, mean)
+        offsets = mean - centre[:, :, None]
+        spread = ordered_sum(offsets[:, None, a] * offsets[None, :, a] for a in range(mean.shape[1]))
+        moments = weighted_sum(shares, P + spread / mean.shape[1])
+        return Hypotheses(centre[:, :, :, None], faults.from_matrix(moments[:, :, :, None]), total[:, None])
+
+    def predict_bank(self, memory: Memory, measurement: Measurement) -> Memory:
+        """Change hypotheses and predict them, and the receiver's levels, to the time of a measurement."""
+        free, pulled = self.change(memory.free, memory.pulled, measurement.number)
+        reported = measurement.reported_deviation * measurement.reported_deviation
+        changing = 1.0 - math.exp(-self.prior.level_rate * self.step)
+        chain = (1.0 - changing) * memory.levels + changing * self.uniform
+        changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
+        chain = self.xp.where(changed, self.fresh, chain)
+        return Memory(
+            self.predict_part(free, self.noises), self.predict_part(pulled, self.others), chain, reported
+        )
+
+    def predict_part(self, h: Hypotheses, noises: Noises) -> Hypotheses:
+        """Predict some hypotheses of these noises by a step."""
+        xp, s = self.xp, self.parameters.sampling
+        one, zero = 0.0 * noises.decay + 1.0, 0.0 * noises.decay
+        pulls = h.mean.shape[0] - 4
+        decay = xp.stack([noises.decay, *[one] * pulls])
+        gained = xp.stack([noises.wandering**2 * (1.0 - noises.decay**2), *[zero] * pulls])
+        delta, drift, eta = h.mean[:3]
+        moved = xp.stack([delta + s.step * drift + s.drive * eta, drift, s.decay * eta])
+        P = faults.predict_fault(h.covariance, s, noises.coloured_growth, noises.white_growth, decay, gained)
+        return Hypotheses(xp.concat([moved, decay[:, None] * h.mean[3:]]), P, h.weights)
+
+    def weigh(
+        self,
+        predicted: Memory,
+        measurement: Measurement,
+        evidence: Array = 0.0,
+        variance_factors: Array = 1.0,
+        level_factors: Array = 1.0,
+    ) -> Weighing:
+        """Weigh predicted hypotheses and levels by a measurement.
+
+        Args:
+            predicted: by :meth:`predict_bank`.
+            measurement: that arrives.
+            evidence: added to the logarithms of the hypotheses' weights, nats, ``(H, N)`` or a number.
+            variance_factors: multiply the variance of every level, ``(N,)`` or a number.
+            level_factors: multiply the probabilities of the levels, ``(L, N)`` or a number.
+        """
+        xp, prior = self.xp, self.prior
+        chain = level_factors * predicted.levels
+        levels, q = variance_factors * (self.factors * predicted.reported), chain
+        white = 1.0 / ordered_sum(chain / levels)
+        if prior.outlier:
+            levels = xp.concat([levels, (prior.outlier_factor * white)[None]])
+            q = xp.concat([(1.0 - prior.outlier) * chain, prior.outlier + 0.0 * chain[:1]])
+        there = measurement.available > 0.0
+        fix = xp.where(there, measurement.ins - measurement.fix, 0.0)
+        age = self.age(measurement.number)
+        free, pulled = predicted.free, predicted.pulled
+        parts = [
+            self.weigh_part(free, xp.ones((1, 1, 1)), fix, there, levels, q),
+            self.weigh_part(pulled, xp.stack([xp.ones_like(age), age]), fix, there, levels, q),
+        ]
+        expected, innovations, directions, noises = zip(*parts, strict=True)
+        before = self.join([free.weights, pulled.weights], 0)
+        log_weights = self.join(
+            [
+                imm.log_probabilities(part.weights) + xp.where(there, noise.log_density, 0.0)
+                for part, noise in zip((free, pulled), noises, strict=True)
+            ],
+            0,
+        )
+        log_weights = log_weights + evidence
+        log_likelihood = imm.log_sum(log_weights)
+        weights = xp.exp(log_weights - log_likelihood)
+        posterior = weighted_sum(weights, self.join([noise.responsibilities for noise in noises], 1))
+        if prior.outlier:
+            posterior = posterior[:-1] + posterior[-1] * chain
+        innovation = weighted_sum(before, self.join(innovations, 1))
+        own = weighted_sum(before, self.join([along.variance for along in directions], 0))
+        return Weighing(
+            log_likelihood,
+            weights,
+            xp.where(there, posterior, chain),
+            weighted_sum(before, self.join(expected, 1)),
+            own,
+            ordered_sum(innovation * innovation) / (own + white),
+            innovations,
+            directions,
+            noises,
+        )
+
+    def weigh_part(
+        self, h: Hypotheses, shares: Array, fix: Array, there: Array, levels: Array, q: Array
+    ) -> tuple[Array, Array, faults.Direction, faults.NoiseMixture]:
+        """Compare some predicted hypotheses with a fix.
+
+        Args:
+            h: hypotheses.
+            shares: of the receiver's errors in the measurement, ``(S - 3, M, N)``.
+            fix: INS less receiver, m, ``(A, N)``.
+            there: whether there is a fix, ``(N,)``.
+            levels: variances of the receiver, ascending, m^2, ``(L, N)``.
+            q: their probabilities, likewise.
+
+        Returns:
+            INS less receiver as predicted and innovations, m, ``(A, J, M, N)``, direction of the update, and noise.
+        """
+        errors = h.mean[3:]
+        pull = ordered_sum(shares[i] * errors[i] for i in range(shares.shape[0]))
+        expected = h.mean[0] - pull
+        innovation = self.xp.where(there, fix[:, None, None] - expected, 0.0)
+        along = faults.measured_direction(h.covariance, shares)
+        squares = ordered_sum(innovation * innovation)
+        noise = faults.weigh_levels(
+            squares, fix.shape[0], along.variance, levels[:, None, None], q[:, None, None]
+        )
+        return expected, innovation, along, noise
+
+    def update_bank(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> Posterior:
+        """Update predicted hypotheses as they are weighed, and report the moments of all."""
+        xp = self.xp
+        there = measurement.available > 0.0
+        split = predicted.free.weights.shape[0]
+        free, pulled = (
+            self.update_part(part, *of_part, there)._replace(weights=xp.reshape(each, part.weights.shape))
+            for part, each, *of_part in zip(
+                (predicted.free, predicted.pulled),
+                (weighing.weights[:split], weighing.weights[split:]),
+                weighing.innovations,
+                weighing.directions,
+                weighing.noises,
+                strict=True,
+            )
+        )
+        weights, delta = weighing.weights, self.join([free.mean[0], pulled.mean[0]], 1)
+        mean = weighted_sum(weights, delta)
+        own = weighted_sum(weights, self.join([each.covariance.ins.position for each in (free, pulled)], 0))
+        offsets = delta - mean[:, None]
+        spread = weighted_sum(weights, offsets[:, None] * offsets[None])
+        memory = Memory(free, pulled, weighing.levels, predicted.reported)
+        return Posterior(measurement.ins - mean, self.eye * own + spread, memory)
+
+    def update_part(
+        self,
+        h: Hypotheses,
+        innovation: Array,
+        along: faults.Direction,
+        noise: faults.NoiseMixture,
+        there: Array,
+    ) -> Hypotheses:
+        """Update some predicted hypotheses by what :meth:`weigh_part` found; their weights stay."""
+        xp = self.xp
+        squares = ordered_sum(innovation * innovation)
+        push = xp.where(there, noise.score, 0.0) * innovation
+        weight = xp.where(there, noise.score - noise.spread * squares / innovation.shape[0], 0.0)
+        moved = [h.mean[i] + along[i] * push for i in range(3)]
+        mean = xp.concat([xp.stack(moved), h.mean[3:] + along.faults[:, None] * push])
+        return Hypotheses(mean, faults.update_fault(h.covariance, along, weight), h.weights)
+
+    def join(self, values: Sequence[Array], before: int) -> Array:
+        """All hypotheses, of noises and onsets, in a row behind some axes."""
+        return self.xp.concat(
+            [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
+            axis=before,
+        )
+
+
+def _flat(h: Hypotheses) -> list[Array]:
+    """Arrays of a covariance in a row."""
+    return [*h.covariance.ins, h.covariance.cross, h.covariance.faults]
+
+
+def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
+    """Undo :func:`_flat`."""
+    return faults.FaultCovariance(AugmentedCovariance(*arrays[:6]), arrays[6], arrays[7])

@@ -1,0 +1,286 @@
+"""A bank of Kalman filters over the levels of gusts and sensors of UavAutopilot.
+
+Equations: ``filters/noise_levels.py``. A kind of aircraft is an actuator and a slow error of some sensors, which is a
+coordinate of the state, a first-order Gauss-Markov process (A. E. Bryson and L. J. Henrikson, Journal of Spacecraft and
+Rockets 5 (1968), 662-665, by augmentation). In each kind every hypothesis is a level of the gusts; what the sensors'
+levels are, each knows by probabilities of its own. The first hypothesis of a kind believes all noise as designed, for
+ever but for a small hazard. Kinds do not change.
+
+It is the estimator ``level-bank`` of the baselines, and what the control ``hypotheses`` steers.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ...filters import imm, noise_levels, packed_covariance
+from ...filters.noise_levels import Hypotheses
+from ...filters.ordered_sums import weighted_sum
+from ..filter import Initial
+from ..observation import Array
+from .plant import Model, pitch_channel
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import UavAutopilot
+
+
+class Kind(NamedTuple):
+    """What does not change in an episode."""
+
+    share: float = 1.0
+    """Prior probability."""
+    lag: float = 1.0
+    """Time constant of the actuator over the believed one; plant P has only kinds with 1."""
+    error: float = 0.15
+    """Standard deviation of the slow errors over the sensor's nominal one."""
+    error_time: float = 1.0
+    """Their correlation time, s."""
+    always: bool = False
+    """Whether they are there where all noise is as designed, too."""
+
+
+class LevelPrior(NamedTuple):
+    """What a bank expects before it has seen anything."""
+
+    gusts: tuple[float, float] = (0.2, 5.0)
+    """Limits of the disturbance's level, all logarithms alike."""
+    gust_points: int = 7
+    gust_change: float = 2.0 / 600.0
+    """Probability that the level changes before a measurement."""
+    sensors: tuple[float, float] = (0.5, 6.0)
+    """Limits of the factor on a sensor's standard deviation."""
+    sensor_points: int = 9
+    sensor_change: float = 1.0 / 600.0
+    outlier: float = 0.0
+    """Probability that a reading is an outlier."""
+    outlier_factor: float = 30.0
+    """Its standard deviation over the nominal one; above all levels."""
+    nominal: float = 1.0 / 6.0
+    """Probability that all noise is as designed."""
+    leave: float = 1e-4
+    """Probability that it ends before a measurement."""
+    kept: float = 0.5
+    """Probability that a sensor's noise then still is as designed."""
+    slow: tuple[str, ...] = ("rate",)
+    """Sensors with slow errors."""
+    kinds: tuple[Kind, ...] = (Kind(),)
+
+
+TRAINING = LevelPrior()
+"""Of the episodes of ``random``: levels of these limits, two changes of the gusts and one of the sensors in 600
+measurements, one episode of six as designed. The slow error has the mean square of the coloured ones there and the
+middle of their correlation times; only the rate sensor's can be told from the motion."""
+VAGUE = LevelPrior(
+    gusts=(0.1, 10.0),
+    gust_points=7,
+    sensors=(0.4, 12.0),
+    outlier=0.002,
+    kinds=(
+        Kind(0.8),
+        Kind(0.1, error=1.5, error_time=30.0, always=True),
+        Kind(0.1, lag=1.7),
+    ),
+)
+"""Ours, for aircraft of which little is known: twice the range of every level, readings that are wrong, a rate sensor
+that has a bias, and an actuator that is slower than designed; one of ten each."""
+
+
+def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
+    """Middles of equal intervals of the logarithm."""
+    low, high = limits
+    return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
+
+
+class Posterior(NamedTuple):
+    """What the readings leave of the hypotheses."""
+
+    mean: Array
+    """Of all together, ``(n, N)``."""
+    covariance: Array
+    """``(n, n, N)``."""
+    memory: Hypotheses
+    log_likelihood: Array
+    """Of the readings, ``(N,)``."""
+    nis: Array
+    """Their normalised innovation squared, ``(N,)``."""
+
+
+class LevelFilter:
+    """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
+
+    Args:
+        task: the problem.
+        prior: what it expects.
+        **changed: fields of the prior that differ.
+    """
+
+    def __init__(self, task: "UavAutopilot", prior: LevelPrior = TRAINING, **changed: Any) -> None:
+        self.prior = prior = prior._replace(**changed)
+        self.task, self.xp = task, task.xp
+        p, constant, n = task.parameters, task.constant, len(task.components)
+        sensors, sigmas = list(task.sensors), p.value("sensor_sigmas")
+        slow = [sensor for sensor in prior.slow if sensor in sensors]
+        self.n, self.size = n, n + len(slow)
+        self.rows = [
+            (i, n + slow.index(s)) if s in slow else (i,) for s, i in zip(sensors, task.measured, strict=True)
+        ]
+        kinds = [kind for kind in prior.kinds if kind.lag == 1.0 or p.plant == "U"]
+        error_sigmas = numpy.array([sigmas[sensors.index(sensor)] for sensor in slow])
+        levels = numpy.array([1.0, *grid(prior.gusts, prior.gust_points)])
+        models = [_KindModel(task, kind, error_sigmas, levels) for kind in kinds]
+        self.groups = len(kinds)
+        each = len(levels)
+        self.F = [constant(m.F) for m in models for _ in levels]
+        self.B = [constant(m.B) for m in models for _ in levels]
+        self.propagator = [constant(packed_covariance.propagator(m.F)) for m in models for _ in levels]
+        self.process, self.start_covariance = (
+            constant(numpy.concatenate(parts, axis=1))[:, :, None]
+            for parts in zip(*((m.process, m.initial) for m in models), strict=True)
+        )
+        many = (1.0 - prior.nominal) / prior.gust_points
+        share = numpy.array([kind.share for kind in kinds]) / sum(kind.share for kind in kinds)
+        within = numpy.array([prior.nominal, *[many] * prior.gust_points])
+        self.probability = constant(numpy.outer(share, within).ravel())[:, None]
+
+        def by_hypothesis(designed: float, other: float) -> Array:
+            return constant([designed] + [other] * (each - 1))[:, None]
+
+        self.change = by_hypothesis(prior.leave, prior.gust_change)
+        self.arrive = by_hypothesis(0.0, 1.0 / prior.gust_points)
+        self.sensor_change = by_hypothesis(0.0, prior.sensor_change)
+        factors = grid(prior.sensors, prior.sensor_points)
+        chances = numpy.full(len(factors), 1.0 / len(factors))
+        kept = (1.0 - prior.kept) * chances
+        kept[numpy.abs(numpy.log(factors)).argmin()] += prior.kept
+        believed = numpy.repeat(chances[:, None], each, axis=1)
+        believed[:, 0] = kept
+        squared = numpy.repeat(factors[:, None] ** 2, each, axis=1)
+        squared[:, 0] = 1.0
+        squared, believed = (numpy.tile(values, (1, self.groups)) for values in (squared, believed))
+        self.levels = constant(chances)[:, None, None]
+        self.believed = constant(believed)[:, :, None]
+        self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
+        self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
+
+    def start_bank(self, initial: Initial) -> Hypotheses:
+        """Start all where everyone starts."""
+        xp, none = self.xp, 0.0 * initial.mean[0]
+        mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
+        return Hypotheses(
+            xp.stack([mean] * self.probability.shape[0], axis=1),
+            self.start_covariance + none,
+            self.probability + none,
+            tuple(self.believed + none for _ in self.rows),
+        )
+
+    def predict_bank(self, memory: Hypotheses, measurement: Measurement) -> Hypotheses:
+        """Let levels change, and predict every hypothesis to the time of a measurement."""
+        h = self.switch(memory)
+        mean, covariance = self.predict(h, measurement)
+        return h._replace(mean=mean, covariance=covariance)
+
+    def update_bank(
+        self, predicted: Hypotheses, measurement: Measurement, variance_factors: Sequence[Any] = ()
+    ) -> Posterior:
+        """Take in the readings one after the other, and report the moments of all.
+
+        Args:
+            predicted: by :meth:`predict_bank`.
+            measurement: that arrives.
+            variance_factors: multiply the variances of every level of each sensor, ``(N,)``; empty: none.
+        """
+        xp, n = self.xp, self.n
+        mean, covariance = predicted.mean, predicted.covariance
+        log_density, nis, sensors = 0.0, 0.0, []
+        for k, rows in enumerate(self.rows):
+            there = measurement.available[k]
+            reading = xp.where(there > 0.0, measurement.reading[k], 0.0)
+            variances = (
+                variance_factors[k] * self.variances[k] if len(variance_factors) else self.variances[k]
+            )
+            step = noise_levels.update_sensor(
+                mean,
+                covariance,
+                reading,
+                rows,
+                noise_levels.SensorNoise(variances, predicted.sensors[k], self.prior.outlier, self.wide[k]),
+                there,
+            )
+            mean, covariance = step.mean, step.covariance
+            sensors.append(step.levels)
+            log_density, nis = log_density + step.log_density, nis + step.nis
+        log_weights = imm.log_probabilities(predicted.probability) + log_density
+        probability = imm.softmax(log_weights)
+        whole = noise_levels.merge(mean, covariance, probability)
+        return Posterior(
+            whole.mean[:n],
+            packed_covariance.unpack(whole.covariance, self.size)[:n, :n],
+            Hypotheses(mean, covariance, probability, tuple(sensors)),
+            imm.log_sum(log_weights),
+            weighted_sum(probability, nis),
+        )
+
+    def switch(self, memory: Hypotheses) -> Hypotheses:
+        """Let levels change in every kind."""
+        xp, each = self.xp, self.change.shape[0]
+        parts = [
+            noise_levels.switch(
+                memory.take(slice(each * i, each * (i + 1))),
+                self.change,
+                self.arrive,
+                self.sensor_change,
+                self.levels,
+            )
+            for i in range(self.groups)
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return Hypotheses(
+            xp.concat([part.mean for part in parts], axis=1),
+            xp.concat([part.covariance for part in parts], axis=1),
+            xp.concat([part.probability for part in parts]),
+            tuple(xp.concat(list(q), axis=1) for q in zip(*(part.sensors for part in parts), strict=True)),
+        )
+
+    def predict(self, h: Hypotheses, measurement: Measurement) -> tuple[Array, Array]:
+        """Equations (10), (12) in every hypothesis."""
+        xp, u = self.xp, measurement.control
+        mean = [
+            xp.matmul(F, h.mean[:, j]) + B * u for j, (F, B) in enumerate(zip(self.F, self.B, strict=True))
+        ]
+        covariance = [xp.matmul(M, h.covariance[:, j]) for j, M in enumerate(self.propagator)]
+        return xp.stack(mean, axis=1), xp.stack(covariance, axis=1) + self.process
+
+
+class _KindModel:
+    """The plant of a kind with its slow errors, for every level of the gusts, as NumPy arrays.
+
+    Args:
+        task: the problem.
+        kind: which one.
+        sigmas: nominal standard deviations of the sensors with slow errors.
+        levels: of the gusts; the first is of noise as designed.
+    """
+
+    def __init__(
+        self, task: "UavAutopilot", kind: Kind, sigmas: numpy.ndarray, levels: numpy.ndarray
+    ) -> None:
+        p, n, errors = task.parameters, len(task.components), len(sigmas)
+        plant: Model = task.design.model if kind.lag == 1.0 else pitch_channel(p, kind.lag)
+        decay = math.exp(-p.value("sampling_interval") / kind.error_time)
+        self.F = numpy.pad(plant.F, (0, errors)) + numpy.diag([0.0] * n + [decay] * errors)
+        self.B = numpy.concatenate([plant.B, numpy.zeros((errors, 1))])
+        scaled, other = (numpy.pad(Q, (0, errors)) for Q in (plant.scaled_noise, plant.other_noise))
+        process, initial = [], []
+        for i, level in enumerate(levels):
+            variances = numpy.where(i > 0 or kind.always, (kind.error * sigmas) ** 2, 0.0)
+            start = numpy.diag([*numpy.square(p.value("initial_sigmas")), *variances])
+            if p.plant == "U":
+                start[n - 1, n - 1] *= level**2
+            gained = numpy.diag([*[0.0] * n, *((1.0 - decay**2) * variances)])
+            process.append(packed_covariance.pack(level**2 * scaled + other + gained))
+            initial.append(packed_covariance.pack(start))
+        self.process, self.initial = numpy.stack(process, axis=1), numpy.stack(initial, axis=1)
