@@ -163,18 +163,18 @@ def test_of_radar_and_esm_zero_answers_are_the_papers_algorithm(class_change):
 
 def test_of_radar_and_esm_any_answer_is_what_the_description_says():
     """The equations at the head of the module, one lane and class after the other, with matrices of NumPy."""
-    model, initial, measurements = episodes(ESM, 16, 30)
+    model, initial, measurements = episodes(ESM, 6, 12)
     task, bank = model.task, model.filter
     models, _ = task.design_models(task.parameters)
     classes, count = task.classes, model.action_space.shape[0]
     assert count == classes + 2 * len(fusion.NOISES)
     rng, state, H = np.random.default_rng(0), bank.start(initial), models.H
     # Under no answer at the start.
-    R_before = np.stack([models.R] * 16, axis=-1)
-    q_before = np.ones(16)
+    R_before = np.stack([models.R] * 6, axis=-1)
+    q_before = np.ones(6)
     for measurement in measurements:
         before, predicted = state, bank.predict(state, measurement)
-        action = rng.uniform(-1.2, 1.2, (count, 16))
+        action = rng.uniform(-1.2, 1.2, (count, 6))
         state = bank.act(predicted, measurement, action)
         P_before, M_before, P_after, M_after = (
             packed_covariance.unpack(part, 3)
