@@ -27,6 +27,9 @@ outlier. Sources: P. J. Huber, Robust estimation of a location parameter, Annals
 1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D. Kovacevic, Robust estimation with
 unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
 
+Gain of another variance. With a caution c the gain is ``k = P h^T / (h P h^T + c r)``, of the noise c r in place of r;
+the covariance that it leaves is that of Joseph's form, ``P -= k u^T + u k^T`` with ``u = P h^T - s k / 2``.
+
 Shapes: mean ``(n, ...)``, covariance ``(n, n, ...)``, residual ``(m, ...)``, batch last.
 """
 
@@ -68,6 +71,7 @@ def update_one_by_one(
     variance: Array,
     available: Array,
     thresholds: Sequence[Array | float] | None = None,
+    cautions: Sequence[Array | float] | None = None,
 ) -> Correction:
     """Mean, covariance and likelihood after m independent scalar observations.
 
@@ -79,6 +83,7 @@ def update_one_by_one(
         variance: of the noise, m values that broadcast against ``(...)``.
         available: one where an observation is there, zero where it is not; m values, likewise.
         thresholds: k of each observation in the robust update, likewise; infinity for none. None: the plain update.
+        cautions: factor on the variance of each observation in its gain alone, likewise. None: the Kalman gain.
 
     Returns:
         The update; an observation that is not available changes nothing and has no likelihood.
@@ -101,10 +106,19 @@ def update_one_by_one(
             s = xp.maximum(s, xp.abs(error) * (variance[j] ** 0.5 / thresholds[j]))
         here = available[j]
         whitened = here * error / xp.sqrt(s)
-        # The same factor on both sides keeps the covariance exactly symmetric.
-        gain = cross * (here / xp.sqrt(s))
-        shift = shift + gain * whitened
-        covariance = covariance - gain[:, None] * gain[None]
+        if cautions is None:
+            # The same factor on both sides keeps the covariance exactly symmetric.
+            gain = cross * (here / xp.sqrt(s))
+            shift = shift + gain * whitened
+            covariance = covariance - gain[:, None] * gain[None]
+        else:
+            explained: Array | float = 0.0
+            for column, value in zip(columns, values, strict=True):
+                explained = explained + cross[column] * value
+            gain = cross * (here / (explained + cautions[j] * (s - explained)))
+            shift = shift + gain * error
+            other = cross - (0.5 * s) * gain
+            covariance = covariance - (gain[:, None] * other[None] + other[:, None] * gain[None])
         square = whitened * whitened
         cost = cost + square + here * xp.log(2.0 * math.pi * s)
         squares.append(square)

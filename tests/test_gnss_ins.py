@@ -282,6 +282,26 @@ def test_what_is_not_available_changes_nothing():
     assert (nothing.log_likelihood == 0.0).all()
 
 
+def test_a_cautious_gain_is_that_of_a_noisier_reading_with_the_covariance_of_the_true_one():
+    """Each observation in its turn, in Joseph's form; one in three is missing."""
+    state, P, residual, rows = random_update(0)
+    H, r = dense(rows, state), SENSOR_SIGMA**2
+    cautions, available = numpy.linspace(0.25, 4.0, 14), (numpy.arange(14) % 3 > 0).astype(float)
+    result = extended_kalman.update_one_by_one(state, P, residual, rows, r, available, None, cautions)
+    for lane in numpy.ndindex(state.shape[1:]):
+        at = (..., *lane)
+        x, C = numpy.zeros(17), P[at].copy()
+        for j, h in enumerate(H[at]):
+            k = available[j] * C @ h / (h @ C @ h + cautions[j] * r[j])
+            x = x + k * (residual[at][j] - h @ x)
+            rest = numpy.eye(17) - numpy.outer(k, h)
+            C = rest @ C @ rest.T + r[j] * numpy.outer(k, k)
+        sigma = numpy.sqrt(numpy.diag(C))
+        assert (abs(result.mean[at] - state[at] - x) / sigma).max() < 1e-9
+        assert abs((result.covariance[at] - C) / numpy.outer(sigma, sigma)).max() < 1e-9
+    assert (result.covariance == result.covariance.swapaxes(0, 1)).all()
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_robust_update_is_the_minimum_of_hubers_cost(seed):
     """Each observation in its turn: where the derivative of prediction's and Huber's cost along P h is zero."""

@@ -132,7 +132,16 @@ def random_policy(env, dtype, network="recurrent"):
         ("UavAutopilot", "kalman-net", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
         pytest.param("LooselyCoupledNavigation", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
-        # Of ten measurements each; its gradient takes longest to compile.
+        ("RadarEsmTracking", "kalman-net", {}, None, "recurrent"),
+        # Their gradients take longest to compile; a decision under `evidence` is ten measurements.
+        pytest.param(
+            "TightlyCoupledNavigation",
+            "kalman-net",
+            {"max_episode_steps": 4, "decision_interval": 1},
+            None,
+            "recurrent",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             "TightlyCoupledNavigation",
             "evidence",

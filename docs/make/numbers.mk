@@ -21,19 +21,20 @@ room_TightlyCoupledNavigation := tightly_coupled_navigation
 
 agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dqn kalman-net
 agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac kalman-net
-agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac
+agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
-agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear
+agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
 shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
-shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo
+shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo kalman-net
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
-shipped_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear
+shipped_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
 # Its filters have 17 states, and one wrong step loses a track: fewer episodes, and agents behind the gate.
 training_TightlyCoupledNavigation := --gated
 training_TightlyCoupledNavigation-ppo := --residual-to fixed-robust-tuned
+training_TightlyCoupledNavigation-kalman-net := --control kalman-net
 episodes_TightlyCoupledNavigation := 400
 
 PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-esm-class-fusion uav-autopilot-kalman

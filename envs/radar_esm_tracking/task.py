@@ -17,6 +17,7 @@ from ..task import Component, PaperPolicy, Task
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
+from .kalman_net import KalmanNetBank
 from .live import ScanInput
 from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
@@ -119,6 +120,7 @@ class RadarEsmTracking(Task):
         "weights": "class probabilities, normalised; all zero is uniform",
     }
     banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
+    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = (
         Component("range", "m"),

@@ -87,16 +87,17 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     task: "TightlyCoupledNavigation"
     parameters: TightlyCoupledNavigationParameters
+    hypotheses: Sequence[str] = HYPOTHESES
 
     @property
     def action_space(self) -> gymnasium.Space:
         """One hypothesis, or a number for each."""
-        return bank_action_space(self.control, len(HYPOTHESES))
+        return bank_action_space(self.control, len(self.hypotheses))
 
     @property
     def actions(self) -> Sequence[str]:
         """What the components of the action concern."""
-        return HYPOTHESES
+        return self.hypotheses
 
     # --- what the agent is shown
 
@@ -105,7 +106,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         """What each filter says by group of sensors, readings, what is missing, and the clock."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
-        each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in HYPOTHESES]
+        each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in self.hypotheses]
         ranges, rates, forces, _ = task.sensors
 
         def innovation(name: str, sensor: SensorGroup) -> Block:
@@ -135,11 +136,11 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             ),
             Block(
                 "log_likelihood", lambda f, y: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood minus the largest one, nats", HYPOTHESES, BOUNDED_LOG,
+                "the log-likelihood minus the largest one, nats", self.hypotheses, BOUNDED_LOG,
             ),
             Block(
                 "log_predicted", lambda f, y: f.log_predicted,
-                "the logarithm of the predicted probability", HYPOTHESES, SIGNED_LOG,
+                "the logarithm of the predicted probability", self.hypotheses, SIGNED_LOG,
             ),
             Block(
                 "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
@@ -185,7 +186,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     def start(self, initial: Initial) -> Filters:
         """Start every filter from what is known of the start."""
-        xp, M, task = self.xp, len(HYPOTHESES), self.task
+        xp, M, task = self.xp, len(self.hypotheses), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
         covariances = xp.stack([pack(initial.covariance)] * M, axis=1)
@@ -270,6 +271,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         measurement: Measurement,
         variance: Sequence[Any],
         thresholds: Sequence[Array] | None = None,
+        cautions: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
         expected, rows = gnss_ins.observe(
@@ -288,6 +290,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             variance,
             measurement.available,
             thresholds,
+            cautions,
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
@@ -412,6 +415,11 @@ class RobustBank(NoiseBank):
     """
 
     @property
+    def reach(self) -> float:
+        """How much of the noises' range an action of one is, as an exponent."""
+        return self.parameters.noise_reach
+
+    @property
     def actions(self) -> Sequence[str]:
         """The groups of sensors, accelerometers that repeat themselves, outliers of ranges and rates."""
         ranges, rates = (sensor.name for sensor in self.task.sensors[:2])
@@ -421,7 +429,7 @@ class RobustBank(NoiseBank):
         """As under ``gain``; accelerometers that repeat their last reading are noisier by an action of their own."""
         xp, forces = self.xp, self.task.sensors[2].readings
         groups = len(self.task.sensors)
-        variance = super()._variance(self.parameters.noise_reach * exponent[:groups], state)
+        variance = super()._variance(self.reach * exponent[:groups], state)
         own = 2.0 * math.log(self.parameters.noise_scale) * xp.clip(exponent[groups], 0.0, None)
         factor = xp.exp(own * state.repeated)
         return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]

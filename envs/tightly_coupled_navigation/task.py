@@ -27,6 +27,7 @@ from ..task import Component, PaperPolicy, Task
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
+from .kalman_net import KalmanNetBank
 from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
@@ -126,9 +127,11 @@ class TightlyCoupledNavigation(Task):
         "mode": HypothesisBank,
         "weights": HypothesisBank,
     }
+    trained_banks = {"kalman-net": KalmanNetBank}
     reach = {
         "robust": ("noise_reach", "noise_scale", "noise_reduction"),
         "gain": ("noise_scale", "noise_reduction"),
+        "kalman-net": ("noise_scale", "noise_reduction"),
     }
     scenarios = SCENARIOS
     components = (

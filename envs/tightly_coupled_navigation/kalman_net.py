@@ -1,0 +1,143 @@
+r"""The filter of TightlyCoupledNavigation that a recurrent network steers from inside: the learned estimator
+``kalman-net``.
+
+One extended Kalman filter with Singer's model of the manoeuvre, in place of the paper's three hypotheses on the motion.
+At every measurement the network answers with numbers in [-1, 1]:
+
+    noise    the groups of sensors, accelerometers that repeat themselves, and outliers of ranges and rates, as under
+             control ``robust`` at its whole reach
+    motion   until the next measurement the acceleration's noise is manoeuvre_range^(2 a) times that of Singer's model
+    gain     of a reading with variance r, g = caution^(2 b) in its group of sensors:
+             k = P h^T / (h P h^T + g r),  P -= k u^T + u k^T,  u = P h^T - k (h P h^T + r) / 2         (Joseph form)
+
+All zero is the policy ``singer``, the paper's third hypothesis alone, but for what tracking loops expect where there
+are apertures: of the bank of ``singer`` it is what all three hypotheses predict, here what this filter predicts.
+Whether the user stands, moves straight or manoeuvres, which the paper asks the hypotheses, the network answers by the
+noise of the motion. References and reading stand in ``maneuvering_target/kalman_net.py``.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+from ...filters import gnss_ins
+from ...filters.packed_covariance import diagonal, pack, unpack
+from ..filter import Initial
+from ..observation import KEPT_AS_LOG, Array, Block
+from .banks import Filters, Prediction, RobustBank
+from .parameters import HYPOTHESES, SINGER
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import TightlyCoupledNavigation
+
+MANOEUVRE_RANGE = 30.0
+"""Largest factor and divisor of the deviation of the acceleration."""
+CAUTION = 2.0
+"""Likewise of the deviation of a reading in the gain alone. Far larger ones can make a filter unstable."""
+DROPPED = ("log_likelihood", "log_predicted")
+"""Blocks that compare hypotheses."""
+
+
+class KalmanNetBank(RobustBank):
+    """One filter, whose noises, gain and motion the action sets."""
+
+    hypotheses = HYPOTHESES[SINGER:]
+    reach = 1.0  # it learns through the filter, and does not explore
+
+    def __init__(self, task: "TightlyCoupledNavigation", control: str) -> None:
+        super().__init__(task, control)
+        only = slice(SINGER, SINGER + 1)
+        model = task.models[SINGER]
+        still = model._replace(noise=0.0 * model.noise)
+        common = gnss_ins.process_noise(still, task.common)
+        moving = gnss_ins.process_noise(model, task.common) - common
+        self.manoeuvre = list(self.actions).index("manoeuvre")
+        self.axis = task.axis[:, :, only]
+        self.common_noise, self.manoeuvre_noise = (
+            task.constant(Q)[:, :, None, None] for Q in (common, moving)
+        )
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """What ``robust`` has, the manoeuvre, and what the gain alone takes the sensors' noise for."""
+        groups = [sensor.name for sensor in self.task.sensors]
+        return [*super().actions, "manoeuvre", *(f"caution_{name}" for name in groups)]
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What the paper's filters show of themselves, and how sure this one is."""
+        xp, p = self.xp, self.parameters
+        parts = {
+            "position": (gnss_ins.POSITION, p.position_unit),
+            "velocity": (gnss_ins.VELOCITY, p.velocity_unit),
+        }
+        places = numpy.array(diagonal(gnss_ins.SIZE))
+
+        def spread(f: Filters, _: Measurement) -> Array:
+            sums = [
+                sum(f.covariances[int(place), 0] for place in places[part]) * (1.0 / unit**2)
+                for part, unit in parts.values()
+            ]
+            return 0.5 * xp.log(xp.stack(sums))
+
+        *shown, last = (block for block in super().blocks if block.name not in DROPPED)
+        sure = Block(
+            "spread", spread, "predicted deviation over the unit of the cost", tuple(parts), KEPT_AS_LOG
+        )
+        return (*shown, sure, last)
+
+    def start(self, initial: Initial) -> Filters:
+        """Start the one filter."""
+        state = super().start(initial)
+        certain = state.log_likelihood
+        return state._replace(log_predicted=certain, probabilities=1.0 + certain)
+
+    def _predict_hypotheses(self, state: Filters) -> Prediction:
+        """Extrapolate with the noise of the motion that was answered."""
+        common = self.task.common
+        factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.last_action[self.manoeuvre])
+        noise = self.common_noise + factor * self.manoeuvre_noise
+        covariances = unpack(state.covariances, gnss_ins.SIZE)
+        mean, covariance = gnss_ins.predict(
+            state.means, covariances, self.axis, common.T, common.decay, noise
+        )
+        return Prediction(mean, pack(covariance), state.probabilities)
+
+    def feedback(self, state: Filters, measurement: Any) -> Array | None:
+        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
+        return self.task.feedback(state.mean, measurement)
+
+    def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
+        """Update by the gain that was answered."""
+        xp = self.xp
+        exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
+        caution = xp.exp(2.0 * math.log(CAUTION) * exponent[self.manoeuvre + 1 :])
+        update = self._update_hypotheses(
+            state.means,
+            state.covariances,
+            measurement,
+            self._variance(exponent, state),
+            self._thresholds(exponent[: self.manoeuvre]),
+            [
+                caution[i]
+                for i, sensor in enumerate(self.task.sensors)
+                for _ in range(sensor.readings.start, sensor.readings.stop)
+            ],
+        )
+        state = state._replace(
+            means=update.mean, covariances=pack(update.covariance), log_likelihood=update.log_likelihood
+        )
+        return self._combine(state, state.probabilities, exponent)
+
+    def covariance(self, state: Filters) -> Array:
+        """Of the one filter."""
+        return unpack(state.covariances[:, 0], gnss_ins.SIZE)
+
+    def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
+        """As of the paper's bank, without probabilities."""
+        records = super().records(state, measurement)
+        del records["mode_probability"]
+        return records
