@@ -296,7 +296,8 @@ class GatedEstimator:
 
     Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
     measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
-    forgotten as soon as new ones speak against them.
+    forgotten as soon as new ones speak against them. Where the fallback takes in what the agent is not told of, such as
+    all plots of a scan, it has no density of the measurement to compare; that speaks against the agent with all odds.
 
     Args:
         agent: a filter whose policy is a :class:`ListeningPolicy`.
@@ -331,6 +332,8 @@ class GatedEstimator:
         if own is not None and other is not None:
             ratio = other - own
             odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
+            told_less = xp.isfinite(own) & xp.isnan(other) & xp.all(xp.isfinite(other_mean), axis=0)
+            odds = xp.where(told_less, MOST_ODDS, odds)
         # A track that is lost altogether, so that its estimate is no number, is no answer either.
         sound = xp.all(xp.isfinite(mean), axis=0)
         trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
