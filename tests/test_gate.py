@@ -225,6 +225,9 @@ def test_who_is_shown_one_plot_of_many_is_not_trusted():
         ("UavAutopilot", "ppo"),
         ("RadarEsmTracking", "ppo"),
         pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
+        # Agents that were trained behind a gate, and as a correction: what is around them is compiled, too.
+        pytest.param("TightlyCoupledNavigation", "bptt-small", marks=pytest.mark.slow),
+        pytest.param("TightlyCoupledNavigation", "ppo", marks=pytest.mark.slow),
     ],
 )
 def test_both_filters_and_alarms_are_compiled_and_nothing_else_comes_out(name, agent):

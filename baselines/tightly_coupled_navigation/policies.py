@@ -242,7 +242,7 @@ BASELINES = Baselines(
         "fixed-robust": FixedRobust,
         "stuck-exclusion": Variant(
             FixedRobust,
-            "The paper's algorithm, but for accelerometers that repeat their last reading: they are left out meanwhile.",
+            "The paper's algorithm without accelerometers that repeat their last reading: they are left out meanwhile.",
             pseudoranges=0.0,
             rates=0.0,
         ),
