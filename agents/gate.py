@@ -48,7 +48,10 @@ CHECKED_EPISODES = 128
 MOST_ODDS = math.log(100.0)
 """Log-odds of one filter to another beyond which nothing is remembered (ours: decisive by Jeffreys' scale)."""
 SIGNIFICANT = 3.0
-"""Standard errors by which a fallback that is refused costs more."""
+"""Standard errors by which a fallback that is refused costs more, and normalised innovations are too large."""
+NIS_MEMORY = 50.0
+"""Measurements over which the normalised innovation squared is averaged, and degrees that count as one before any;
+ours."""
 
 
 class PaperAction(ConstantPolicy):
@@ -230,10 +233,14 @@ class Gated(Policy):
         if own != model.control:
             raise ValueError(f"the policy is made for control {own!r}, but the task has {model.control!r}")
         self.gate = Gate(model, fallback, alarm, window)
+        parts = self.policy, self.gate.fallback
+        self.traceable = all(map(says_traceable, parts))  # type: ignore[misc]  # of these two
         expose_spaces(self, self.policy)
 
-    def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory]:
-        """Memories of policy and gate."""
+    def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
+        """Memories of policy and gate; none of what can be traced, which draws nothing."""
+        if self.traceable:
+            return None
         return (self.policy.begin(seeds) if isinstance(self.policy, Policy) else None), self.gate.begin(seeds)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
@@ -289,6 +296,10 @@ class GatedMemory(NamedTuple):
     """Memory of the other."""
     odds: Array
     """Log-odds of the fallback to the agent's filter by how well they have predicted the measurements, ``(N,)``."""
+    squares: Array
+    """Weighted sum of the fallback's normalised innovations squared, ``(N,)``."""
+    degrees: Array
+    """Likewise of their degrees of freedom."""
 
 
 class GatedEstimator:
@@ -296,7 +307,13 @@ class GatedEstimator:
 
     Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
     measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
-    forgotten as soon as new ones speak against them.
+    forgotten as soon as new ones speak against them. Where the fallback takes in what the agent is not told of, such as
+    all plots of a scan, it has no density of the measurement to compare; that speaks against the agent with all odds.
+
+    Where the fallback's innovations have been significantly larger than it expects, its covariance is answered times
+    their mean square: the variance factor of an adjustment (Teunissen, Adjustment Theory, 2000), as if all noise were
+    larger alike. Errors that last show little in the innovations, and are not healed. The agent's covariance stays: its
+    innovations are those before its action.
 
     Args:
         agent: a filter whose policy is a :class:`ListeningPolicy`.
@@ -308,13 +325,16 @@ class GatedEstimator:
     def __init__(self, agent: LearnedEstimator, fallback: Any) -> None:
         self.agent, self.fallback, self.xp = agent, fallback, agent.filter.xp
         self.network, self.filter = agent.network, agent.filter
+        self.adapts_covariance = isinstance(fallback, LearnedEstimator) and fallback.filter.adapts_covariance
         policy: Any = agent.network
         self.traceable = says_traceable(policy.policy) and getattr(fallback, "traceable", False)
 
     def start(self, initial: Any, N: int) -> GatedMemory:
         """Start both where everyone starts."""
+        none = 0.0 * initial.mean[0]
+        expected = none + NIS_MEMORY
         return GatedMemory(
-            self.agent.start(initial, N), self.fallback.start(initial, N), 0.0 * initial.mean[0]
+            self.agent.start(initial, N), self.fallback.start(initial, N), none, expected, expected
         )
 
     def update(self, measurement: Any, memory: GatedMemory) -> tuple[Array, Array, GatedMemory]:
@@ -322,23 +342,49 @@ class GatedEstimator:
         xp = self.xp
         mean, covariance, agent = self.agent.update(measurement, memory.agent)
         other_mean, other_covariance, fallback, *told = self.fallback.update(measurement, memory.fallback)
-        own = self.agent.log_likelihood(agent, measurement)
+        own = self.agent.likelihood(agent, measurement)
         if isinstance(self.fallback, LearnedEstimator):
-            other = self.fallback.log_likelihood(fallback, measurement)
+            other = self.fallback.likelihood(fallback, measurement)
         else:
-            other = Likelihood.of(*told).log_likelihood if told else None
+            other = Likelihood.of(*told) if told else Likelihood(None)
         odds = memory.odds
-        if own is not None and other is not None:
-            ratio = other - own
+        if own.log_likelihood is not None and other.log_likelihood is not None:
+            ratio = other.log_likelihood - own.log_likelihood
             odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
+            told_less = xp.isfinite(own.log_likelihood) & xp.isnan(other.log_likelihood)
+            odds = xp.where(told_less & xp.all(xp.isfinite(other_mean), axis=0), MOST_ODDS, odds)
+        squares, degrees = self._sum_squares(memory, other)
+        other_covariance = self._variance_factor(squares, degrees) * other_covariance
         # A track that is lost altogether, so that its estimate is no number, is no answer either.
         sound = xp.all(xp.isfinite(mean), axis=0)
         trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
         return (
             xp.where(trusted, mean, other_mean),
             xp.where(trusted, covariance, other_covariance),
-            GatedMemory(agent, fallback, odds),
+            GatedMemory(agent, fallback, odds, squares, degrees),
         )
+
+    def _sum_squares(self, memory: GatedMemory, told: Likelihood) -> tuple[Array, Array]:
+        """Sums of the fallback's normalised innovations squared, and of their degrees; what is not told, or not
+        received, leaves them as they are.
+        """
+        if self.adapts_covariance or told.nis is None or told.nis_degrees is None:
+            return memory.squares, memory.degrees
+        xp, keep = self.xp, 1.0 - 1.0 / NIS_MEMORY
+        there = xp.isfinite(told.nis) & (told.nis_degrees > 0.0)
+        return (
+            xp.where(there, keep * memory.squares + told.nis, memory.squares),
+            xp.where(there, keep * memory.degrees + told.nis_degrees, memory.degrees),
+        )
+
+    def _variance_factor(self, squares: Array, degrees: Array) -> Array:
+        """Mean square of the fallback's innovations where it is significantly above one, else one, ``(N,)``.
+
+        Squares have the variance 2, and weights that fade slowly halve that of their mean: its deviation is one over
+        the root of the degrees.
+        """
+        mean = squares / degrees
+        return self.xp.where(mean > 1.0 + SIGNIFICANT / self.xp.sqrt(degrees), mean, 1.0)
 
 
 def is_gateable(maker: Any) -> bool:

@@ -14,7 +14,7 @@ from ..envs.filter import Input
 from ..envs.model import Model
 from ..envs.observation import Array
 from ..envs.task import Task
-from ..evaluation.competitors import Kind, Policy
+from ..evaluation.competitors import Kind, Likelihood, Policy
 from ..evaluation.steered_filter import Steered, steer
 
 
@@ -44,12 +44,10 @@ class LearnedEstimator:
         state = self.filter.update(self.filter.predict(memory, measurement), Input(measurement))
         return self.filter.mean(state), self.filter.covariance(state), state
 
-    def log_likelihood(self, memory: Steered, measurement: Any) -> Array | None:
-        """Log-density of the measurement last taken in, as it was predicted; None where the bank does not tell."""
-        likelihood: Array | None = self.filter.records(memory, fill_missing(measurement)).get(
-            "log_likelihood"
-        )
-        return likelihood
+    def likelihood(self, memory: Steered, measurement: Any) -> Likelihood:
+        """How well the measurement last taken in was predicted; None for what the bank does not tell."""
+        records = self.filter.records(memory, fill_missing(measurement))
+        return Likelihood(*(records.get(name) for name in Likelihood._fields))
 
 
 def fill_missing(measurement: Any) -> Any:

@@ -13,7 +13,7 @@ import numpy
 from ..baselines.problem import Problem
 from ..envs.environment import TaskEnv
 from ..envs.model import Model
-from ..evaluation.competitors import Policy, expose_spaces, kind_of, make_competitor
+from ..evaluation.competitors import Policy, expose_spaces, kind_of, make_competitor, says_traceable
 
 
 def check_residual(model: Model, policy: Any) -> None:
@@ -108,10 +108,13 @@ class ResidualPolicy(Policy):
         check_residual(model, policy)
         self.control = model.control  # type: ignore[misc]
         self.policy, self.agent = policy, agent
+        self.traceable = says_traceable(policy) and says_traceable(agent)  # type: ignore[misc]  # of these two
         expose_spaces(self, agent)
 
-    def begin(self, seeds: Sequence[int]) -> tuple[Any, Any]:
-        """Memories of both."""
+    def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:
+        """Memories of both; none of what can be traced, which draws nothing."""
+        if self.traceable:
+            return None
         both = self.policy, self.agent
         first, second = (part.begin(seeds) if isinstance(part, Policy) else None for part in both)
         return first, second

@@ -50,6 +50,8 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     """What it is given that no competitor knows, in words; empty where that is nothing."""
     in_python: ClassVar[bool] = False
     """Whether ``start`` and ``update`` run as Python code, whatever computes the rest: they cannot be traced."""
+    adapts_covariance: ClassVar[bool] = False
+    """Whether the covariance that is reported grows with the innovations."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task

@@ -159,7 +159,12 @@ def compilation_key(maker: Any) -> Any:
 
 
 def says_traceable(policy: Any) -> bool:
-    """Whether a policy says of its own methods, not of those that they replace, that they can be traced."""
+    """Whether a policy says of its own methods, not of those that they replace, that they can be traced; or of itself,
+    where that depends on what it is made of.
+    """
+    own = getattr(policy, "__dict__", {})
+    if "traceable" in own:
+        return bool(own["traceable"])
     for cls in type(policy).__mro__:
         if "traceable" in vars(cls):
             return bool(vars(cls)["traceable"])

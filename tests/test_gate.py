@@ -205,6 +205,18 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
     assert (variance[2][is_other] == variance[1][is_other]).all()
 
 
+def test_who_is_shown_one_plot_of_many_is_not_trusted():
+    """The fallback takes in all plots of a scan, and has no density of the one that the agent's filter takes."""
+    fallback = baselines_of(ID).fallback
+    options = {"episodes": 16, "scenario": "clutter", "split": "validation", "tracks": True}
+    data = evaluate(ID, [fallback, "bptt", "gated:bptt"], **options)
+    other, agent, gated = data["estimate"].values
+    # Before the first plot nothing is compared; what that answer moves the window by is less than an error of range.
+    sigma = make_model(ID, None, "clutter").task.parameters.range_sigma
+    np.testing.assert_allclose(gated[..., :2], other[..., :2], atol=sigma, rtol=0.0)
+    assert abs(agent - other).max() > 10.0 * sigma
+
+
 @pytest.mark.parametrize(
     ("name", "agent"),
     [
@@ -213,6 +225,9 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
         ("UavAutopilot", "ppo"),
         ("RadarEsmTracking", "ppo"),
         pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
+        # Agents that were trained behind a gate, and as a correction: what is around them is compiled, too.
+        pytest.param("TightlyCoupledNavigation", "bptt-small", marks=pytest.mark.slow),
+        pytest.param("TightlyCoupledNavigation", "ppo", marks=pytest.mark.slow),
     ],
 )
 def test_both_filters_and_alarms_are_compiled_and_nothing_else_comes_out(name, agent):
@@ -234,6 +249,13 @@ class Lying(Policy):
         return np.ones((len(observation), 1)), state
 
 
+class Silent(Alarm):
+    """Never speaks."""
+
+    def hear(self, observation, memory, start):
+        return observation[:, 0] != observation[:, 0], None
+
+
 class Loud(Alarm):
     """Speaks always."""
 
@@ -250,6 +272,40 @@ def test_who_predicts_worse_than_the_fallback_is_not_trusted():
     paper, lying, held = data["cost"].mean(["episode", "time"]).values
     assert lying > 1.01 * paper
     assert held - paper < 0.25 * (lying - paper)
+
+
+def test_the_fallback_covariance_follows_its_innovations():
+    """Receivers that are five to ten times as noisy as stated; with the stated noise nothing changes."""
+    problem = problem_of("filtergym/LooselyCoupledNavigation-v0")
+    options = {"split": "validation", "episodes": 32, "tracks": True}
+    silent = GatedMaker(problem, "silent", competitor(problem.id, problem.paper), alarm=Silent)
+    makers = {"paper": problem.paper, "gated": silent}
+    jammed, plain = (evaluate(problem.id, makers, scenario, **options) for scenario in ("jamming", "paper"))
+    for data in (jammed, plain):
+        paper, gated = data["estimate"].values
+        np.testing.assert_allclose(gated, paper, rtol=1e-9, atol=1e-12)
+    paper, gated = (jammed["nees"].sel(policy=name).mean().item() for name in makers)
+    assert gated < 0.5 * paper
+    paper, gated = plain["covariance"].values
+    assert (np.isclose(gated, paper, rtol=1e-9).all(axis=(-1, -2))).mean() > 0.95
+    naive = naive_factors(
+        jammed["nis"].sel(policy="paper").values, jammed["nis_degrees"].sel(policy="paper").values
+    )
+    paper, gated = jammed["covariance"].values
+    np.testing.assert_allclose(gated, naive[..., None, None] * paper, rtol=1e-6)
+
+
+def naive_factors(nis, degrees):
+    """Of the covariance, measurement by measurement, ``(episodes, time)``."""
+    factors = np.ones_like(nis)
+    for episode in range(len(nis)):
+        squares = count = 50.0
+        for k, (square, freedom) in enumerate(zip(nis[episode], degrees[episode], strict=True)):
+            if np.isfinite(square) and freedom > 0.0:
+                squares, count = 0.98 * squares + square, 0.98 * count + freedom
+            if squares / count > 1.0 + 3.0 / np.sqrt(count):
+                factors[episode, k] = squares / count
+    return factors
 
 
 def test_a_gate_that_falls_back_on_something_worse_than_the_paper_is_refused():

@@ -27,6 +27,11 @@ SEMI_MARKOV_VAGUE = Variant(
     "any length, disturbed, and measurements that may be outliers.",
     **VAGUE_PRIOR,
 )
+SEMI_MARKOV_VAGUE_DATA_ASSOCIATION = Variant(
+    SemiMarkovDataAssociation,
+    "`semi-markov-vague`, each of whose hypotheses weighs all plots of a scan; without clutter it is that filter.",
+    **VAGUE_PRIOR,
+)
 
 ESTIMATORS = {
     "kalman-imm": KalmanInteractingMultipleModel,
@@ -36,6 +41,7 @@ ESTIMATORS = {
     "kalman-pda": ProbabilisticDataAssociation,
     "kalman-imm-pda": InteractingMultipleModelDataAssociation,
     "semi-markov-pda": SemiMarkovDataAssociation,
+    "semi-markov-vague-pda": SEMI_MARKOV_VAGUE_DATA_ASSOCIATION,
     "unscented-turn": UnscentedTurn,
     "sage-husa": SageHusa,
     "variational-bayes": VariationalBayes,
@@ -131,6 +137,11 @@ TUNABLE = {
     "semi-markov-vague": tunable(
         SEMI_MARKOV_VAGUE,
         _semi_markov(SEMI_MARKOV_VAGUE, VAGUE_PRIOR["hazards"]),
+        **_semi_markov_limits(VAGUE_PRIOR),
+    ),
+    "semi-markov-vague-pda": tunable(
+        SEMI_MARKOV_VAGUE_DATA_ASSOCIATION,
+        _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE_PRIOR["hazards"]),
         **_semi_markov_limits(VAGUE_PRIOR),
     ),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),

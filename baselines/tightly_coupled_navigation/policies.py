@@ -240,6 +240,12 @@ BASELINES = Baselines(
         "stuck-check-fallback": StuckCheckFallback,
         "fixed-gain": FixedGain,
         "fixed-robust": FixedRobust,
+        "stuck-exclusion": Variant(
+            FixedRobust,
+            "The paper's algorithm without accelerometers that repeat their last reading: they are left out meanwhile.",
+            pseudoranges=0.0,
+            rates=0.0,
+        ),
         "singer": Variant(
             ConstantMode,
             "The paper's non-adaptive measurer: Singer's model alone, as in the third filter of the bank.",
@@ -259,6 +265,7 @@ BASELINES = Baselines(
     score_paper="multi-hypothesis",
     score_reference="known-mode",
     tunable=TUNABLE,
+    fallback="stuck-exclusion",
     alarm=SensorAlarm,
     best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.

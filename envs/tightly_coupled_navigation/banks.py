@@ -351,6 +351,8 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 class NoiseBank(HypothesisBank):
     """Control ``gain``: the action says how noisy the sensors are; the paper's probabilities."""
 
+    adapts_covariance = True
+
     @property
     def action_space(self) -> gymnasium.Space:
         """A number for each group of sensors."""
