@@ -1,4 +1,6 @@
 # Two commands do everything on a machine with Python >= 3.11: `make benchmark` and `make test`.
+# What Python has compiled of the sources serves the other processes and the next run.
+unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 # Processes of `make benchmark`; each takes up to half a GB.
 JOBS ?= 2

@@ -51,12 +51,18 @@ def processor() -> tuple[str, str]:
     """
     chosen = os.environ.get(PROCESSOR)
     if not chosen:
-        return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
+        return _host()
     name, *features = chosen.split(",")
     for feature in features:
         if feature[:1] not in ("+", "-"):
             raise ValueError(f"{PROCESSOR}={chosen!r}: expected +FEATURE or -FEATURE, got {feature!r}")
     return name, ",".join(features)
+
+
+@functools.cache
+def _host() -> tuple[str, str]:
+    """Name and features of this processor, which LLVM finds out anew each time."""
+    return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
 
 
 def _target() -> Any:
@@ -83,7 +89,8 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         library = library or fastest(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
-        made_of = repr((program.steps, program.results, list(lane_first), symbols))
+        steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
+        made_of = repr((steps, results, list(lane_first), symbols))
         key = _key(made_of, _own_text())
         if key not in _LIBRARIES:
             for own in library.functions.values():

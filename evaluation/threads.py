@@ -8,26 +8,34 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from threadpoolctl import threadpool_limits
 
 SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries read when they are loaded."""
+_INSIDE = ContextVar("inside", default=False)
+"""Whether whoever runs has one thread already."""
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Let BLAS and torch use one thread each, also where they are loaded meanwhile."""
+    if _INSIDE.get():  # to look through the loaded libraries again takes longer than many a piece of work
+        yield
+        return
     torch = sys.modules.get("torch")
     threads = None if torch is None else torch.get_num_threads()
     settings = {name: os.environ.get(name) for name in SETTINGS}
     os.environ.update(dict.fromkeys(SETTINGS, "1"))
+    token = _INSIDE.set(True)
     try:
         with threadpool_limits(1):
             if torch is not None and threads != 1:
                 torch.set_num_threads(1)
             yield
     finally:
+        _INSIDE.reset(token)
         if torch is not None and threads != 1:
             torch.set_num_threads(threads)
         for name, value in settings.items():

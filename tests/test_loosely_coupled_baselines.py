@@ -183,8 +183,10 @@ class Recited:
     def __init__(self, task):
         self.task, p = task, task.parameters
         rate = np.exp(np.linspace(*np.log(p.manoeuvre_rate), 2001))
-        self.weight = 1.0 / rate**4 / np.sum(1.0 / rate**4)
-        self.rate = rate * p.sampling_interval
+        weight = 1.0 / rate**4 / np.sum(1.0 / rate**4)
+        times = np.arange(p.horizon + 1) * p.sampling_interval
+        # Linear in the start, whose correlation with the motion is the mean of cos(rate t).
+        self.share = weight @ np.cos(rate[:, None] * times)
 
     def start(self, initial, N):
         return initial.mean
@@ -192,9 +194,7 @@ class Recited:
     def update(self, measurement, memory):
         p = self.task.parameters
         if p.manoeuvres:
-            # Linear in the start, whose correlation with the motion is the mean of cos(rate t).
-            share = (np.cos(self.rate[:, None] * measurement.number) * self.weight[:, None]).sum(axis=0)
-            mean = share * memory
+            mean = self.share[np.asarray(measurement.number, dtype=int)] * memory
         else:
             mean = memory + p.reference_amplitude * np.sin(
                 p.reference_rate * p.sampling_interval * measurement.number

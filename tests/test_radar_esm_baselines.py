@@ -518,6 +518,7 @@ def test_reproduction_reports_its_progress(reproduced):
     assert sum(reproduced[1]) == pytest.approx(reproduction.STEPS)
 
 
+@pytest.mark.slow
 def test_reproduction_has_a_verdict_for_every_claim_and_four_figures(reproduced):
     result = reproduced[0]
     verdicts = {claim.key: claim.verdict for claim in result.claims}

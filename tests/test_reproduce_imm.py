@@ -254,6 +254,7 @@ def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
     assert sum(results.done) == pytest.approx(paper.STEPS)
 
 
+@pytest.mark.slow
 def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
     stated = judge_claims(claims.CLAIMS, claims.quantities(results.of))
     keys = [claim.key for claim in stated]
