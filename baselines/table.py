@@ -55,7 +55,8 @@ def tunable(
     """
 
     def keywords(chosen: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-        return {}, functools.partial(make, **without_logarithms(chosen))
+        own = dict(getattr(make, "task_keywords", {}))
+        return own, functools.partial(make, **without_logarithms(chosen))
 
     return Tunable(
         getattr(make, "control", None),

@@ -132,7 +132,7 @@ class Task(ABC):
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
     reach: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Parameters that say how far an action reaches, by control or trained bank. A learned policy keeps those that it
+    """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy keeps those that it
     was trained with: under others the same numbers would be other actions."""
     log_format: ClassVar[LogFormat | None] = None
     """Tables of real measurements that can be read; None where they cannot."""

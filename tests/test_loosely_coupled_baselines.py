@@ -62,6 +62,7 @@ def on_paper():
 def steered(name, scenario, seeds, **keywords):
     """States after every action of a policy or reference, one list."""
     maker = competitor(ID, name)
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     model = make_model(ID, getattr(maker, "control", None), scenario, **keywords)
     return model, [state for state, _ in rollout(model, maker, seeds)]
 
@@ -425,13 +426,13 @@ def test_tuned_values_are_shipped_and_better_on_other_episodes():
 
 @pytest.mark.parametrize("control", ["gain", "mode"])
 def test_lanes_that_restart_alone_equal_single_environments(control):
-    env = gym.make_vec(ID, num_envs=3, control=control, autoreset_mode="Disabled", horizon=12)
+    env = gym.make_vec(ID, num_envs=3, control=control, autoreset_mode="Disabled", horizon=120)
     env.reset(seed=[1, 2, 3])
     action = np.full((3, 1), 0.4, np.float32) if control == "gain" else np.array([0, 1, 2])
     for _ in range(5):
         env.step(action)
     env.reset(seed=[9, 9, 9], options={"reset_mask": np.array([False, True, False])})
-    alone = gym.make(ID, control=control, horizon=12)
+    alone = gym.make(ID, control=control, horizon=120)
     alone.reset(seed=9)
     for _ in range(7):
         shown, paid, *_ = env.step(action)

@@ -80,7 +80,7 @@ def test_reused_figure_shows_what_a_new_one_shows(control, general, monkeypatch)
 
 def test_a_scenario_whose_measurements_take_uniform_numbers_is_drawn():
     env = gymnasium.make(
-        "filtergym/LooselyCoupledNavigation-v0", scenario="outliers", render_mode="rgb_array", horizon=5
+        "filtergym/LooselyCoupledNavigation-v0", scenario="outliers", render_mode="rgb_array", horizon=5, decision_interval=1
     )
     env.reset(seed=0)
     assert env.render().ndim == 3

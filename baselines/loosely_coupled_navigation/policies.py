@@ -5,7 +5,7 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
@@ -99,6 +99,8 @@ class TimeVarying(Policy):
 
     control = "gain"
     traceable = True
+    task_keywords: ClassVar[dict[str, Any]] = {"decision_interval": 1}
+    """It follows the Riccati equation measurement by measurement."""
 
     def __init__(self, model: Model, intensity: float | None = None) -> None:
         super().__init__(model)

@@ -50,7 +50,8 @@ class LooselyCoupledNavigation(Task):
 
     ### Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge. An action holds for
+    ``decision_interval`` measurements, ten by default.
 
     Without a measurement the gain is zero, whatever the action; under ``noise`` the covariance still grows by
     the rate errors' noises that the action states.
@@ -85,7 +86,7 @@ class LooselyCoupledNavigation(Task):
 
     ### Episode End
 
-    Truncation after ``horizon`` measurements (500 = 5 s). There is no termination.
+    Truncation after ``horizon`` measurements (500 = 5 s, 50 decisions). There is no termination.
 
     ### Arguments
 
@@ -99,7 +100,7 @@ class LooselyCoupledNavigation(Task):
     """
 
     id = ID
-    interface = 3
+    interface = 4
     paper_source = (
         "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
         "navigation complexes (in Russian)"
@@ -124,7 +125,7 @@ class LooselyCoupledNavigation(Task):
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
     reach = {
-        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale"),
+        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale", "decision_interval"),
         "gain": ("smallest_gain",),
         "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
     }
