@@ -256,30 +256,22 @@ class _Names:
 
     def _crosses(self, start: tuple[float, float], end: tuple[float, float]) -> bool:
         """Whether a line from a point to its name runs through another name or point."""
-        along = numpy.linspace(start, end, 12)
-        return any(
-            bool(((along[:, 0] > a) & (along[:, 0] < c) & (along[:, 1] > b) & (along[:, 1] < d)).any())
-            for a, b, c, d in self.taken
-            if not (a <= start[0] <= c and b <= start[1] <= d)
-        )
+        x, y = numpy.linspace(start, end, 12).T[:, :, None]
+        a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
+        others = ~((a <= start[0]) & (start[0] <= c) & (b <= start[1]) & (start[1] <= d))
+        return bool(((x > a) & (x < c) & (y > b) & (y < d) & others).any())
 
     def _crowding(self, box: tuple[float, float, float, float]) -> float:
         """How much else there is in a box: names and points weigh more than lines, and the frame most."""
         left, bottom, right, top = box
         margin = 0.8 * self.pixels
-        found = 0.0
-        for a, b, c, d in self.taken:
-            across = min(right + margin, c) - max(left - margin, a)
-            along = min(top + margin, d) - max(bottom - margin, b)
-            found += 10.0 * (across > 0.0 and along > 0.0)
-        for line in self.lines:
-            inside = (
-                (line[:, 0] > left)
-                & (line[:, 0] < right)
-                & (line[:, 1] > bottom - margin)
-                & (line[:, 1] < top)
-            )
-            found += 3.0 * bool(inside.any())
+        a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
+        across = numpy.minimum(right + margin, c) - numpy.maximum(left - margin, a)
+        along = numpy.minimum(top + margin, d) - numpy.maximum(bottom - margin, b)
+        found = 10.0 * numpy.count_nonzero((across > 0.0) & (along > 0.0))
+        x, y = numpy.moveaxis(numpy.array(self.lines), -1, 0)
+        inside = (x > left) & (x < right) & (y > bottom - margin) & (y < top)
+        found += 3.0 * numpy.count_nonzero(inside.any(axis=1))
         window = self.window
         return found + 100.0 * (
             left < window.x0 + margin

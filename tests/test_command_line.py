@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import commands
 import pytest
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.catalogue import catalogue
 from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
@@ -335,6 +336,13 @@ def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
     benchmark.run_benchmark(tmp_path, benchmark.BenchmarkOptions())
     assert (tmp_path / "results.json").exists()
     assert {path.name for path in waiting.iterdir()} == others
+
+
+def test_quick_benchmark_runs_every_environment_in_its_default_scenario():
+    from filtergym.reports import benchmark
+
+    expected = [(id, cls.default_scenario) for id, cls in catalogue().items()]
+    assert [(cell.environment, cell.scenario) for cell in benchmark.cells(False)] == expected
 
 
 def test_full_benchmark_compares_everything():
