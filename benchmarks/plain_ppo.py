@@ -3,8 +3,8 @@
     python benchmarks/plain_ppo.py --out plain_ppo.json
     python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
 
-One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 where one holds for
-ten measurements), five training seeds; then the deterministic policy, the action zero and the paper's algorithm meet
+One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 in
+TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's algorithm meet
 the same episodes of the test split. Runs that a file holds are not repeated.
 """
 

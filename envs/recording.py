@@ -208,7 +208,8 @@ class Recording:
                 f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
             )
         named = {**self.parameters, **keywords}
-        interval = freeze(named.get("decision_interval", defaults["decision_interval"]))
+        own = cls.recorded_decision_interval or defaults["decision_interval"]
+        interval = freeze(named.get("decision_interval", own))
         check("decision_interval", interval, *field_limits(cls.Parameters)["decision_interval"])
         longest, shortest = int(self.lengths.max()), int(self.lengths.min())
         if shortest < interval:
@@ -216,7 +217,8 @@ class Recording:
                 f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
                 f"{self.name!r}, got {interval}"
             )
-        parameters = {"horizon": longest - longest % interval, **self.typical, **self.parameters}
+        held = {"horizon": longest - longest % interval, "decision_interval": interval}
+        parameters = {**held, **self.typical, **self.parameters}
         made = cls.Parameters(**{**parameters, **keywords})
         if made.horizon > longest:
             raise ValueError(

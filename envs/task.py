@@ -134,6 +134,8 @@ class Task(ABC):
     reach: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy keeps those that it
     was trained with: under others the same numbers would be other actions."""
+    recorded_decision_interval: ClassVar[int | None] = None
+    """Measurements for which an action holds in a recording that names no number; None: as by default. One loses none."""
     log_format: ClassVar[LogFormat | None] = None
     """Tables of real measurements that can be read; None where they cannot."""
     live_input: ClassVar[type[LiveInput]] = LiveInput

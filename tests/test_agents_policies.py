@@ -127,7 +127,7 @@ def test_fields_are_found_by_their_names(file):
     control = cls.controls[0] if kind_of(maker) == "estimator" else maker.control
     interval = min(cls.Parameters().decision_interval, 5)
     own_reach = getattr(maker, "task_keywords", {})
-    parameters = cls.Parameters(horizon=4 * interval, decision_interval=interval, **own_reach)
+    parameters = cls.Parameters(**{"horizon": 4 * interval, "decision_interval": interval, **own_reach})
     costs = []
     for own in (cls, wider(cls)):
         model = Model(own(parameters), control)

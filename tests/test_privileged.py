@@ -81,7 +81,7 @@ def test_maneuvers_are_flown_when_the_context_says():
 
 
 def test_outages_are_where_the_context_says():
-    contexts, states = rollout(LOOSE, 499, scenario="outage")
+    contexts, states = rollout(LOOSE, 499, scenario="outage", decision_interval=1)
     first, beyond = contexts[0]["outage"]
     number = np.arange(1, 501)
     np.testing.assert_array_equal([c["available"] for c in contexts], (number < first) | (number >= beyond))
@@ -90,7 +90,7 @@ def test_outages_are_where_the_context_says():
 
 
 def test_class_changes_when_the_context_says():
-    contexts, _ = rollout(ESM, 100, scenario="class-change")
+    contexts, _ = rollout(ESM, 100, scenario="class-change", decision_interval=1)
     start = contexts[0]
     changed = np.arange(1, 102) >= start["change_scan"]
     assert changed.any()
@@ -120,7 +120,7 @@ def test_levels_are_those_of_the_times():
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_context_of_a_vector_is_that_of_single_environments(backend, mode):
     pytest.importorskip(NEEDED[backend])
-    keywords = {"horizon": 3, "context": True}
+    keywords = {"horizon": 3, "decision_interval": 1, "context": True}
     many = gymnasium.make_vec(LOOSE, num_envs=3, backend=backend, autoreset_mode=mode, **keywords)
     alone = [gymnasium.make(LOOSE, backend="numpy", **keywords) for _ in range(3)]
     told = [many.reset(seed=4)[1]] + [
@@ -153,7 +153,7 @@ def test_context_of_a_vector_is_that_of_single_environments(backend, mode):
 
 
 def test_context_of_a_vector_has_gymnasiums_form():
-    keywords = {"num_envs": 2, "context": True, "horizon": 3}
+    keywords = {"num_envs": 2, "context": True, "horizon": 3, "decision_interval": 1}
     own = gymnasium.make_vec(LOOSE, **keywords)
     synced = gymnasium.make_vec(LOOSE, vectorization_mode="sync", **keywords)
     infos = [(own.reset(seed=0)[1], synced.reset(seed=0)[1])]
@@ -198,7 +198,8 @@ def test_privileged_observations_are_context_and_error(env_id, short, backend):
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_privileged_vectors_are_those_of_single_environments(backend, scenario):
     pytest.importorskip(NEEDED[backend])
-    keywords = {"observation": "asymmetric", "scenario": scenario, "horizon": 3, "reward": "relative"}
+    keywords = {"observation": "asymmetric", "scenario": scenario, "reward": "relative"}
+    keywords |= {"horizon": 3, "decision_interval": 1}
     many = gymnasium.make_vec(LOOSE, num_envs=4, backend=backend, autoreset_mode="SameStep", **keywords)
     shown = [many.reset(seed=0)[0]]
     action = np.full((4, *many.single_action_space.shape), 0.1)

@@ -40,8 +40,8 @@ ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigatio
 UAV = "filtergym/UavAutopilot-v0"
 OPEN = {
     TARGET: {"horizon": 24},
-    LOOSE: {"horizon": 40, "axes": 2},
-    ESM: {"horizon": 24},
+    LOOSE: {"horizon": 40, "axes": 2, "decision_interval": 1},
+    ESM: {"horizon": 24, "decision_interval": 1},
     TIGHT: {"scenario": "rates-lost", "horizon": 12, "decision_interval": 3},
 }
 DOCS = Path(__file__).parent.parent / "docs"
@@ -123,6 +123,19 @@ def test_types_of_measurements_come_back(recordings):
         assert {n: (v.dtype, v.shape) for n, v in found.items()} == {
             n: (v.dtype, v.shape) for n, v in expected.items()
         }
+
+
+@pytest.mark.parametrize("env", [LOOSE, ESM])
+def test_nothing_of_a_recording_is_lost_to_the_decision_interval(env):
+    """Without a named interval an agent acts at every measurement, in an episode of any length."""
+    interval = make_model(env).task.decision_interval
+    assert interval > 1
+    made = record(env, episodes=1, backend="numpy", horizon=interval + 1, decision_interval=1)
+    blank = dataclasses.replace(made, parameters={})
+    task = make_model(env, scenario=blank).task
+    assert (task.horizon, task.decision_interval) == (interval + 1, 1)
+    named = make_model(env, scenario=blank, decision_interval=interval).task
+    assert (named.horizon, named.decision_interval) == (interval, interval)
 
 
 def test_torch_replays_too(recordings):

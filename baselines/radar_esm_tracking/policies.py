@@ -6,7 +6,7 @@ Equation numbers and readings are those of the task's paper (Ivanov, Seliverstov
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy
 
@@ -43,6 +43,8 @@ class _Posterior(Policy):
 
     control = "weights"
     traceable = True
+    task_keywords: ClassVar[dict[str, Any]] = {"decision_interval": 1}
+    """It states a posterior of every scan."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)

@@ -108,6 +108,7 @@ class LooselyCoupledNavigation(Task):
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
     log_format = LOG_FORMAT
+    recorded_decision_interval = 1
     live_input = PositionInput
     actions = {
         "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "

@@ -60,7 +60,8 @@ class RadarEsmTracking(Task):
 
     ## Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge. An action holds for
+    ``decision_interval`` scans, four by default: from one ESM decision to the next.
 
     ## Observation Space
 
@@ -76,11 +77,11 @@ class RadarEsmTracking(Task):
 
     ## Rewards
 
-    By default ("relative") what the paper's algorithm is charged on the same noise less what the agent is
-    charged: `30 log(1 + x / 30)` each, x the mean of three squared errors (range over `range_scale`, range rate
-    over `range_rate_scale`, acceleration over `acceleration_scale`) in units of 0.3, what the paper's algorithm is
-    charged on average. The noise of the track, which no weight changes, cancels. "cost" is the agent's own part,
-    below zero.
+    By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the mean of three squared errors (range over
+    `range_scale`, range rate over `range_rate_scale`, acceleration over `acceleration_scale`) in units of 0.05, and
+    x0 that of the action zero on the same noise. Most scans cost more than 0.05, so the reward is about the logarithm
+    of a ratio: a few mistaken classes do not rule it. "cost" is `-30 log(1 + x / 30)` in units of 0.3, what the paper's
+    algorithm is charged on average.
 
     ## Starting State
 
@@ -91,7 +92,7 @@ class RadarEsmTracking(Task):
 
     ## Episode End
 
-    Truncation after `horizon` scans; there is no termination. The range is a coordinate of a linear model: a
+    Truncation after `horizon` scans (120, 30 decisions); there is no termination. The range is a coordinate of a linear model: a
     near and fast target may pass through zero.
 
     ## Arguments
@@ -105,7 +106,7 @@ class RadarEsmTracking(Task):
     """
 
     id = ID
-    interface = 3
+    interface = 4
     paper_source = (
         "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "
         "recognition of the target's class (in Russian)"
@@ -113,12 +114,14 @@ class RadarEsmTracking(Task):
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
     log_format = LOG_FORMAT
+    recorded_decision_interval = 1
     live_input = ScanInput
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",
         "weights": "class probabilities, normalised; all zero is uniform",
     }
+    reach = {"evidence": ("evidence_scale", "decision_interval")}
     banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
     trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
@@ -133,8 +136,10 @@ class RadarEsmTracking(Task):
         "and acceleration_scale"
     )
     reward_unit = 0.3
-    # The noise of the track is most of the cost, and no weight changes it.
-    reward = "relative"
+    # The noise of the track is most of the cost, and no weight changes it; a logarithm, because a few mistaken classes
+    # would hide what an action changes in all other episodes.
+    reward = "log-relative"
+    log_reward_unit = 0.05
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: RadarEsmTrackingParameters
