@@ -131,7 +131,6 @@ def random_policy(env, dtype, network="recurrent"):
         ("UavAutopilot", "gain", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
         pytest.param("LooselyCoupledNavigation", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
-        pytest.param("UavAutopilot", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
         # Of ten measurements each; its gradient takes longest to compile.
         pytest.param(
             "TightlyCoupledNavigation",
