@@ -62,6 +62,18 @@ def test_frames_are_images_that_change(control, general, monkeypatch):
     env.close()
 
 
+@pytest.mark.parametrize("name", ["LooselyCoupledNavigation", "UavAutopilot"])
+def test_what_a_bank_of_hypotheses_believes_is_drawn(name):
+    env = TaskEnv(
+        f"filtergym/{name}-v0", control="hypotheses", render_mode="rgb_array", horizon=1, backend="numpy"
+    )
+    env.reset(seed=3)
+    before = env.render()
+    env.step(env.action_space.sample())
+    assert (before != env.render()).any()
+    env.close()
+
+
 @pytest.mark.parametrize(("control", "general"), [("gain", False), ("evidence", True)])
 def test_reused_figure_shows_what_a_new_one_shows(control, general, monkeypatch):
     if general:

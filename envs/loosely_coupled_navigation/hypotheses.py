@@ -1,8 +1,8 @@
 r"""Control ``hypotheses``: the estimator ``fault-bank``, whose prior and noises the action sets at every fix.
 
 The filters stand in ``fault_bank.py``; H hypotheses of noises and of pulls predict to the fix with weights p' and
-covariances P', and the levels of the receiver have probabilities q'. The action a in [-1, 1]^6 then changes what
-the fix is weighed with:
+covariances P', and the levels of the receiver have probabilities q'. The action a in [-1, 1]^6 then changes what the
+fix is weighed with:
 
     p'(h) <- p'(h) r1^(a1 pulled(h)) r2^(a2 modelled(h))                                    renormalised by Bayes' rule
     q'(l) <- q'(l) r3^(a3 s(l)),    R <- R r4^a4, this once
@@ -37,7 +37,8 @@ from .world import Measurement
 
 ACTIONS = ("pull", "modelled", "level", "receiver", "inertial", "wandering")
 REACH = (1.05, 1.05, 1.5, 1.25, 2.0, 2.0)
-"""Factors by which actions of one multiply."""
+"""Factors by which actions of one multiply: so small that white noise of deviation one, with which a new policy
+explores, costs a twentieth at most."""
 
 
 class SteeredBank(NamedTuple):

@@ -25,7 +25,7 @@ from ..rendering import (
     grown,
 )
 from .banks import NOISES, Augmented, Schemes, Steered
-from .hypotheses import ACTIONS, SteeredBank
+from .hypotheses import SteeredBank
 from .task import LooselyCoupledNavigation
 
 TRACK = (0.06, 0.075, 0.43, 0.80)
@@ -65,11 +65,14 @@ class LooselyCoupledNavigationPicture(Picture):
             # A gain of zero has no logarithm: it is drawn at the smallest one that an action can set.
             smallest = self.task.parameters.smallest_gain
             values["log_gain"] = math.log10(max(float(filters.gain[0, 0]), smallest))
-        elif isinstance(filters, Augmented | SteeredBank):
+        elif isinstance(filters, Augmented):
             values["innovation"] = math.nan if missing else normalised[0, 0]
-            names = NOISES if isinstance(filters, Augmented) else ACTIONS
-            for name, action in zip(names, filters.action[:, 0], strict=True):
-                values[f"action.{name}"] = action
+            for name, action in zip(NOISES, filters.action[:, 0], strict=True):
+                values[f"noise.{name}"] = action
+        elif isinstance(filters, SteeredBank):
+            values["innovation"] = math.nan if missing else normalised[0, 0]
+            probabilities = filters.probabilities[:, 0]
+            values["kind.modelled"], values["kind.pulled off"] = probabilities[0], probabilities[-2:].sum()
         else:
             assert isinstance(filters, Schemes)
             for i, weight in enumerate(filters.weights[:, 0]):
@@ -103,13 +106,14 @@ class LooselyCoupledNavigationPicture(Picture):
             low = math.log10(self.task.parameters.smallest_gain)
             innovations = {"innovation": "innovation"}
             steered = Strip(f"log10 of the gain{suffix}", {"gain": "log_gain"}, (low, 0.2), steps=True)
-        elif self.model.control in ("noise", "hypotheses"):
+        elif self.model.control == "noise":
             innovations = {"innovation": "innovation"}
-            names = NOISES if self.model.control == "noise" else ACTIONS
-            actions = {name: f"action.{name}" for name in names}
-            steered = Strip(
-                f"action: {self.model.control}", actions, (-1.08, 1.08), guides=(0.0,), steps=True
-            )
+            noises = {name: f"noise.{name}" for name in NOISES}
+            steered = Strip("action: noises", noises, (-1.08, 1.08), guides=(0.0,), steps=True)
+        elif self.model.control == "hypotheses":
+            innovations = {"innovation": "innovation"}
+            kinds = {kind: f"kind.{kind}" for kind in ("modelled", "pulled off")}
+            steered = Strip("probabilities", kinds, (-0.04, 1.04))
         else:
             names = self.task.modes
             innovations = {names[2]: "innovation.2"}

@@ -91,7 +91,7 @@ class LooselyCoupledNavigation(Task):
     ### Arguments
 
     ``scenario``: "random" (default; noise levels over a decade, changes of the receiver noise, outages),
-    "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver". ``control``: "noise", "gain", "mode", "weights". Every field
+    "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver". ``control``: "noise", "gain", "hypotheses", "mode", "weights". Every field
     of :class:`LooselyCoupledNavigationParameters` is a keyword.
 
     ### Version History
@@ -119,14 +119,20 @@ class LooselyCoupledNavigation(Task):
         "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
         "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
         "hypotheses": "factors r^a in the bank over faults at this fix: odds that the receiver is pulled off (r = 1.05), "
-        "that all noises are as modelled (1.05), probability of the receiver's highest level (1.1); variance of the fix "
-        "(1.25), process noise of the INS and of the receiver's coloured error (1.25 each); **0 is the estimator "
+        "that all noises are as modelled (1.05), probability of the receiver's highest level (1.5); variance of the fix "
+        "(1.25), process noise of the INS and of the receiver's coloured error (2 each); **0 is the estimator "
         "`fault-bank`**",
         "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
     reach = {
-        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale", "decision_interval"),
+        "noise": (
+            "noise_reach",
+            "receiver_scale",
+            "receiver_reduction",
+            "process_scale",
+            "decision_interval",
+        ),
         "gain": ("smallest_gain",),
         "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
     }

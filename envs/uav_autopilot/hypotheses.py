@@ -35,7 +35,8 @@ ACTIONS = ("gusts", "designed", "process")
 """What comes before the sensors."""
 REACH = (1.1, 1.25, 2.0)
 SENSOR_REACH = 1.5
-"""Factors by which actions of one multiply."""
+"""Factors by which actions of one multiply: so small that white noise of deviation one, with which a new policy
+explores, costs a twentieth at most."""
 
 
 class SteeredLevels(NamedTuple):
@@ -87,7 +88,8 @@ class HypothesesBank(AutopilotBank):
         """Of the hypotheses of each kind."""
         factors = (*REACH, *[SENSOR_REACH] * len(task.sensors))
         self.log_reach = task.constant([math.log(factor) for factor in factors])[:, None]
-        heights = numpy.log(grid(prior.gusts, prior.gust_points))
+        self.gust_levels = grid(prior.gusts, prior.gust_points)
+        heights = numpy.log(self.gust_levels)
         heights = numpy.array([0.0, *heights / heights[-1]])
         designed = numpy.arange(len(heights)) == 0.0
         raised = numpy.tile([heights, designed.astype(float)], (1, bank.groups))

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from ..model import Episode, Model
 from ..rendering import Picture, Strip, error_strip
 from .banks import MODES, AutopilotBank, Filter
-from .hypotheses import SteeredLevels
+from .hypotheses import HypothesesBank, SteeredLevels
 from .task import UavAutopilot
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
-BY_NAME = ("noise", "hypotheses")
-"""Controls whose actions are drawn, each with its name."""
+GUSTS = ("designed", "weaker", "stronger")
+"""Hypotheses that are drawn as one."""
 LEAST = 1.5
 """Half of the smallest range of the output, in units of the output: a unit step and some noise."""
 
@@ -49,12 +49,24 @@ class UavAutopilotPicture(Picture):
         }
         if self.model.control == "mode":
             values["mode"] = float(estimator.action[:, 0].argmax())
-        elif self.model.control in BY_NAME:
+        elif isinstance(estimator, SteeredLevels):
+            values |= self.beliefs(estimator)
+        elif self.model.control == "noise":
             for name, action in zip(self.actions, estimator.action[:, 0], strict=True):
                 values[f"action.{name}"] = action
         else:
             values["log10_scale"] = math.log10(estimator.scale[0])
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
+
+    def beliefs(self, estimator: SteeredLevels) -> dict[str, float]:
+        """Probabilities of hypotheses about the gusts, by what is drawn as one."""
+        assert isinstance(self.model.filter, HypothesesBank)
+        designed, *others = estimator.probabilities[:, 0]
+        stronger = sum(
+            p for p, level in zip(others, self.model.filter.gust_levels, strict=True) if level > 1.0
+        )
+        values = (designed, sum(others) - stronger, stronger)
+        return {f"gusts.{name}": float(value) for name, value in zip(GUSTS, values, strict=True)}
 
     def strips(self) -> Sequence[Strip]:
         """Left column the loop, right column the filter."""
@@ -71,10 +83,12 @@ class UavAutopilotPicture(Picture):
                 (-1.05 * reach, 1.05 * reach),
                 guides=(0.0,),
             )
-        elif self.model.control in BY_NAME:
+        elif self.model.control == "noise":
             actions = {name: f"action.{name}" for name in self.actions}
+            steered = Strip("action: noises", actions, (-1.08, 1.08), guides=(0.0,), steps=True)
+        elif self.model.control == "hypotheses":
             steered = Strip(
-                f"action: {self.model.control}", actions, (-1.08, 1.08), guides=(0.0,), steps=True
+                "probabilities of the gusts", {name: f"gusts.{name}" for name in GUSTS}, (-0.04, 1.04)
             )
         else:
             legend = ", ".join(f"{i} {mode}" for i, mode in enumerate(MODES))
