@@ -121,7 +121,13 @@ class LooselyCoupledNavigation(Task):
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
     reach = {
-        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale", "decision_interval"),
+        "noise": (
+            "noise_reach",
+            "receiver_scale",
+            "receiver_reduction",
+            "process_scale",
+            "decision_interval",
+        ),
         "gain": ("smallest_gain",),
         "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
     }
