@@ -439,7 +439,10 @@ class GatedMaker:
         """What the agent saw in its training; None where nobody knows."""
 
     def _check_fallback(self) -> None:
-        kind, keywords = kind_of(self._fallback), getattr(self._fallback, "task_keywords", {})
+        kind, keywords = kind_of(self._fallback), dict(getattr(self._fallback, "task_keywords", {}))
+        keywords.pop(
+            "decision_interval", None
+        )  # its actions hold for as long as it says, whatever the agent's do
         if kind not in ("policy", "estimator") or self._fallback is RandomPolicy:
             raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
         if keywords:
@@ -479,7 +482,8 @@ class GatedMaker:
         control = control_of(self._fallback, "policy", None, self.problem.task, self.fallback)
         model = Model(task, control)
         policy = make_competitor(self._fallback, model.on_numpy())
-        return LearnedEstimator(model, policy, task.decision_interval)
+        own = getattr(self._fallback, "task_keywords", {})
+        return LearnedEstimator(model, policy, own.get("decision_interval", task.decision_interval))
 
 
 @cache

@@ -290,6 +290,8 @@ class StoredPolicy:
         now, keywords = model.task.parameters, self.task_keywords
         defaults = type(now)()
         for name in model.task.reach.get(self.control, ()):
+            if name == "decision_interval":  # an action means the same, however long it holds
+                continue
             trained = keywords.get(name, getattr(defaults, name))
             if getattr(now, name) != trained:
                 raise ValueError(

@@ -4,8 +4,8 @@
     python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
 
 One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 in
-TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's algorithm meet
-the same episodes of the test split. Runs that a file holds are not repeated.
+TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's
+algorithm meet the same episodes of the test split. Runs that a file holds are not repeated.
 """
 
 import argparse

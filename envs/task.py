@@ -132,10 +132,11 @@ class Task(ABC):
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
     reach: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy keeps those that it
-    was trained with: under others the same numbers would be other actions."""
+    """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy
+    keeps those that it was trained with: under others the same numbers would be other actions."""
     recorded_decision_interval: ClassVar[int | None] = None
-    """Measurements for which an action holds in a recording that names no number; None: as by default. One loses none."""
+    """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
+    measurement is lost."""
     log_format: ClassVar[LogFormat | None] = None
     """Tables of real measurements that can be read; None where they cannot."""
     live_input: ClassVar[type[LiveInput]] = LiveInput

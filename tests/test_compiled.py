@@ -170,7 +170,9 @@ def test_other_processes_see_the_same(way):
 
 def test_environments_are_made_in_threads():
     def flight(seed):
-        env = gym.make_vec("filtergym/LooselyCoupledNavigation-v0", num_envs=8, backend="compiled", horizon=70)
+        env = gym.make_vec(
+            "filtergym/LooselyCoupledNavigation-v0", num_envs=8, backend="compiled", horizon=70
+        )
         return flown(env, [np.zeros(env.action_space.shape)] * 5)
 
     compiled_tasks._trace_once.cache_clear()

@@ -106,7 +106,7 @@ def test_probabilities(dataset, curves):
     np.testing.assert_allclose(found["mode_probability_high"], high)
     assert np.isnan(curves["mode_probability"].sel(policy="adaptive")).all()
     assert "true_class_probability" not in curves
-    radar = evaluate(RADAR, ["quasi-optimal"], episodes=12, horizon=15)
+    radar = evaluate(RADAR, ["quasi-optimal"], episodes=12, horizon=16)
     found = curves_of(radar)
     assert found["true_class_probability"].dims == ("policy", "time")
     expected = radar["true_class_probability"].mean("episode")

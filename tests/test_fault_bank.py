@@ -118,7 +118,7 @@ def of_bank(bank, seen):
 
 def small(**changed):
     """A bank of few hypotheses and its task."""
-    task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=7).task
+    task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=7, decision_interval=1).task
     prior = {
         "points": 2,
         "onsets": 3,

@@ -163,7 +163,11 @@ def test_alarms_hear_what_is_wrong(name):
 
 def test_smaller_noise_is_wrong_too():
     env = gymnasium.make_vec(
-        "filtergym/LooselyCoupledNavigation-v0", num_envs=8, scenario="paper", horizon=150
+        "filtergym/LooselyCoupledNavigation-v0",
+        num_envs=8,
+        scenario="paper",
+        horizon=150,
+        decision_interval=1,
     )
     model = env.unwrapped.model
     first, _ = env.reset(seed=0)

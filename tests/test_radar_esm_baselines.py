@@ -168,7 +168,9 @@ def played(model, estimator, seeds, decisions):
 
 
 def test_ideal_is_the_channel_of_the_true_class():
-    model = make_model(ID, scenario="random", class_change=None, radar_coloured=(0.0, 0.0))
+    model = make_model(
+        ID, scenario="random", decision_interval=1, class_change=None, radar_coloured=(0.0, 0.0)
+    )
     _, states = played(model, Ideal(model.task), range(24), 120)
     for episode, mean, covariance in states:
         lane, true = numpy.arange(24), episode.truth.target_class
@@ -180,7 +182,7 @@ def test_ideal_is_the_channel_of_the_true_class():
 
 def test_ideal_switches_its_model_at_the_change():
     """Against a Kalman filter written out for each lane, which keeps state and covariance at the change."""
-    model = make_model(ID, scenario="class-change")
+    model = make_model(ID, scenario="class-change", decision_interval=1)
     models, start = model.task.design_models(model.task.parameters)
     H, R = models.H, models.R
     told, states = played(model, Ideal(model.task), range(8), 120)
@@ -243,7 +245,7 @@ def decided(model, policy, seeds, decisions):
 )  # fmt: skip
 def test_weights_against_bayes_written_out(cls, arguments):
     """Every lane's weights from the states, with products in place of sums of logarithms."""
-    model = make_model(ID, "weights", "crowded")
+    model = make_model(ID, "weights", "crowded", decision_interval=1)
     p = model.task.parameters
     recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
     pi = composition @ recognition
@@ -277,7 +279,7 @@ def test_weights_against_bayes_written_out(cls, arguments):
 
 @pytest.mark.parametrize("arguments", [{}, {"change": 0.1, "refused": 0.7, "esm": 0.4}])
 def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
-    model = make_model(ID, "weights", "crowded")
+    model = make_model(ID, "weights", "crowded", decision_interval=1)
     p = model.task.parameters
     recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
     policy = baselines.ForgettingJointType(model, **arguments)
@@ -306,7 +308,7 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
 
 
 def test_forgetting_nothing_is_the_joint_posterior():
-    model = make_model(ID, "weights", "random")
+    model = make_model(ID, "weights", "random", decision_interval=1)
     joint, kept = baselines.JointType(model), baselines.ForgettingJointType(model, change=0.0)
     state = None
     lanes = start_lanes(model, range(8))

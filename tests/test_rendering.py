@@ -92,7 +92,11 @@ def test_reused_figure_shows_what_a_new_one_shows(control, general, monkeypatch)
 
 def test_a_scenario_whose_measurements_take_uniform_numbers_is_drawn():
     env = gymnasium.make(
-        "filtergym/LooselyCoupledNavigation-v0", scenario="outliers", render_mode="rgb_array", horizon=5, decision_interval=1
+        "filtergym/LooselyCoupledNavigation-v0",
+        scenario="outliers",
+        render_mode="rgb_array",
+        horizon=5,
+        decision_interval=1,
     )
     env.reset(seed=0)
     assert env.render().ndim == 3
@@ -301,9 +305,10 @@ def test_estimators_smoothers_and_references_are_drawn(id, name, monkeypatch):
         "draw",
         lambda self, history, state: drawn.append({key: values.copy() for key, values in history.items()}),
     )
-    dataset = evaluate(id, [name], None, 2, horizon=7, tracks=True)
+    dataset = evaluate(id, [name], None, 2, horizon=7, decision_interval=1, tracks=True)
     seed = int(dataset["episode_seed"].values[1])
-    frames = episode_frames(task_class(id), name, competitor(id, name), None, seed=seed, every=3, horizon=7)
+    keywords = {"horizon": 7, "decision_interval": 1}
+    frames = episode_frames(task_class(id), name, competitor(id, name), None, seed=seed, every=3, **keywords)
     assert len(frames) == 3  # measurements 3, 6, and the last
     assert frames[0].size == (960, 608)
     own = dataset.isel(policy=0, episode=1)

@@ -32,6 +32,7 @@ class ClassAlarm(Alarm):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         p = self.task.parameters
+        self.decisions = p.horizon  # an episode holds as many ESM decisions, however long an action holds
         self.squared = model.reader("log_squared_innovation")
         self.log_likelihood, self.last_weight = model.reader("log_likelihood"), model.reader("last_weight")
         self.used_count, self.refused_count = model.reader("used_count"), model.reader("refused_count")

@@ -18,8 +18,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     horizon: int = parameter(120, at_least=1)
     """Scans acted on in one episode (ours: 60 s; the paper does not say)."""
     decision_interval: int = parameter(4, at_least=1)
-    """Scans for which one action holds (ours: from one ESM decision to the next. What a single scan owes to its weights is
-    lost in the noise: plain PPO found too little in 200,000 decisions of one scan)."""
+    """Scans for which one action holds (ours: from one ESM decision to the next. What a single scan owes to its weights
+    is lost in the noise: plain PPO found too little in 200,000 decisions of one scan)."""
     esm_period: int = parameter(4, at_least=1)
     """Scans from one ESM decision to the next, W (paper: 2 s)."""
     manoeuvrability: tuple[float, ...] = parameter((0.025, 0.033, 0.1), above=0.0)

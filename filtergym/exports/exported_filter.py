@@ -71,7 +71,7 @@ def find_exported(request: ExportRequest) -> Exported:
     task = make_task(problem.task, scenario, **{**getattr(maker, "task_keywords", {}), **keywords})
     if isinstance(maker, EstimatorMaker):  # a bank with a network, whatever it is from outside
         model = ReadModel(task, maker.bank)
-        parts = _steered_parts(model, maker.policy(model))
+        parts = _steered_parts(model, maker.policy(model), 1)
     elif kind == "estimator":
         model = ReadModel(task, control_of(maker, kind, None, problem.task, name))
         own = check_competitor(name, make_competitor(maker, task), kind)
@@ -81,7 +81,7 @@ def find_exported(request: ExportRequest) -> Exported:
         policy = check_competitor(name, make_competitor(maker, model), kind)
         if isinstance(policy, RandomPolicy):
             raise ValueError(f"{name!r} draws its actions: there is nothing to write out")
-        parts = _steered_parts(model, policy)
+        parts = _steered_parts(model, policy, model.task.decision_interval)
     initial, measurement = _first_measurement(model)
     return Exported(task, parts, measurement, initial, model, maker)
 
@@ -94,8 +94,14 @@ def _mask_of(world: World) -> Any:
     return world.mask_missing
 
 
-def _steered_parts(model: ReadModel, policy: Any) -> Parts:
-    """Parts of a bank under a policy; an action that never changes needs no observation."""
+def _steered_parts(model: ReadModel, policy: Any, decision_interval: int) -> Parts:
+    """Parts of a bank under a policy; an action that never changes needs no observation.
+
+    Args:
+        model: of the bank.
+        policy: that steers it.
+        decision_interval: measurements for which an action holds; one for a network inside a filter.
+    """
     if isinstance(policy, ConstantPolicy):
         action: Array = numpy.array(policy.action, dtype=float)
         return Parts(ConstantTrack, {"filter": model.filter, "action": action}, OF_A_BANK)
@@ -105,7 +111,7 @@ def _steered_parts(model: ReadModel, policy: Any) -> Parts:
         "filter": model.filter,
         "observation": model.observation,
         "policy": policy,
-        "decision_interval": model.task.decision_interval,
+        "decision_interval": decision_interval,
     }
     return Parts(SteeredTrack, arguments, OF_A_BANK + OF_AN_OBSERVATION)
 
