@@ -149,9 +149,9 @@ def update_coordinates_with_gain(
 ) -> UpdateWithGain:
     """Take in measurements of single coordinates with the Kalman gain K of another covariance M and other variances.
 
-    One after the other, with ``k = M_:i / (M_ii + R')``::
+    One after the other, with the column m of M and the column p of P that belong to the coordinate i::
 
-        x = x + k (z - x_i),  P = P - k u^T - u k^T,  u = P_:i - k (P_ii + R) / 2,  M = M - k M_i:
+        k = m / (m_i + R'),  x = x + k (z - x_i),  P = P - k u^T - u k^T,  u = p - k (p_i + R) / 2,  M = M - k m^T
 
     which is ``x + K nu`` and ``(I - K H) P (I - K H)^T + K R K^T`` with the joint gain of M and R'.
 
