@@ -117,7 +117,8 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report]"
+	# Most modules of these packages are never imported: Python compiles the others when they are, and keeps them.
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[fast,report]"
 	touch $@
 
 $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
