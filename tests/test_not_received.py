@@ -15,11 +15,11 @@ from filtergym import evaluate, record
 
 RADAR = "filtergym/ManeuveringTarget-v0"
 UNRELIABLE = {  # scenario, horizon, and what may not be received
-    RADAR: ("missed-detections", 100, "position"),
+    RADAR: ("missed-detections", 40, "position"),
     "filtergym/LooselyCoupledNavigation-v0": ("outage", 400, "fix"),
-    "filtergym/RadarEsmTracking-v0": ("random", 100, "bearing_difference"),
-    "filtergym/TightlyCoupledNavigation-v0": ("rates-lost", 120, "readings"),
-    "filtergym/UavAutopilot-v0": ("random", 200, "reading"),
+    "filtergym/RadarEsmTracking-v0": ("random", 40, "bearing_difference"),
+    "filtergym/TightlyCoupledNavigation-v0": ("rates-lost", 40, "readings"),
+    "filtergym/UavAutopilot-v0": ("random", 80, "reading"),
 }
 
 
