@@ -124,7 +124,7 @@ def table(runs: list[dict]) -> Table:
             own[0]["control"],
             f"{own[0]['steps']:,}",
             f"{each.mean():+.1f}",
-            f"[{each.mean() - half:+.1f}, {each.mean() + half:+.1f}]",
+            f"[{each.mean() - half:+.1f}, {each.mean() + half:+.1f}]" if len(own) > 1 else "",
             f"{median:+.1f}",
             f"{100.0 * own[0]['zero_difference']:+.1f}",
             f"{100.0 * own[0]['zero_median_difference']:+.1f}",

@@ -253,7 +253,7 @@ def test_a_state_that_does_not_fit_is_a_sentence():
     with pytest.raises(
         ValueError, match=r"RadarEsmTracking-v0 measures scan, radar, .*: Elsewhere must say by a"
     ):
-        filtergym.evaluate("RadarEsmTracking", {"mine": Elsewhere}, episodes=1, horizon=2)
+        filtergym.evaluate("RadarEsmTracking", {"mine": Elsewhere}, episodes=1, horizon=4)
 
 
 def test_without_a_measurement_filterpy_only_predicts():

@@ -13,7 +13,8 @@ LEAKY = ((0.9, 0.08, 0.02), (0.0, 0.7, 0.3), (0.25, 0.05, 0.7))
 
 
 def make(scenario="paper", control="evidence", xp=numpy, **keywords) -> Model:
-    parameters = TASK.Parameters(**{**TASK.scenarios[scenario].parameters, **keywords})
+    keywords = {**TASK.scenarios[scenario].parameters, "decision_interval": 1, **keywords}
+    parameters = TASK.Parameters(**keywords)
     return Model(TASK(parameters, xp), control)
 
 

@@ -22,7 +22,6 @@ from filtergym.agents.search import (
 from filtergym.agents.training_run import RunOptions, load_run, new_run, save_run
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
-from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 SPACE = {"learning_rate": {"low": 1e-4, "high": 1e-2, "log": True, "prefix": "lin_"}, "hidden_size": [2, 4]}
@@ -160,7 +159,7 @@ def test_shipped_spaces_are_of_settings_that_there_are(algorithm):
             assert rollout % chosen.get("batch_size", 1) == 0
     if algorithm == "bptt":
         for id in catalogue():
-            model = make_model(id)
+            model = new_run(problem_of(id), RunOptions("bptt")).make_model()
             assert (
                 max(read_space(id, "bptt")["truncation"])
                 == model.task.horizon // model.task.decision_interval

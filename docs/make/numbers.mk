@@ -109,6 +109,14 @@ $(DONE)/flights: $(DONE)/ship-ManeuveringTarget
 $(DONE)/plain:
 	$(BIN)/python benchmarks/plain_ppo.py --markdown --out build/plain_ppo.json > build/plain_ppo.txt
 	$(table) build/plain_ppo.txt --name plain_ppo --command "python benchmarks/plain_ppo.py --markdown"
+	$(BIN)/python benchmarks/plain_ppo.py --markdown --algo recurrent-ppo --envs 16 --seeds 1 --steps 50000 \
+	  --out build/plain_recurrent_ppo.json > build/plain_recurrent_ppo.txt
+	$(table) build/plain_recurrent_ppo.txt --name plain_recurrent_ppo --command \
+	  "python benchmarks/plain_ppo.py --markdown --algo recurrent-ppo --envs 16 --seeds 1 --steps 50000"
+	$(BIN)/python benchmarks/plain_ppo.py --markdown --algo sac --envs 16 --seeds 1 --steps 20000 \
+	  --out build/plain_sac.json > build/plain_sac.txt
+	$(table) build/plain_sac.txt --name plain_sac --command \
+	  "python benchmarks/plain_ppo.py --markdown --algo sac --envs 16 --seeds 1 --steps 20000"
 	$(finish)
 
 $(DONE)/harm-%: $(DONE)/ship-%
