@@ -33,6 +33,8 @@ from .world import Measurement, Start
 if TYPE_CHECKING:
     from .task import RadarEsmTracking
 
+EVIDENCE = 12.0
+"""Nats that an answer of one adds to the logarithm of a class's probability: here nobody explores."""
 NOISE_RANGE = 3.0
 """Largest factor and divisor of the deviations of accelerations and radar errors."""
 CAUTION = 3.0
@@ -184,12 +186,11 @@ class KalmanNetBank(ClassBank):
                 imm.log_probabilities(jump.probabilities),
             )
         esm = self._esm_log_likelihood(f.used, measurement)
-        scale = self.parameters.evidence_scale
         return f._replace(
             mean=mean,
             covariance=covariance,
             log_predicted=log_predicted,
-            probabilities=bank_probabilities("evidence", a[:classes], log_predicted, esm, scale, xp),
+            probabilities=bank_probabilities("evidence", a[:classes], log_predicted, esm, EVIDENCE, xp),
             believed=imm.mode_posterior(log_predicted, esm),
             gain_covariance=gain_covariance,
             action=a,
