@@ -205,7 +205,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
                 posterior[s] += scipy.stats.multivariate_normal(cov=theta).logpdf(delta)
             weights = np.exp(posterior + esm[:, i] - max(posterior + esm[:, i]))
             np.testing.assert_allclose(state.believed[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12)
-            weights *= np.exp(task.parameters.evidence_scale * a[:classes])
+            weights *= np.exp(fusion.EVIDENCE * a[:classes])
             np.testing.assert_allclose(
                 state.probabilities[:, i], weights / weights.sum(), rtol=1e-7, atol=1e-12
             )
