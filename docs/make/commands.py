@@ -26,9 +26,11 @@ from records import (
     benchmark_data,
     markdown_tables,
     read_benchmark,
+    read_record,
     recorded_environments,
     short_name,
     today,
+    with_competitors,
     without_place,
     write_record,
 )
@@ -61,9 +63,18 @@ Folder = Annotated[Path, typer.Option("--into", help="Folder of the records.")]
 def record(
     results: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
     note: Note = "",
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Competitor that is put into the record that there is, from evaluations over the same episodes; "
+            "repeatable."
+        ),
+    ] = None,
     into: Folder = FOLDER,
 ) -> None:
     """Make a record of every environment that a full benchmark has measured: what pages show of it.
+
+    With --add results.json are of ``filtergym evaluate --out``, with the scenario's best competitor among its policies.
 
     Example: python docs/make record results/results.json
     """
@@ -76,6 +87,9 @@ def record(
             data = benchmark_data(problem_of(id), records)
             made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
             name = f"{BENCHMARK}/{short_name(id)}"
+            if add:
+                whole = read_record(name, into)
+                made = whole._replace(note=note or whole.note, data=with_competitors(whole.data, data, add))
             console.print(
                 f"{write_record(name, made, into)}: {len(data['scenarios'])} scenarios", soft_wrap=True
             )

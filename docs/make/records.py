@@ -7,8 +7,9 @@ three kinds of data: ``benchmark/ENVIRONMENT`` holds what pages show of ``filter
 
 import datetime
 import json
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -178,6 +179,57 @@ def benchmark_data(problem: Problem, records: Sequence[Record]) -> dict[str, Any
         if r.unit != "1":
             units[key] = r.unit
     return {"environment": problem.id, "split": split, "seed": seed, "units": units, "scenarios": scenarios}
+
+
+def with_competitors(
+    data: Mapping[str, Any], added: Mapping[str, Any], names: Collection[str]
+) -> dict[str, Any]:
+    """Return a benchmark's data with the rows of competitors that were measured later, over the same episodes.
+
+    Args:
+        data: of the whole benchmark.
+        added: of the same environment, with some competitors; the best of each scenario is among them, since all
+            others are compared with it.
+        names: of those that are added or replaced; the others are there to be compared.
+
+    Raises:
+        ValueError: if the episodes are others, a competitor that is not named costs something else than it did, or one
+            that is named costs less than the best: then the whole scenario has to be measured again.
+    """
+    for key in ("environment", "split", "seed"):
+        if data[key] != added[key]:
+            raise ValueError(f"the record has {key} {data[key]}, what is added {added[key]}")
+    scenarios = dict(data["scenarios"])
+    for name, own in added["scenarios"].items():
+        known = scenarios.get(name)
+        if known is None or known["episodes"] != own["episodes"]:
+            raise ValueError(f"the record has other episodes of {name}")
+        for competitor in own["competitors"].keys() - {*names}:
+            before = known["competitors"].get(competitor)
+            if before is None or not _same_cost(before, own["competitors"][competitor]):
+                raise ValueError(f"{competitor} costs something else in the record of {name}")
+        if _best(known) != _best(own):
+            raise ValueError(
+                f"{_best(own)} costs less than {_best(known)} in {name}: measure that scenario again"
+            )
+        fresh = {competitor: own["competitors"][competitor] for competitor in names}
+        scenarios[name] = {**known, "competitors": {**known["competitors"], **fresh}}
+    return {**data, "units": {**data["units"], **added["units"]}, "scenarios": scenarios}
+
+
+def _same_cost(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    return math.isclose(one["metrics"]["cost"][0], other["metrics"]["cost"][0], rel_tol=1e-5)
+
+
+def _best(scenario: Mapping[str, Any]) -> str:
+    """Name of whom the others are compared with."""
+    [name] = {
+        key.partition(" ")[2]
+        for each in scenario["competitors"].values()
+        for key in each["metrics"]
+        if key.startswith("behind_best ")
+    }
+    return name
 
 
 def _is_shown(record: Record, components: set[str], problem: Problem) -> bool:

@@ -435,8 +435,10 @@ class FaultFilter:
         there = measurement.available > 0.0
         split = predicted.free.weights.shape[0]
         free, pulled = (
-            self.update_part(part, *of_part, there)._replace(weights=xp.reshape(each, part.weights.shape))
-            for part, each, *of_part in zip(
+            self.update_part(part, innovation, along, noise, there)._replace(
+                weights=xp.reshape(each, part.weights.shape)
+            )
+            for part, each, innovation, along, noise in zip(
                 (predicted.free, predicted.pulled),
                 (weighing.weights[:split], weighing.weights[split:]),
                 weighing.innovations,

@@ -21,7 +21,7 @@ from ...filters.ordered_sums import weighted_sum
 from ..filter import Initial
 from ..observation import Array
 from .plant import Model, pitch_channel
-from .world import Measurement
+from .world import Measurement, Start
 
 if TYPE_CHECKING:
     from .task import UavAutopilot
@@ -165,7 +165,7 @@ class LevelFilter:
         self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
 
-    def start_bank(self, initial: Initial) -> Hypotheses:
+    def start_bank(self, initial: Initial | Start) -> Hypotheses:
         """Start all where everyone starts."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
