@@ -347,16 +347,19 @@ class GatedEstimator:
             other = self.fallback.likelihood(fallback, measurement)
         else:
             other = Likelihood.of(*told) if told else Likelihood(None)
-        odds = memory.odds
-        if own.log_likelihood is not None and other.log_likelihood is not None:
-            ratio = other.log_likelihood - own.log_likelihood
-            odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
-            told_less = xp.isfinite(own.log_likelihood) & xp.isnan(other.log_likelihood)
-            odds = xp.where(told_less & xp.all(xp.isfinite(other_mean), axis=0), MOST_ODDS, odds)
+        # A track that is lost altogether, so that its estimate is no number, is no answer either.
+        odds, sound = memory.odds, xp.all(xp.isfinite(mean), axis=0)
+        if other.log_likelihood is not None:
+            silent = xp.isnan(other.log_likelihood) & xp.all(xp.isfinite(other_mean), axis=0)
+            if own.log_likelihood is None:
+                # Whether it was told less, or nothing was received, this agent does not say.
+                sound = sound & ~silent
+            else:
+                ratio = other.log_likelihood - own.log_likelihood
+                odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
+                odds = xp.where(silent & xp.isfinite(own.log_likelihood), MOST_ODDS, odds)
         squares, degrees = self._sum_squares(memory, other)
         other_covariance = self._variance_factor(squares, degrees) * other_covariance
-        # A track that is lost altogether, so that its estimate is no number, is no answer either.
-        sound = xp.all(xp.isfinite(mean), axis=0)
         trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
         return (
             xp.where(trusted, mean, other_mean),

@@ -209,11 +209,12 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
     assert (variance[2][is_other] == variance[1][is_other]).all()
 
 
-def test_who_is_shown_one_plot_of_many_is_not_trusted():
+@pytest.mark.parametrize("name", ["bptt", "kalman-net"])
+def test_who_is_shown_one_plot_of_many_is_not_trusted(name):
     """The fallback takes in all plots of a scan, and has no density of the one that the agent's filter takes."""
     fallback = baselines_of(ID).fallback
     options = {"episodes": 16, "scenario": "clutter", "split": "validation", "tracks": True}
-    data = evaluate(ID, [fallback, "bptt", "gated:bptt"], **options)
+    data = evaluate(ID, [fallback, name, f"gated:{name}"], **options)
     other, agent, gated = data["estimate"].values
     # Before the first plot nothing is compared; what that answer moves the window by is less than an error of range.
     sigma = make_model(ID, None, "clutter").task.parameters.range_sigma
