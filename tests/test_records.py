@@ -224,6 +224,37 @@ def test_comparison_shows_what_the_records_say(recorded, result):
         comparison.overview_markdown([measured], "worst")
 
 
+def test_a_record_takes_competitors_measured_later(recorded, tmp_path, make_page):
+    """Over the same episodes they are as if they had been there; whoever does not come out again is refused."""
+    later = results_of(ENV, ["imm", "imm-tuned", "ppo", "known-turn", "zero"], None, 10, split="validation")
+    write_results(tmp_path / "later.json", [later], settings_of("filtergym evaluate"))
+    before, _ = read_benchmark("ManeuveringTarget", recorded)
+    [best] = {r.component for r in before.records if r.metric == "behind_best"}
+    assert best in {"imm", "imm-tuned", "ppo", "known-turn"}
+    code, _, errors = make_page("record", "later.json", "--into", "records", "--add", "zero")
+    assert code == 0, errors
+    after, record = read_benchmark("ManeuveringTarget", recorded)
+    assert (record.command, record.note) == ("filtergym benchmark", "A try.")
+    assert {r.policy for r in after.records} == {*NAMES, "zero"}
+    assert [r for r in after.records if r.policy != "zero"] == before.records
+    assert value(after.records, "zero", "cost").value == pytest.approx(
+        value(later.records, "zero", "cost").value, rel=5e-6, abs=0
+    )
+    other = results_of(ENV, ["imm", best, "known-turn", "zero"], None, 10, split="validation", seed=1)
+    write_results(tmp_path / "other.json", [other], settings_of("filtergym evaluate"))
+    code, _, errors = make_page("record", "other.json", "--into", "records", "--add", "zero")
+    assert (code, "the record has seed 0, what is added 1" in errors) == (2, True)
+    code, _, errors = make_page("record", "later.json", "--into", "records", "--add", "zero", "--add", "imm")
+    assert code == 0, errors
+    data = {**read_record("benchmark/ManeuveringTarget", recorded).data}
+    [scenario] = data["scenarios"]
+    cost = data["scenarios"][scenario]["competitors"]["imm"]["metrics"]["cost"]
+    cost[0] *= 1.001
+    write_record("benchmark/ManeuveringTarget", record._replace(data=data), recorded)
+    code, _, errors = make_page("record", "later.json", "--into", "records", "--add", "zero")
+    assert (code, "imm costs something else in the record" in errors) == (2, True)
+
+
 def test_results_table_of_everybody_and_of_some(recorded, result):
     found, record = read_benchmark("ManeuveringTarget", recorded)
     whole = results_markdown(found, record)

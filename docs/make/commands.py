@@ -159,6 +159,10 @@ def seeds(
     into: Annotated[
         Path | None, typer.Option(help="Folder of the records, where that of the environment is written.")
     ] = None,
+    add: Annotated[
+        bool,
+        typer.Option(help="Keep the other algorithms of the record that there is, of the same episodes."),
+    ] = False,
     note: Note = "",
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
     columns: Columns = 2,
@@ -200,8 +204,11 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         data = training_seeds.seeds_data(study, records)
+        name = f"{SEEDS}/{short_name(problem.id)}"
+        if add:
+            data = training_seeds.with_runs(read_record(name, into).data, data)
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)
-        write_record(f"{SEEDS}/{short_name(problem.id)}", made, into)
+        write_record(name, made, into)
     store.clear()
     for grid in grids:
         console.print(grid)

@@ -550,6 +550,35 @@ def seeds_data(study: Study, comparisons: Sequence[Comparison]) -> dict[str, Any
     }
 
 
+def with_runs(data: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's data with algorithms that were scored later, over the same episodes: added or replaced.
+
+    Raises:
+        ValueError: if environment, episodes or scenarios are others.
+    """
+    for key in ("environment", "split", "seed", "episodes"):
+        if data[key] != added[key]:
+            raise ValueError(f"the record has {key} {data[key]}, what is added {added[key]}")
+    if list(data["scenarios"]) != list(added["scenarios"]):
+        raise ValueError(f"the record is of {', '.join(data['scenarios'])}")
+    fresh = {algorithm for _, algorithm, *_ in added["runs"]}
+    kept = [run for run in data["runs"] if run[1] not in fresh]
+    gone = {run[0] for run in data["runs"]} - {run[0] for run in kept}
+    scenarios = {}
+    for name, rows in data["scenarios"].items():
+        new = added["scenarios"][name]
+        measured = {row[0] for row in new} | fresh | gone
+        scenarios[name] = [row for row in rows if row[0] not in measured] + new
+    curves = {name: curve for name, curve in data.get("curves", {}).items() if name not in gone}
+    return {
+        **data,
+        "units": {**data["units"], **added["units"]},
+        "runs": sorted([*kept, *added["runs"]], key=lambda run: (run[1], run[2])),
+        "curves": {**curves, **added["curves"]},
+        "scenarios": scenarios,
+    }
+
+
 def seeds_markdown(record: ResultRecord) -> str:
     """Return the tables of training seeds in Markdown, with the commands that made them and the runs."""
     data = record.data
