@@ -1,7 +1,7 @@
 """The front of cost and time of every environment, from the records of a benchmark: a picture, and a table."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.evaluation.competitors import RANKED
@@ -67,7 +67,7 @@ def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
             quick = [r for r in costs if r.policy in times and times[r.policy].nanoseconds <= budget]
             for kind, line in enumerate(best):
                 mine = [r for r in quick if (r.policy in learned) == bool(kind)]
-                line.append(min(mine, key=lambda r: r.value, default=None))
+                line.append(min(mine, key=lambda r: cast(float, r.value), default=None))
         for kind, title in enumerate(("classical", "learned")):
             cells = [_cell(own, rival) for own, rival in zip(best[kind], best[1 - kind], strict=True)]
             rows.append([short_name(problem.id) if not kind else "", title, *cells])
