@@ -1,325 +1,35 @@
-r"""A bank of extended Kalman filters over motion and faults of TightlyCoupledNavigation.
+"""The bank over motion and faults of TightlyCoupledNavigation as an estimator.
 
-Three hypotheses on the motion are kept, the paper's: rest, constant velocity, Singer manoeuvre. They follow each other
-as legs do: a manoeuvre begins with an acceleration that has nothing to do with the past, whatever was before it, also
-another manoeuvre; constant velocity follows a manoeuvre; nobody comes back to rest. So before each measurement a
-fourth hypothesis, "a manoeuvre has begun at this step", is made of the predictions of all three, with an acceleration
-of zero and the variance of the prior; after the measurement it is merged with the manoeuvre by moments.
-
-Each filter has, beside the 17 states of the paper, one error for every pseudorange (``filters/range_errors.py``). Under
-an open sky it is a Gauss-Markov process. Between houses, which the C/N0 tells, it holds for about a second and is then
-drawn anew, with a mean and a variance that depend on the C/N0. The update by a pseudorange tests each satellite for
-that: a pseudorange that has jumped is left to its own error and excluded from the position.
-
-The noise of every rate is at one of L levels, a Markov chain that all hypotheses share; the rate enters each filter as
-a Gaussian sum. Accelerometers that repeat themselves exactly are left out: noise never does.
-
-Reading: levels and renewals are weighed under each hypothesis on the motion, and the levels then averaged over them.
+The filters stand in ``envs/tightly_coupled_navigation/fault_hypotheses.py``, because an action may steer them, too.
 """
-
-import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import numpy
 
 from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.tightly_coupled_navigation.parameters import LINE, REST, SINGER
-from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
+from ...envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter, Hypotheses
 from ...envs.tightly_coupled_navigation.world import Measurement
 from ...evaluation.competitors import Likelihood
-from ...filters import extended_kalman, gnss_ins, imm, range_errors
-from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ...filters.packed_covariance import pack, unpack
-
-LEAST_PROBABILITY = 1e-30
-"""Of constant velocity: what is merged has weights that are never zero by zero."""
-CN0_LIMITS = (30.0, 38.0, 44.0)
-"""dB-Hz, between which the errors between houses are alike."""
 
 
-class FaultPrior(NamedTuple):
-    """What a bank expects before it has seen anything."""
-
-    quiet: float = 1.0
-    """Time from the start in which no leg ends, s."""
-    leg: float = 2.0
-    """Mean duration of a leg, s."""
-    acceleration: float = 13.0
-    """Standard deviation of the acceleration with which a manoeuvre begins, m/s^2 per axis."""
-    acceleration_between_houses: float = 1.3
-    start: tuple[float, float, float] = (0.425, 0.425, 0.15)
-    """Probabilities of rest, constant velocity and manoeuvre at the start."""
-    levels: tuple[float, ...] = (1.0, 2.5, 4.5, 8.0)
-    """Standard deviations of a rate over the nominal one, ascending, the first one 1."""
-    noisy_rate: float = 0.012
-    """Of one satellite, faults of the rate expected in a second."""
-    noisy_time: float = 2.0
-    """Mean duration of such a fault, s."""
-    coloured: float = 1.15
-    """Standard deviation of the error of a pseudorange under an open sky, m."""
-    correlation_time: float = 4.5
-    """Of it, s."""
-    jump: float = 0.0
-    """Of one satellite under an open sky, jumps of the pseudorange expected in a second."""
-    jump_sigma: float = 30.0
-    """Standard deviation of the error after such a jump, m."""
-    hold: float = 1.25
-    """Mean time for which an error between houses holds, s."""
-    error_mean: tuple[float, ...] = (62.8, 31.9, 14.1, 4.6)
-    """Mean of errors between houses, m, below each of ``CN0_LIMITS`` and above the last one: those of the lognormal
-    and the half normal distributions of the environment."""
-    error_sigma: tuple[float, ...] = (48.0, 25.0, 24.5, 6.7)
-    """Standard deviation of the same, m."""
-
-
-TRAINING = FaultPrior()
-VAGUE = FaultPrior(
-    quiet=0.0,
-    leg=3.0,
-    acceleration=20.0,
-    acceleration_between_houses=20.0,
-    start=(1 / 3, 1 / 3, 1 / 3),
-    levels=(1.0, 3.0, 10.0, 30.0),
-    noisy_rate=0.05,
-    coloured=2.0,
-    correlation_time=10.0,
-    jump=0.02,
-    error_mean=(40.0, 40.0, 20.0, 10.0),
-    error_sigma=(60.0, 60.0, 40.0, 20.0),
-)
-
-
-class Hypotheses(NamedTuple):
-    """Memory of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
-
-    means: Array
-    """``(n, M, N)``."""
-    covariances: Array
-    """Packed, ``(n (n + 1) / 2, M, N)``."""
-    probabilities: Array
-    """``(M, N)``."""
-    levels: Array
-    """Probabilities of the noise levels of every rate, ``(L, S, N)``."""
-    accelerometers: Array
-    """Last readings, ``(3, N)``, m/s^2; infinite before the first."""
-
-
-class FaultHypotheses:
-    """Bank.
+class FaultHypotheses(FaultFilter):
+    """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
 
     Args:
         task: the problem.
         prior: what it expects.
+        **changed: fields of the prior.
     """
 
     kind = "estimator"
     traceable = True
 
-    def __init__(self, task: TightlyCoupledNavigation, prior: FaultPrior = TRAINING, **changed: Any) -> None:
-        self.task, self.xp = task, task.xp
-        self.prior = prior = prior._replace(**changed)
-        T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
-        self.size = n
-        noise, known = numpy.zeros((n, n, 3, 1)), gnss_ins.SIZE
-        for i, model in enumerate(task.models):
-            noise[:known, :known, i, 0] = gnss_ins.process_noise(model, task.common)
-        self.noise = task.constant(noise)
-        self.open_sky = math.exp(-T / prior.correlation_time)
-        self.gained = prior.coloured**2 * (1.0 - self.open_sky**2)
-        self.ending = 1.0 - math.exp(-T / prior.leg)
-        self.lost = 1.0 - math.exp(-T / prior.hold)
-        self.jump = 1.0 - math.exp(-T * prior.jump)
-        squares = numpy.array(prior.levels) ** 2
-        self.level_variance = [
-            task.constant(squares * task.sensor_variance[S + j])[:, None, None] for j in range(S)
-        ]
-        L = len(squares)
-        onset = 1.0 - math.exp(-T * prior.noisy_rate)
-        over = 1.0 - math.exp(-T / prior.noisy_time)
-        chain = numpy.diag([1.0 - onset] + [1.0 - over] * (L - 1))
-        chain[0, 1:], chain[1:, 0] = onset / (L - 1), over
-        self.level_chain = chain
-        self.first_levels = task.constant(numpy.array([1.0 - 1e-3] + [1e-3 / (L - 1)] * (L - 1)))[:, None]
-
     def start(self, initial: Initial, N: int) -> Hypotheses:
         """Start every filter from what is known of the start."""
-        xp, S, task = self.xp, self.task.satellites, self.task
-        none = 0.0 * initial.mean[0]
-        mean, covariance = range_errors.start(
-            initial.mean, initial.covariance, S, none + self.prior.coloured**2
-        )
-        levels = self.first_levels[:, None] + xp.stack([none] * S)
-        return Hypotheses(
-            xp.stack([mean] * 3, axis=1),
-            xp.stack([pack(covariance)] * 3, axis=1),
-            task.constant(self.prior.start)[:, None] + none,
-            levels,
-            xp.stack([none + math.inf] * 3),
-        )
-
-    def _predict(
-        self, memory: Hypotheses, measurement: Measurement, between: Array
-    ) -> tuple[Array, Array, Array]:
-        """Predict under the four hypotheses: mean, covariance, probabilities."""
-        xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
-        number = xp.astype(measurement.number, memory.means.dtype)
-        ending = xp.where(number * common.T < prior.quiet, 0.0, self.ending)
-        rest, line, singer = (memory.probabilities[i] for i in range(3))
-        to_line, begins = 0.5 * ending * singer, ending * (rest + line) + 0.5 * ending * singer
-        P = unpack(memory.covariances, self.size)
-        x = memory.means
-        lines, entering = (1.0 - ending) * line, to_line
-        total = xp.clip(lines + entering, LEAST_PROBABILITY, None)
-        entering = entering / total
-        weights = xp.stack([1.0 - entering, entering])
-        mean, covariance = imm.combine(x[:, LINE:], P[:, :, LINE:], weights)
-        x = xp.stack([x[:, REST], mean, x[:, SINGER]], axis=1)
-        P = xp.stack([P[:, :, REST], covariance, P[:, :, SINGER]], axis=2)
-        kept = xp.where(between, 1.0, self.open_sky)
-        gained = xp.where(between, 0.0, self.gained)
-        mean, covariance = range_errors.predict(
-            x, P, task.axis, common.T, common.decay, self.noise, kept, gained
-        )
-        # A manoeuvre that begins: the step is one of the motion before it, the acceleration is new.
-        weights = xp.stack([ending * rest, ending * line, 0.5 * ending * singer])
-        total_new = ordered_sum(weights)
-        here = total_new > 0.0
-        weights = xp.where(here, weights / xp.where(here, total_new, 1.0), 1.0 / 3.0)
-        new, new_covariance = imm.combine(mean, covariance, weights)
-        strength = xp.where(between, prior.acceleration_between_houses, prior.acceleration)
-        a = gnss_ins.ACCELERATION
-        zero = 0.0 * new[a]
-        new = xp.concat([new[: a.start], zero, new[a.stop :]])
-        none = 0.0 * new_covariance[a]
-        C = xp.concat([new_covariance[: a.start], none, new_covariance[a.stop :]])
-        none = 0.0 * C[:, a]
-        C = xp.concat([C[:, : a.start], none, C[:, a.stop :]], axis=1)
-        own = numpy.zeros((self.size, self.size))
-        own[a, a] = numpy.eye(3)
-        C = C + task.constant(own)[:, :, None] * (strength * strength)
-        probabilities = xp.stack([(1.0 - ending) * rest, total, (1.0 - ending) * singer, begins])
-        mean = xp.concat([mean, new[:, None]], axis=1)
-        return mean, xp.concat([covariance, C[:, :, None]], axis=2), probabilities
-
-    def _renewals(self, measurement: Measurement, between: Array) -> list[range_errors.Renewal]:
-        """How each range error may have been drawn anew."""
-        xp, prior = self.xp, self.prior
-        first = measurement.number <= 1
-        renewals = []
-        for j in range(self.task.satellites):
-            cn0 = measurement.cn0[j]
-            mean, sigma = prior.error_mean[-1], prior.error_sigma[-1]
-            for limit, m, s in zip(
-                reversed(CN0_LIMITS), prior.error_mean[-2::-1], prior.error_sigma[-2::-1], strict=True
-            ):
-                mean, sigma = xp.where(cn0 < limit, m, mean), xp.where(cn0 < limit, s, sigma)
-            renewals.append(
-                range_errors.Renewal(
-                    xp.where(between, xp.where(first, 1.0, self.lost), self.jump),
-                    xp.where(between, mean, 0.0),
-                    xp.where(between, sigma * sigma, prior.jump_sigma**2),
-                )
-            )
-        return renewals
+        return self.start_bank(initial)
 
     def update(
         self, measurement: Measurement, memory: Hypotheses
     ) -> tuple[Array, Array, Hypotheses, Likelihood]:
         """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
-        xp, task, S = self.xp, self.task, self.task.satellites
-        forces, angles = (sensor.readings for sensor in task.sensors[2:])
-        available = measurement.available
-        readings = xp.where(available > 0.0, measurement.readings, 0.0)
-        fresh = xp.any(readings[forces] != memory.accelerometers, axis=0)
-        usable = available[forces] * xp.astype(fresh, available.dtype)
-        between = xp.any(measurement.cn0 != task.parameters.clear_cn0, axis=0)
-        mean, covariance, probabilities = self._predict(memory, measurement, between)
-        expected, rows = range_errors.observe(
-            mean,
-            measurement.satellite_position[:, :, None],
-            measurement.satellite_velocity[:, :, None],
-            measurement.ins_angles[:, None],
-            task.parameters.gravity,
-        )
-        residual = readings[:, None] - expected
-        state = range_errors.begin(mean, covariance)
-        for j, renewal in enumerate(self._renewals(measurement, between)):
-            place = gnss_ins.SIZE + j
-            state = range_errors.take_pseudorange(
-                state,
-                mean[place],
-                place,
-                residual[j],
-                rows[j],
-                task.sensor_variance[j],
-                renewal,
-                available[j],
-            )
-        shares, predicted_levels = [], []
-        for j in range(S):
-            i = S + j
-            levels = self._move_levels(memory.levels[:, j])
-            state, share = range_errors.take_reading(
-                state, residual[i], rows[i], self.level_variance[j], levels[:, None], available[i]
-            )
-            shares.append(share)
-            predicted_levels.append(levels)
-        others = slice(forces.start, angles.stop)
-        left = [
-            residual[i] - ordered_sum([state.shift[c] * v for c, v in zip(*rows[i], strict=True)])
-            for i in range(others.start, others.stop)
-        ]
-        rest_available = xp.concat([usable, available[angles]])
-        update = extended_kalman.update_one_by_one(
-            mean + state.shift,
-            state.covariance,
-            xp.stack(left),
-            rows[others],
-            task.sensor_variance[others],
-            rest_available,
-        )
-        log_likelihood = state.log_likelihood + update.log_likelihood
-        log_prior = imm.log_probabilities(probabilities)
-        weights = imm.mode_posterior(log_prior, log_likelihood)
-        nis = weighted_sum(weights, state.squared_distance + ordered_sum(update.squared_residuals))
-        learned = [
-            xp.where(available[S + j] > 0.0, weighted_sum(weights, shares[j]), predicted_levels[j])
-            for j in range(S)
-        ]
-        means, covariances, weights = self._merge(update.mean, update.covariance, weights)
-        known = gnss_ins.SIZE
-        centre, spread = imm.combine(means[:known], covariances[:known, :known], weights)
-        after = Hypotheses(means, pack(covariances), weights, xp.stack(learned, axis=1), readings[forces])
-        degrees = ordered_sum(available[: forces.start]) + ordered_sum(rest_available)
-        likelihood = Likelihood(imm.log_mixture_density(log_prior, log_likelihood), nis, degrees)
-        return centre, spread, after, likelihood
-
-    def _move_levels(self, levels: Array) -> Array:
-        """Probabilities of the levels after a step, ``(L, N)``."""
-        L = levels.shape[0]
-        return self.xp.stack(
-            [
-                ordered_sum(
-                    [float(self.level_chain[i, j]) * levels[i] for i in range(L) if self.level_chain[i, j]]
-                )
-                for j in range(L)
-            ]
-        )
-
-    def _merge(self, means: Array, covariances: Array, weights: Array) -> tuple[Array, Array, Array]:
-        """Merge a manoeuvre that has begun with the one that was there."""
-        xp = self.xp
-        pair: Sequence[Array] = (weights[SINGER], weights[3])
-        total = pair[0] + pair[1]
-        there = total > 0.0
-        share = xp.where(there, pair[0] / xp.where(there, total, 1.0), 0.5)
-        mean, covariance = imm.combine(
-            means[:, SINGER:], covariances[:, :, SINGER:], xp.stack([share, 1.0 - share])
-        )
-        return (
-            xp.concat([means[:, :SINGER], mean[:, None]], axis=1),
-            xp.concat([covariances[:, :, :SINGER], covariance[:, :, None]], axis=2),
-            xp.stack([weights[REST], weights[LINE], total]),
-        )
+        found = self.update_bank(measurement, memory)
+        likelihood = Likelihood(found.log_likelihood, found.nis, found.degrees)
+        return found.mean, found.covariance, found.memory, likelihood

@@ -34,8 +34,12 @@ MOTION_ROW = -1.0
 """Where the true hypothesis is drawn below the faults."""
 LEAST_REACH = 30.0
 """Half width of the course that is shown at least, m."""
-NOISE_CONTROLS = ("gain", "robust")
-"""Controls whose actions are drawn."""
+ACTIONS = {
+    "gain": ("action",),
+    "robust": ("action", "readings"),
+    "hypotheses": ("action: probabilities", "action: noises"),
+}
+"""Controls whose actions are drawn, and the titles of their strips, of four components the first one."""
 
 
 class TightlyCoupledNavigationPicture(Picture):
@@ -79,7 +83,7 @@ class TightlyCoupledNavigationPicture(Picture):
             "rate_innovation": float(numpy.abs(innovation[S:]).max()),
         }
         values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
-        if self.model.control in NOISE_CONTROLS:
+        if self.model.control in ACTIONS:
             values |= {f"gain.{i}": action[lane] for i, action in enumerate(bank.last_action)}
         return {name: float(value) for name, value in values.items()}
 
@@ -113,14 +117,14 @@ class TightlyCoupledNavigationPicture(Picture):
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
-        if self.model.control in NOISE_CONTROLS:
+        if self.model.control in ACTIONS:
             steering: Any = self.model.filter
             names = [name.removeprefix("accelerometers_").replace("_", " ") for name in steering.actions]
             groups = len(self.task.sensors)
-            for title, part in (("action", range(groups)), ("readings", range(groups, len(names)))):
-                if part:
-                    own = {names[i]: f"gain.{i}" for i in part}
-                    steered.append(Strip(title, own, (-1.05, 1.05), guides=(0.0,), steps=True))
+            parts = range(groups), range(groups, len(names))
+            for title, part in zip(ACTIONS[self.model.control], parts, strict=False):
+                own = {names[i]: f"gain.{i}" for i in part}
+                steered.append(Strip(title, own, (-1.05, 1.05), guides=(0.0,), steps=True))
         return [
             *steered,
             Strip(

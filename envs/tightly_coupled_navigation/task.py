@@ -27,6 +27,7 @@ from ..task import Component, PaperPolicy, Task
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
+from .hypotheses import FaultHypothesesBank
 from .kalman_net import KalmanNetBank
 from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
@@ -114,6 +115,10 @@ class TightlyCoupledNavigation(Task):
         "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
         "positive action, 3 to that of a negative one; under the paper's probabilities, for "
         "faults that no weight can cure; **0 is the paper's algorithm**",
+        "hypotheses": "factors r^a in the bank over motion and faults at every measurement: probability that a manoeuvre has "
+        "begun (r = 4), that one goes on (1.05), odds that the error of a pseudorange is another one (4), probability of a "
+        "rate's highest noise level (1.5); process noise of the motion (2), variance of pseudoranges (2), of rates (2), of "
+        "accelerometers (4); **0 is the estimator `fault-hypotheses`**",
         "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
         "paper's algorithm**",
         "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
@@ -123,6 +128,7 @@ class TightlyCoupledNavigation(Task):
     banks = {
         "robust": RobustBank,
         "gain": NoiseBank,
+        "hypotheses": FaultHypothesesBank,
         "evidence": HypothesisBank,
         "mode": HypothesisBank,
         "weights": HypothesisBank,
