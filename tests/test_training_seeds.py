@@ -242,3 +242,28 @@ def test_what_cannot_be_compared(folders, tmp_path, make_page, monkeypatch):
     shutil.rmtree(folders[0] / "best")
     with pytest.raises(ValueError, match="has no best agent yet"):
         load_runs(folders[:1])
+
+
+def test_a_record_takes_further_algorithms(folders, tmp_path, make_page, monkeypatch):
+    """Of the same episodes; those it has already are replaced, with their curves."""
+    monkeypatch.chdir(tmp_path)
+    renamed = tmp_path / "other"
+    shutil.copytree(folders[0], renamed)
+    text = json.loads((renamed / "run.json").read_text())
+    text["algorithm"] = "bptt-small"
+    (renamed / "run.json").write_text(json.dumps(text))
+    arguments = ("--split", "validation", "--into", "records", "--policy", "imm", "--scenario", "random")
+    assert make_page("seeds", *folders, *arguments, "--episodes", 20)[0] == 0
+    before = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
+    code, _, errors = make_page("seeds", renamed, *arguments, "--episodes", 20, "--add")
+    assert code == 0, errors
+    after = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
+    assert [run[0] for run in after["runs"]] == ["bptt seed 0", "bptt seed 1", "bptt-small seed 0"]
+    assert {*after["curves"]} == {run[0] for run in after["runs"]}
+    kept = [row for row in after["scenarios"]["random"] if not row[0].startswith(("bptt-small", "imm"))]
+    assert kept == [row for row in before["scenarios"]["random"] if row[0] != "imm"]
+    assert make_page("seeds", folders[1], *arguments, "--episodes", 20, "--add")[0] == 0
+    replaced = read_record("seeds/ManeuveringTarget", tmp_path / "records").data
+    assert [run[0] for run in replaced["runs"]] == ["bptt seed 1", "bptt-small seed 0"]
+    code, _, errors = make_page("seeds", renamed, *arguments, "--episodes", 21, "--add")
+    assert (code, "the record has episodes 20, what is added 21" in errors) == (2, True)

@@ -90,7 +90,7 @@ $(foreach environment,$(ENVIRONMENTS),$(eval $(call shipping,$(environment))))
 
 $(DONE)/seeds-%: $(DONE)/ship-%
 	$(BIN)/python docs/make seeds runs/$*/*-? --scenario random --episodes $(call episodes,$*) --jobs $(JOBS) \
-	  --out results/seeds/$*.json --into docs/records --curves docs/images/training_$*.png --trust
+	  --out results/seeds/$*.json --into docs/records --trust
 	$(finish)
 
 # The second command alone makes the records of all environments anew from a finished benchmark, wherever it lies.

@@ -191,24 +191,25 @@ class SeedProfiles(_Rendered):
 
 
 class TrainingCurves(_Rendered):
-    """``{training-curves} ENVIRONMENT``: validation cost over training, of the record; of one without curves the
-    picture that was kept.
-    """
+    """``{training-curves} ENVIRONMENT``: validation cost over training, of those runs whose curves the record has."""
 
     @property
     def data(self) -> dict[str, Any]:
-        """Of the record."""
+        """Of the record, without the runs that have no curve."""
         environment_id(self.name_given)
-        return self.record(f"{SEEDS}/{self.name_given}").data
+        data = self.record(f"{SEEDS}/{self.name_given}").data
+        return {**data, "runs": [run for run in data["runs"] if run[0] in data.get("curves", {})]}
 
     def markdown(self) -> str:
-        """Return the picture that was kept."""
-        kept = f"![Validation cost over training, every seed](/images/training_{self.name_given}.png)"
-        return "" if self.data.get("curves") else kept
+        """Say whose curves are not there."""
+        shown = {run[1] for run in self.data["runs"]}
+        every = dict.fromkeys(run[1] for run in self.record(f"{SEEDS}/{self.name_given}").data["runs"])
+        missing = ", ".join(f"`{name}`" for name in every if name not in shown)
+        return f"Curves of {missing} were not kept." if missing else ""
 
     def figure(self) -> tuple[str, str, Any] | None:
         """Return the curves of the record."""
-        if not self.data.get("curves"):
+        if not self.data["runs"]:
             return None
         words = f"Validation cost over training, median and range over training seeds, {self.name_given}"
         return f"training_{self.name_given}", words, learning_curves(self.data)
