@@ -57,7 +57,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/pairs $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -129,6 +129,11 @@ $(DONE)/exported: $(shipped)
 	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
 	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
+	$(finish)
+
+$(DONE)/pairs: $(shipped)
+	$(BIN)/python benchmarks/front_pairs.py > build/pairs.txt
+	$(table) build/pairs.txt --name front_pairs --command "python benchmarks/front_pairs.py"
 	$(finish)
 
 $(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation
