@@ -220,7 +220,8 @@ class FaultFilter:
         """Predict under the four hypotheses: mean, covariance, probabilities."""
         xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
         number = xp.astype(measurement.number, memory.means.dtype)
-        ending = xp.where(number * common.T < prior.quiet, 0.0, self.ending)
+        # Half a step further, or rounding would choose the measurement at which the time is over.
+        ending = xp.where((number + 0.5) * common.T < prior.quiet, 0.0, self.ending)
         rest, line, singer = (memory.probabilities[i] for i in range(3))
         to_line, begins = 0.5 * ending * singer, ending * (rest + line) + 0.5 * ending * singer
         P = unpack(memory.covariances, self.size)
