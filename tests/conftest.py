@@ -65,13 +65,22 @@ def pytest_generate_tests(metafunc):
     paired = metafunc.definition.get_closest_marker("with_controls")
     if paired:
         names, cases = paired.args
-        metafunc.parametrize(("env_id", "control", *names), paired_controls(cases))
+        metafunc.parametrize(("env_id", "control", *names), mark_slow(paired_controls(cases)))
         return
     if "control" in metafunc.fixturenames:
         cases = [(id, control) for id, cls in catalogue().items() for control in cls.controls]
-        metafunc.parametrize(("env_id", "control"), cases)
+        metafunc.parametrize(("env_id", "control"), mark_slow(cases))
     else:
         metafunc.parametrize("env_id", list(catalogue()))
+
+
+SLOW_CONTROLS = {("filtergym/TightlyCoupledNavigation-v0", "hypotheses")}
+"""Controls whose programs take ten seconds to compile."""
+
+
+def mark_slow(rows):
+    """Mark the rows ``(env_id, control, ...)`` of slow controls."""
+    return [pytest.param(*row, marks=pytest.mark.slow) if row[:2] in SLOW_CONTROLS else row for row in rows]
 
 
 def paired_controls(cases):

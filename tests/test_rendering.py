@@ -65,7 +65,12 @@ def test_frames_are_images_that_change(control, general, monkeypatch):
 @pytest.mark.parametrize("name", ["LooselyCoupledNavigation", "TightlyCoupledNavigation", "UavAutopilot"])
 def test_what_a_bank_of_hypotheses_believes_is_drawn(name):
     env = TaskEnv(
-        f"filtergym/{name}-v0", control="hypotheses", render_mode="rgb_array", horizon=1, backend="numpy"
+        f"filtergym/{name}-v0",
+        control="hypotheses",
+        render_mode="rgb_array",
+        horizon=1,
+        decision_interval=1,
+        backend="numpy",
     )
     env.reset(seed=3)
     before = env.render()

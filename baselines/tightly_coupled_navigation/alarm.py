@@ -3,7 +3,6 @@
 import numpy
 
 from ...envs.model import Model
-from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ..alarm import LARGER, Alarm, certain, scale_ratio
 
 
@@ -28,6 +27,6 @@ class SensorAlarm(Alarm):
         # Shown is the mean over the readings and measurements of a decision.
         measurements = self.measurements(before)
         degrees = measurements * numpy.stack(here, axis=1)
-        mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
+        mean = self.nis(observation).reshape(count, len(here), -1).min(axis=2)
         stuck = self.repeat(observation)[:, 0] > 0.0
         return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)

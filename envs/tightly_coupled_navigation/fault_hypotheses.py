@@ -181,11 +181,15 @@ class FaultFilter:
         for i, model in enumerate(task.models):
             noise[:known, :known, i, 0] = gnss_ins.process_noise(model, task.common)
         self.noise = task.constant(noise)
-        self.open_sky = math.exp(-T / prior.correlation_time)
-        self.gained = prior.coloured**2 * (1.0 - self.open_sky**2)
-        self.ending = 1.0 - math.exp(-T / prior.leg)
-        self.lost = 1.0 - math.exp(-T / prior.hold)
-        self.jump = 1.0 - math.exp(-T * prior.jump)
+        open_sky = math.exp(-T / prior.correlation_time)
+        # Arrays: of two plain numbers torch would choose in single precision.
+        self.open_sky = task.constant(open_sky)
+        self.gained = task.constant(prior.coloured**2 * (1.0 - open_sky**2))
+        self.ending = task.constant(1.0 - math.exp(-T / prior.leg))
+        self.lost = task.constant(1.0 - math.exp(-T / prior.hold))
+        self.jump = task.constant(1.0 - math.exp(-T * prior.jump))
+        self.acceleration = task.constant(prior.acceleration)
+        self.last_error = task.constant(prior.error_mean[-1]), task.constant(prior.error_sigma[-1])
         squares = numpy.array(prior.levels) ** 2
         self.level_variance = [
             task.constant(squares * task.sensor_variance[S + j])[:, None, None] for j in range(S)
@@ -220,7 +224,8 @@ class FaultFilter:
         """Predict under the four hypotheses: mean, covariance, probabilities."""
         xp, task, prior, common = self.xp, self.task, self.prior, self.task.common
         number = xp.astype(measurement.number, memory.means.dtype)
-        ending = xp.where(number * common.T < prior.quiet, 0.0, self.ending)
+        # Half a step further, or rounding would choose the measurement at which the time is over.
+        ending = xp.where((number + 0.5) * common.T < prior.quiet, 0.0, self.ending)
         rest, line, singer = (memory.probabilities[i] for i in range(3))
         to_line, begins = 0.5 * ending * singer, ending * (rest + line) + 0.5 * ending * singer
         P = unpack(memory.covariances, self.size)
@@ -243,7 +248,7 @@ class FaultFilter:
         here = total_new > 0.0
         weights = xp.where(here, weights / xp.where(here, total_new, 1.0), 1.0 / 3.0)
         new, new_covariance = imm.combine(mean, covariance, weights)
-        strength = xp.where(between, prior.acceleration_between_houses, prior.acceleration)
+        strength = xp.where(between, prior.acceleration_between_houses, self.acceleration)
         a = gnss_ins.ACCELERATION
         zero = 0.0 * new[a]
         new = xp.concat([new[: a.start], zero, new[a.stop :]])
@@ -266,7 +271,7 @@ class FaultFilter:
         renewals = []
         for j in range(self.task.satellites):
             cn0 = measurement.cn0[j]
-            mean, sigma = prior.error_mean[-1], prior.error_sigma[-1]
+            mean, sigma = self.last_error
             for limit, m, s in zip(
                 reversed(CN0_LIMITS), prior.error_mean[-2::-1], prior.error_sigma[-2::-1], strict=True
             ):
