@@ -138,12 +138,13 @@ def test_fields_are_found_by_their_names(file):
 
 
 def test_there_are_shipped_agents():
-    """Policies of every environment, estimators where there is a filter for them."""
+    """Policies of every environment, estimators where there is a filter for them that does no ruin."""
     names = ("bptt", "bptt-linear", "bptt-small", "ppo")
     policies = [f"{id.partition('/')[2]}/{name}" for id in catalogue() for name in names]
     estimators = [
         f"{id.partition('/')[2]}/{name}" for id, cls in catalogue().items() for name in cls.trained_banks
     ]
+    estimators.remove("TightlyCoupledNavigation-v0/kalman-net")
     assert sorted(f"{file.parent.name}/{file.stem}" for file in SHIPPED) == sorted(policies + estimators)
 
 
