@@ -37,7 +37,7 @@ LEAST_REACH = 30.0
 ACTIONS = {
     "gain": ("action",),
     "robust": ("action", "readings"),
-    "hypotheses": ("action: probabilities", "action: noises"),
+    "hypotheses": ("action: odds", "noises"),
 }
 """Controls whose actions are drawn, and the titles of their strips, of four components the first one."""
 
