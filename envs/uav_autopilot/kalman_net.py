@@ -16,13 +16,14 @@ alone, because they are known here.
 """
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy
 
 from ...filters import packed_covariance
-from ..observation import ACTION, Array, Block
+from ..observation import ACTION, SIGNED_LOG, Array, Block
 from .banks import NoiseBank
 from .world import Measurement, Start
 
@@ -71,6 +72,18 @@ class KalmanNetBank(NoiseBank):
             *(f"caution_{s}" for s in sensors),
         )
         self.no_action = (0.0,) * len(self.answers)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """As of the bank; an estimator is not told of the last valid reading in a dropout, so that it is not shown."""
+        reading = Block(
+            "reading",
+            lambda _, measurement: measurement.available * measurement.reading / self.sensor_sigmas,
+            "the reading over its sigma; 0 in a dropout",
+            self.task.sensors,
+            SIGNED_LOG,
+        )
+        return [reading if block.name == reading.name else block for block in super().blocks]
 
     @property
     def action_space(self) -> gymnasium.Space:
