@@ -26,7 +26,9 @@ def steered():
         "stick_duration": (0.1, 0.3), "rates_outage_probability": 0.5, "rates_outage_duration": (0.1, 0.3),
     }  # fmt: skip
     model = make_model(ID, "hypotheses", "random", **faults)
-    bank, estimator, scans, answers = model.filter, FaultHypotheses(model.task), [], []
+    bank, scans, answers = model.filter, [], []
+    # A leg may end from the start, or no manoeuvre would begin so early.
+    bank.bank, estimator = (make(model.task, quiet=0.0) for make in (FaultFilter, FaultHypotheses))
 
     class Watched:
         kind = "estimator"
@@ -46,6 +48,7 @@ def steered():
 
     for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
         pass
+    assert max(state.expected[3].max() for state, _ in scans) > 0.1
     assert 0.0 < np.mean([state.between for state, _ in scans]) < 1.0
     assert 0.0 < np.mean([state.repeated for state, _ in scans]) < 1.0
     assert 0.0 < np.mean([measurement.available for _, measurement in scans]) < 1.0
@@ -95,7 +98,7 @@ def test_hypotheses_scales_renewals_levels_and_noises(steered):
             q = (level**heights)[:, None] * super()._move_levels(levels)
             return q / q.sum(axis=0)
 
-    other = Other(task)
+    other = Other(task, bank.bank.prior)
     other.noise = motion * other.noise
     odds = renewal * other.lost / (1.0 - other.lost)
     other.lost = odds / (1.0 + odds)

@@ -144,14 +144,6 @@ def random_policy(env, dtype, network="recurrent"):
         ),
         pytest.param(
             "TightlyCoupledNavigation",
-            "hypotheses",
-            {"max_episode_steps": 4, "decision_interval": 1},
-            None,
-            "recurrent",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "TightlyCoupledNavigation",
             "evidence",
             {"max_episode_steps": 2},
             None,
