@@ -477,5 +477,5 @@ def test_budgets_of_time_name_who_costs_least_in_each(monkeypatch):
     lines = front.budgets_markdown([BenchmarkRecords(problem, records)]).splitlines()
     classical, learned = ([cell.strip() for cell in line.split("|")[3:-1]] for line in lines[2:])
     assert (classical[0], learned[0]) == ("`imm` -10.0", "**`quick agent` -20.0**")
-    assert (classical[2], learned[2]) == (classical[0], learned[0])
-    assert (classical[3], learned[3]) == ("`slow` -30.0", "`agent` -31.0")
+    assert (classical[1], learned[1]) == (classical[0], learned[0])
+    assert (classical[2], learned[2]) == ("`slow` -30.0", "`agent` -31.0")

@@ -12,7 +12,7 @@ from filtergym.evaluation.times import points_of_records, times_of_records
 from filtergym.papers.grid import markdown_table
 from records import BenchmarkRecords, short_name
 
-BUDGETS = (100, 200, 500, 1000, 2000, 5000)
+BUDGETS = (100, 300, 1000, 5000)
 """Nanoseconds that a measurement may take."""
 
 

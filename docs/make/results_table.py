@@ -140,9 +140,15 @@ def chosen_markdown(
         ]
         first = [name] if len(found) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]
-        notes.append(f"{_where(records)} {record.origin}")
+        notes.append(
+            f"{_where(records)} {record.origin}" if len(found) == 1 else f"{name} {records[0].episodes}"
+        )
     table = markdown_table([*(["environment"] if len(found) > 1 else []), *header], rows)
-    return "\n".join([*table, "", *dict.fromkeys(notes)])
+    if len(found) > 1:
+        notes = [
+            f"Episodes: {', '.join(notes)}; with 95 % bootstrap intervals, from the records of the benchmark."
+        ]
+    return "\n".join([*table, "", *notes])
 
 
 def _where(records: Sequence[Record]) -> str:
