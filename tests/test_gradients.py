@@ -131,7 +131,14 @@ def random_policy(env, dtype, network="recurrent"):
         ("UavAutopilot", "gain", {}, None, "recurrent"),
         ("UavAutopilot", "kalman-net", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
-        pytest.param("LooselyCoupledNavigation", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
+        pytest.param(
+            "LooselyCoupledNavigation",
+            "hypotheses",
+            {"decision_interval": 1},
+            None,
+            "recurrent",
+            marks=pytest.mark.slow,
+        ),
         ("RadarEsmTracking", "kalman-net", {}, None, "recurrent"),
         # Their gradients take longest to compile; a decision under `evidence` is ten measurements.
         pytest.param(

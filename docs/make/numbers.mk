@@ -58,7 +58,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/pairs $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -130,6 +130,11 @@ $(DONE)/exported: $(shipped)
 	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
 	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
+	$(finish)
+
+$(DONE)/budgets: $(ENVIRONMENTS:%=$(DONE)/tune-%)
+	$(BIN)/python benchmarks/training_budgets.py --runs runs/budgets > build/budgets.txt
+	$(table) build/budgets.txt --name training_budgets --command "python benchmarks/training_budgets.py"
 	$(finish)
 
 $(DONE)/pairs: $(shipped)

@@ -1,0 +1,61 @@
+"""What a budget of training buys: ``bptt`` after 100,000, a million and ten million decisions, in Markdown.
+
+    python benchmarks/training_budgets.py --runs runs/budgets
+
+Each run is one of its own with the settings of ``filtergym train``, whose learning rate falls over its own length; runs
+that the folder holds are not repeated. TightlyCoupledNavigation is left out: there a decision takes ten measurements of
+three filters, and the shipped runs have 100,000 of them. The best agent of each run meets the episodes of the test
+split.
+"""
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.papers.grid import markdown_table
+
+import filtergym
+
+ENVIRONMENTS = ("ManeuveringTarget", "UavAutopilot", "RadarEsmTracking", "LooselyCoupledNavigation")
+BUDGETS = (100_000, 1_000_000, 10_000_000)
+
+
+def train(id: str, algo: str, steps: int, seed: int, run: Path) -> None:
+    """Train once, unless it is done."""
+    if not (run / "best").exists():
+        words = ["train", id, "--algo", algo, "--steps", str(steps), "--seed", str(seed), "--no-compare"]
+        command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def main() -> None:
+    """Train, evaluate, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, default=Path("runs/budgets"), help="folder of the runs")
+    parser.add_argument("--algo", default="bptt")
+    parser.add_argument("--environment", action="append", help="short name; repeatable; default: four")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--episodes", type=int, default=1000)
+    asked = parser.parse_args()
+    rows = []
+    for name in asked.environment or ENVIRONMENTS:
+        id, cells = f"filtergym/{name}-v0", []
+        paper = baselines_of(id).score_paper
+        for steps in BUDGETS:
+            runs = [asked.runs / f"{name}-{asked.algo}-{steps}-{seed}" for seed in range(asked.seeds)]
+            for seed, run in enumerate(runs):
+                train(id, asked.algo, steps, seed, run)
+            results = filtergym.evaluate(id, [paper, *map(str, runs)], episodes=asked.episodes, seed=0)
+            cost = results["cost"].mean(["episode", "time"]).values
+            change = 100.0 * (cost[1:] / cost[0] - 1.0)
+            cells.append(f"{numpy.mean(change):+.1f} ({change.min():+.1f} to {change.max():+.1f})")
+        rows.append([name, *cells])
+    header = [f"{asked.algo}, {asked.seeds} seeds", *(f"{steps:,} decisions" for steps in BUDGETS)]
+    print("\n".join(markdown_table(header, rows)))
+
+
+if __name__ == "__main__":
+    main()
