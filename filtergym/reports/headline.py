@@ -54,7 +54,7 @@ def headline_table(results: Sequence[Result]) -> Table:
             table.add_row(*row, SHORT.get(word, word))
     table.caption = (
         "learned and classical policies steer the paper's filters, an estimator is a classical filter of its own, the "
-        "reference knows the truth. Covariance: consistent where the interval of ANEES holds one; slightly over or under: overconfident "
-        "or cautious by less than a factor of two."
+        "reference knows the truth. Covariance: consistent where the interval of ANEES holds one; slightly over or "
+        "under: overconfident or cautious by less than a factor of two."
     )
     return table
