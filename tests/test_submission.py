@@ -464,7 +464,7 @@ def test_the_commands_of_the_page_run(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE, encoding="utf-8")
     page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
-    for line in page.partition("```sh\n")[2].partition("```")[0].splitlines():
+    for line in page.partition("```sh\n")[2].partition("```")[0].replace("\\\n", "").splitlines():
         _, *words = shlex.split(line)
         words += ["--protocol", "trial"] if words[0] == "submit" else []
         code, _, errors = command(*words)
