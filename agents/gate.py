@@ -443,9 +443,8 @@ class GatedMaker:
 
     def _check_fallback(self) -> None:
         kind, keywords = kind_of(self._fallback), dict(getattr(self._fallback, "task_keywords", {}))
-        keywords.pop(
-            "decision_interval", None
-        )  # its actions hold for as long as it says, whatever the agent's do
+        # Its actions hold for as long as it says, whatever the agent's do.
+        keywords.pop("decision_interval", None)
         if kind not in ("policy", "estimator") or self._fallback is RandomPolicy:
             raise ValueError(f"{self.fallback!r} is of kind {kind} and nothing that a gate can fall back on")
         if keywords:

@@ -23,12 +23,12 @@ ENVIRONMENTS = ("ManeuveringTarget", "UavAutopilot", "RadarEsmTracking", "Loosel
 BUDGETS = (100_000, 1_000_000, 10_000_000)
 
 
-def train(id: str, algo: str, steps: int, seed: int, run: Path) -> None:
-    """Train once, unless it is done."""
-    if not (run / "best").exists():
-        words = ["train", id, "--algo", algo, "--steps", str(steps), "--seed", str(seed), "--no-compare"]
-        command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+def train(id: str, algo: str, steps: int, seeds: int, run: Path) -> list[str]:
+    """Train once for each seed, and return the folders; what is done is left alone, what was interrupted goes on."""
+    words = ["train", id, "--algo", algo, "--steps", str(steps), "--seeds", f"0-{seeds - 1}", "--no-compare"]
+    command = [sys.executable, "-m", "filtergym", *words, "--out", str(run)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return [f"{run}-{seed}" for seed in range(seeds)]
 
 
 def main() -> None:
@@ -45,10 +45,8 @@ def main() -> None:
         id, cells = f"filtergym/{name}-v0", []
         paper = baselines_of(id).score_paper
         for steps in BUDGETS:
-            runs = [asked.runs / f"{name}-{asked.algo}-{steps}-{seed}" for seed in range(asked.seeds)]
-            for seed, run in enumerate(runs):
-                train(id, asked.algo, steps, seed, run)
-            results = filtergym.evaluate(id, [paper, *map(str, runs)], episodes=asked.episodes, seed=0)
+            runs = train(id, asked.algo, steps, asked.seeds, asked.runs / f"{name}-{asked.algo}-{steps}")
+            results = filtergym.evaluate(id, [paper, *runs], episodes=asked.episodes, seed=0)
             cost = results["cost"].mean(["episode", "time"]).values
             change = 100.0 * (cost[1:] / cost[0] - 1.0)
             cells.append(f"{numpy.mean(change):+.1f} ({change.min():+.1f} to {change.max():+.1f})")
