@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import numpy as np
 from filtergym.envs import backend
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.model import Model
+from filtergym.evaluation.rollout import rollout
+from filtergym.evaluation.seeds import episode_seeds
 
 DECISIONS = 5
 """Length of the short episodes, in decisions."""
@@ -19,3 +22,41 @@ def short_episodes(id: str) -> dict[str, Any]:
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
     interval = min(task_class(id).Parameters().decision_interval, 2)
     return {"horizon": DECISIONS * interval, "decision_interval": interval}
+
+
+LANES = 8
+"""Of a bank of hypotheses that is watched."""
+
+
+def act(bank: Any, state: Any, measurement: Any, action: Any) -> Any:
+    """Take a measurement in by the same action in every lane."""
+    return bank.act(state, measurement, np.array(action)[:, None] + np.zeros(LANES))
+
+
+def watch_hypotheses(model: Model, estimator: Any, field: str, no_action: Any) -> tuple[list[Any], list[Any]]:
+    """Fly the estimator that a bank of hypotheses steers, beside the bank under no action.
+
+    Returns:
+        for every measurement the bank's state as predicted with the measurement, and the estimator's answers.
+    """
+    bank, scans, answers = model.filter, [], []
+
+    class Watched:
+        kind = "estimator"
+
+        def start(self, initial, N):
+            self.state = bank.start(initial)
+            return estimator.start(initial, N)
+
+        def update(self, measurement, memory):
+            # A bank is given some number where there is no reading, an estimator NaN.
+            given = measurement._replace(**{field: np.nan_to_num(getattr(measurement, field))})
+            self.state = bank.predict(self.state, given)
+            scans.append((self.state, given))
+            self.state = act(bank, self.state, given, no_action)
+            answers.append(estimator.update(measurement, memory))
+            return answers[-1]
+
+    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
+        pass
+    return scans, answers

@@ -15,7 +15,7 @@ from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters.linear_systems import van_loan
 from filtergym.filters.loosely_coupled import error_model
-from models import make_model
+from models import act, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
 
@@ -226,33 +226,11 @@ def steered():
     """
     outage = {"outage_probability": 1.0, "outage_start": (0.4, 0.4), "outage_duration": (0.1, 0.3)}
     model = make_model(ID, "hypotheses", "random", axes=2, horizon=120, **outage)
-    bank, estimator, scans, answers = model.filter, FaultBank(model.task), [], []
-
-    class Watched:
-        kind = "estimator"
-
-        def start(self, initial, N):
-            self.state = bank.start(initial)
-            return estimator.start(initial, N)
-
-        def update(self, measurement, memory):
-            # A bank is given zero where there is no fix, an estimator NaN.
-            given = measurement._replace(fix=np.nan_to_num(measurement.fix))
-            self.state = bank.predict(self.state, given)
-            scans.append((self.state, given))
-            self.state = act(bank, self.state, given, np.zeros(6))
-            answers.append(estimator.update(measurement, memory))
-            return answers[-1]
-
-    for _ in rollout(model, Watched(), episode_seeds("train", 3, 8)):
-        pass
+    bank = model.filter
+    scans, answers = watch_hypotheses(model, FaultBank(model.task), "fix", np.zeros(6))
     assert 0.0 < np.mean([measurement.available for _, measurement in scans]) < 1.0
     assert sum(state.memory.pulled.weights.max() > 0.01 for state, _ in scans) > 10
     return bank, scans, answers
-
-
-def act(bank, state, measurement, action):
-    return bank.act(state, measurement, np.array(action)[:, None] + np.zeros(len(measurement.available)))
 
 
 def weights_after(bank, state, measurement, action):

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from filtergym.baselines.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
-from models import make_model
+from models import act, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
-LANES = 8
 ZERO = np.zeros(8)
 
 
@@ -26,37 +23,15 @@ def steered():
         "stick_duration": (0.1, 0.3), "rates_outage_probability": 0.5, "rates_outage_duration": (0.1, 0.3),
     }  # fmt: skip
     model = make_model(ID, "hypotheses", "random", **faults)
-    bank, scans, answers = model.filter, [], []
+    bank = model.filter
     # A leg may end from the start, or no manoeuvre would begin so early.
     bank.bank, estimator = (make(model.task, quiet=0.0) for make in (FaultFilter, FaultHypotheses))
-
-    class Watched:
-        kind = "estimator"
-
-        def start(self, initial, N):
-            self.state = bank.start(initial)
-            return estimator.start(initial, N)
-
-        def update(self, measurement, memory):
-            # A bank is given some number where there is no reading, an estimator NaN.
-            given = measurement._replace(readings=np.nan_to_num(measurement.readings))
-            self.state = bank.predict(self.state, given)
-            scans.append((self.state, given))
-            self.state = act(bank, self.state, given, ZERO)
-            answers.append(estimator.update(measurement, memory))
-            return answers[-1]
-
-    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
-        pass
+    scans, answers = watch_hypotheses(model, estimator, "readings", ZERO)
     assert max(state.expected[3].max() for state, _ in scans) > 0.1
     assert 0.0 < np.mean([state.between for state, _ in scans]) < 1.0
     assert 0.0 < np.mean([state.repeated for state, _ in scans]) < 1.0
     assert 0.0 < np.mean([measurement.available for _, measurement in scans]) < 1.0
     return bank, scans, answers
-
-
-def act(bank, state, measurement, action):
-    return bank.act(state, measurement, np.array(action)[:, None] + np.zeros(LANES))
 
 
 def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):

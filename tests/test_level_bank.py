@@ -6,48 +6,23 @@ import numpy as np
 import pytest
 from filtergym.baselines.uav_autopilot.level_bank import LevelBank
 from filtergym.envs.uav_autopilot.level_bank import grid
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import noise_levels, packed_covariance
-from models import make_model
+from models import act, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
 
 ID = "filtergym/UavAutopilot-v0"
-LANES = 8
 
 
 @pytest.fixture(scope="module", params=["U", "P"])
 def steered(request):
     """The bank, for every measurement its state as predicted and the measurement, and the estimator's answers."""
     model = make_model(ID, "hypotheses", "random", plant=request.param, horizon=80, dropout_period=20)
-    bank, estimator, scans, answers = model.filter, LevelBank(model.task), [], []
-
-    class Watched:
-        kind = "estimator"
-
-        def start(self, initial, N):
-            self.state = bank.start(initial)
-            return estimator.start(initial, N)
-
-        def update(self, measurement, memory):
-            # A bank is given the last reading where a sensor is silent, an estimator NaN.
-            given = measurement._replace(reading=np.nan_to_num(measurement.reading))
-            self.state = bank.predict(self.state, given)
-            scans.append((self.state, given))
-            self.state = act(bank, self.state, given, bank.no_action)
-            answers.append(estimator.update(measurement, memory))
-            return answers[-1]
-
-    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
-        pass
+    bank = model.filter
+    scans, answers = watch_hypotheses(model, LevelBank(model.task), "reading", bank.no_action)
     # Of single sensors or of all.
     assert 0.5 < np.mean([measurement.available for _, measurement in scans]) < 1.0
     return bank, scans, answers
-
-
-def act(bank, state, measurement, action):
-    return bank.act(state, measurement, np.array(action)[:, None] + np.zeros(LANES))
 
 
 def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):

@@ -246,6 +246,8 @@ def test_a_record_takes_competitors_measured_later(recorded, tmp_path, make_page
     assert (code, "the record has seed 0, what is added 1" in errors) == (2, True)
     code, _, errors = make_page("record", "later.json", "--into", "records", "--add", "zero", "--add", "imm")
     assert code == 0, errors
+    code, _, errors = make_page("record", "later.json", "--into", "records", "--add", "adaptive")
+    assert (code, "adaptive took no part in random" in errors) == (2, True)
     data = {**read_record("benchmark/ManeuveringTarget", recorded).data}
     [scenario] = data["scenarios"]
     cost = data["scenarios"][scenario]["competitors"]["imm"]["metrics"]["cost"]

@@ -202,6 +202,8 @@ def with_competitors(
     scenarios = dict(data["scenarios"])
     for name, own in added["scenarios"].items():
         known = scenarios.get(name)
+        if absent := sorted({*names} - own["competitors"].keys()):
+            raise ValueError(f"{', '.join(absent)} took no part in {name}")
         if known is None or known["episodes"] != own["episodes"]:
             raise ValueError(f"the record has other episodes of {name}")
         for competitor in own["competitors"].keys() - {*names}:
