@@ -11,7 +11,7 @@ from typing import Any
 import numpy
 
 from .catalogue import check_names, import_task, nearest, task_class
-from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
+from .flight_tables import FLIGHT_SUFFIXES
 from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from .plausibility import check_recording
 from .recorded_tables import TruthFile, read_columns
@@ -170,8 +170,6 @@ def _read_recording(
     """Read one file."""
     if not file.is_file():
         raise ValueError("there is no such file")
-    if file.stat().st_size > MOST_BYTES:
-        raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     if names_environment(file):
         if truth is not None:
             raise ValueError(

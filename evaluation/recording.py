@@ -9,7 +9,8 @@ from ..envs.backend import make_model
 from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
-from ..envs.recording import MOST_NUMBERS, Recording, measure_once
+from ..envs.foreign_files import MOST_NUMBERS
+from ..envs.recording import Recording, measure_once
 from ..envs.recording_files import differing
 from ..envs.scenario_choice import find_scenario, make_task, read_files
 from ..envs.task import Task, named_arrays
