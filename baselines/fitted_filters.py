@@ -113,6 +113,11 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
         if log_format is None or log_format.scale_noise is None:
             raise ValueError(f"{path}: measurements of {problem.id} state no deviations that could be scaled")
         family = with_noise_scale(family, log_format.scale_noise)
+    if values.keys() != family.limits.keys():
+        raise ValueError(
+            f"{path} must give {table['filter']!r} a number for each of {', '.join(family.limits)}, got "
+            f"{', '.join(values):.200}"
+        )
     try:
         values = check_values(values, family)
     except ValueError as error:

@@ -359,7 +359,7 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> Table:
         wanted = known if isinstance(known, ColumnNames) else ColumnNames(known)
         table = _READERS[suffix_of(file)](file, wanted)
         for name, cells in table.columns.items():
-            if cells.dtype == object:
+            if cells.dtype.kind == "O":  # words, whatever pandas keeps them in
                 check_cells(str(name), cells)
         return table
     except UnicodeDecodeError as error:
@@ -411,10 +411,18 @@ def numbers(name: str, values: "pandas.Series") -> "pandas.Series":
     try:
         return cells.map(float)
     except (ValueError, TypeError, OverflowError):
-        row = (pandas.to_numeric(cells, errors="coerce").isna() & cells.notna()).idxmax()
+        row = next(row for row, cell in cells.items() if not _is_number(cell))
         raise ValueError(
             f"{name} has {quote_shortened(cells[row])} in row {row}, which is no number"
         ) from None
+
+
+def _is_number(cell: Any) -> bool:
+    try:
+        float(cell)
+    except (ValueError, TypeError, OverflowError):
+        return False
+    return True
 
 
 def is_true(values: "pandas.Series") -> "pandas.Series":

@@ -55,7 +55,7 @@ def limits() -> Limits:
         ValueError: if the environment says what is no limit.
     """
     found = []
-    for name, otherwise in ((MEMORY, 512.0), (SECONDS, 10.0)):
+    for name, otherwise in ((MEMORY, 512.0), (SECONDS, 5.0)):
         try:
             value = float(os.environ.get(name) or otherwise)
         except ValueError:
@@ -77,6 +77,8 @@ def refuse_memory(what: str) -> ValueError:
 
 def quote_shortened(value: Any, most: int = 80) -> str:
     """Return a value as Python writes it, cut where it is long: nobody wants to be told two megabytes."""
+    if isinstance(value, int) and abs(value) >= 10**most:
+        return f"a whole number of {value.bit_length() * math.log10(2.0):,.0f} digits"
     text = repr(value if not isinstance(value, str | bytes) else value[: most + 1])
     return text if len(text) <= most else f"{text[:most]}..."
 
@@ -100,18 +102,18 @@ def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
         raise
     except (OSError, ValueError) as error:
         raise ValueError(getattr(error, "strerror", None) or str(error)) from error
+    found = os.fstat(handle)
+    if not stat.S_ISREG(found.st_mode):
+        os.close(handle)
+        raise ValueError("it is no file but a folder, a device or a pipe")
     with os.fdopen(handle, "rb") as file:
-        found = os.fstat(handle)
-        if not stat.S_ISREG(found.st_mode):
-            raise ValueError("it is no file but a folder, a device or a pipe")
         if found.st_size > most:
-            larger = (
-                f"it is larger than {most / 1e9:g} GB"
-                if most >= 1e8
-                else f"it is larger than {most / 1e6:g} MB"
-            )
-            raise ValueError(f"{larger}: split it")
+            raise ValueError(f"it is larger than {_size(most)}: split it")
         yield file
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e9:g} GB" if count >= 1e9 else f"{count / 1e6:g} MB"
 
 
 def read_content(path: Path, most: int | None = None) -> bytes:
@@ -129,7 +131,7 @@ def read_content(path: Path, most: int | None = None) -> bytes:
     with open_foreign(path, most) as file:
         content = file.read(most + 1)
     if len(content) > most:  # it grew, or the system does not say how large it is
-        raise ValueError(f"it is larger than {most / 1e6:g} MB: split it")
+        raise ValueError(f"it is larger than {_size(most)}: split it")
     return content
 
 
@@ -238,7 +240,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
             stderr=subprocess.DEVNULL,
             env={**os.environ, **one_thread, **own},
         )
-    late = threading.Timer(2.0 * seconds, process.kill)
+    late = threading.Timer(3.0 * seconds, process.kill)
     late.start()
     try:
         assert process.stdout is not None
@@ -263,7 +265,7 @@ def parse_apart(parser: str, path: Path, extra: str, most: int = MOST_BYTES, **o
 def _explain_end(code: int, seconds: float) -> ValueError:
     """Return the error for a parser that ended without an answer."""
     if code == 3:
-        return refuse_memory("reading it takes more memory")
+        return refuse_memory("its parser needs more memory")
     if -code in (9, 24):  # SIGKILL, SIGXCPU
         return ValueError(
             f"reading it took more than {seconds:.0f} s: it is damaged, or set {SECONDS}={4 * seconds:.0f} (s) if you "

@@ -501,11 +501,13 @@ def main() -> None:
     except LimitError as error:
         head, arrays = {"memory": str(error)}, []
     except MemoryError:
-        head, arrays = {"memory": "reading it takes more memory"}, []
+        head, arrays = {"memory": "its parser needs more memory"}, []
     except Exception as error:  # libraries raise whatever a broken file makes them stumble over
         text = " ".join(str(error).split())[:300] or type(error).__name__
         short = "alloc" in text.lower() or "memory" in text.lower()
-        head, arrays = {"memory" if short else "error": text, "own": type(error) is ValueError}, []
+        head, arrays = {"error": text, "own": type(error) is ValueError}, []
+        if short:
+            head = {"memory": "its parser needs more memory"}
     try:
         _answer(answers, head, arrays)
     except MemoryError:

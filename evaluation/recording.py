@@ -8,8 +8,8 @@ import numpy
 from ..envs.backend import make_model
 from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.filter import Filter, Initial, Input
-from ..envs.model import Episode, Model
 from ..envs.foreign_files import MOST_NUMBERS
+from ..envs.model import Episode, Model
 from ..envs.recording import Recording, measure_once
 from ..envs.recording_files import differing
 from ..envs.scenario_choice import find_scenario, make_task, read_files
