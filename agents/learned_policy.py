@@ -16,10 +16,10 @@ from typing import Any, get_type_hints
 
 import numpy
 
-from ..envs.catalogue import short_name, task_class
-from ..envs.foreign_files import parse_json, read_content
-from ..envs.model import Model
-from ..envs.task import Task
+from ..envs.contract.model import Model
+from ..envs.contract.task import Task
+from ..envs.data.foreign_files import parse_json, read_content
+from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
@@ -249,7 +249,9 @@ def _check_run(run: Any) -> None:
         raise ValueError("its header has no record of a run")
     for name, hint in get_type_hints(TrainingRun).items():
         if name in run and not fits(run[name], hint):
-            raise ValueError(f"{name} of its run must be {getattr(hint, '__name__', hint)}, got {run[name]!r:.80}")
+            raise ValueError(
+                f"{name} of its run must be {getattr(hint, '__name__', hint)}, got {run[name]!r:.80}"
+            )
     if not isinstance(run.get("hyperparameters", {}).get("env_kwargs", {}), dict):
         raise ValueError("env_kwargs of its run must map names to values")
 

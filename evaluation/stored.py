@@ -5,7 +5,7 @@ import types
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints, is_typeddict
 
-from ..envs import foreign_files
+from ..envs.data import foreign_files
 
 Stored = TypeVar("Stored")
 

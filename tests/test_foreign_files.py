@@ -13,8 +13,14 @@ from filtergym.agents.learned_policy import PRETRAINED, load_policy
 from filtergym.agents.settings import read_config
 from filtergym.baselines.fitted_filters import families_of, read_fitted
 from filtergym.baselines.problem import problem_of
-from filtergym.envs import foreign_files
-from filtergym.envs.foreign_files import open_foreign, parse_apart, parse_json, quote_shortened, read_yaml
+from filtergym.envs.data import foreign_files
+from filtergym.envs.data.foreign_files import (
+    open_foreign,
+    parse_apart,
+    parse_json,
+    quote_shortened,
+    read_yaml,
+)
 from filtergym.evaluation.stored import read_json
 
 from filtergym import evaluate, read_flights, read_recording
