@@ -35,7 +35,7 @@ from .evaluation import (
     say_departures,
     write,
 )
-from .shown import REPORT, make_report, print_results, print_verdict
+from .shown import REPORT, make_report, print_outcome, print_results, print_table
 from .terminal import (
     Backend,
     Cluster,
@@ -337,9 +337,14 @@ def benchmark(
     with whole_files(out) as waiting:
         records_as_csv(waiting / "records.csv", all_records(results))
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
-    print_verdict(results)
-    console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
+    print_outcome(results)
+    console.print()
     make_report(results, settings_of(options.command), out / REPORT)
+    console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
+    console.print(
+        "what the environments are, and who competes in them: filtergym list, docs/environments.md\n"
+    )
+    print_table(results)
 
 
 def animate(

@@ -6,12 +6,16 @@ from pathlib import Path
 from ..evaluation.files import write_text
 from ..evaluation.metrics import Record
 from ..reports.headline import headline_table
-from ..reports.ranking import verdict
+from ..reports.outcome import outcome_sentences, protocol_sentences
+from ..reports.ranking import remarks
+from ..reports.reasons import fill
 from ..reports.results import Result, Settings
 from ..reports.tables import results_tables
 from .terminal import console
 
 REPORT = "report.html"
+SENTENCE_WIDTH, TABLE_WIDTH = 100, 80
+"""Columns that a sentence and the table of the best take at most."""
 
 
 def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
@@ -25,12 +29,26 @@ def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
         console.print(table)
 
 
-def print_verdict(results: Sequence[Result]) -> None:
-    """Print what results come to: one screen."""
-    console.print(headline_table(results), width=min(console.width, 80))
+def print_outcome(results: Sequence[Result]) -> None:
+    """Print a sentence for each environment, and what they rest on."""
+    for sentence in outcome_sentences(results):
+        _print_sentence(sentence)
     console.print()
-    for sentence in verdict(results):
-        console.print(sentence.replace("`", ""), width=min(console.width, 80), highlight=False)
+    for sentence in protocol_sentences(results):
+        _print_sentence(sentence)
+
+
+def print_table(results: Sequence[Result]) -> None:
+    """Print the best of every origin as a table, and remarks on it."""
+    console.print(headline_table(results), width=min(console.width, TABLE_WIDTH))
+    console.print()
+    for sentence in remarks(results):
+        _print_sentence(sentence)
+
+
+def _print_sentence(sentence: str) -> None:
+    width = min(console.width, SENTENCE_WIDTH)
+    console.print(fill(sentence.replace("`", ""), width), highlight=False, soft_wrap=True)
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:

@@ -1,5 +1,6 @@
-"""What a benchmark comes to: one sentence for each environment, for readers who have seen neither it nor this package."""
+"""What a benchmark comes to: one sentence for each environment, for readers who know nothing of this package."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,6 +27,27 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
     return [sentence_of(result) for result in usual if ranking(result.records, result.learned)]
 
 
+def protocol_sentences(results: Sequence[Result]) -> list[str]:
+    """Say what the sentences and the table below them rest on.
+
+    Args:
+        results: as of :func:`outcome_sentences`.
+    """
+    records = [result.records[0] for result in results if result.default or not _any_default(results)]
+    episodes = sorted({record.episodes for record in records})
+    first = records[0]
+    each = " to ".join(f"{number:,}" for number in dict.fromkeys((episodes[0], episodes[-1])))
+    return [
+        f"Every competitor met the same {each} episodes of an environment ({first.split} split, seed {first.seed}). "
+        "Ranges hold 95 %; competitors are level where that of their difference holds zero. Error cost is the mean "
+        "squared error of the estimate, in a control loop the loop's quadratic cost; times are of one processor core."
+    ]
+
+
+def _any_default(results: Sequence[Result]) -> bool:
+    return any(result.default for result in results)
+
+
 def sentence_of(result: Result) -> str:
     """Return the sentence on one environment and scenario, in which somebody is ranked."""
     places = ranking(result.records, result.learned)
@@ -42,10 +64,13 @@ def sentence_of(result: Result) -> str:
     behind = rival.behind
     if behind is None or behind.value is None:
         clause += "costs more"
-    elif behind.low is None or behind.low <= 0.0:
+    elif behind.low is None or behind.high is None or behind.low <= 0.0:
         clause += "is level with it"
+    elif behind.value >= 1.0:
+        times, low, high = (f"{1.0 + share:.2g}" for share in (behind.value, behind.low, behind.high))
+        clause += f"costs {times} times as much ({low} to {high} times)"
     else:
-        clause += f"is {_percent(behind.value)} % behind it ({_range(behind.low, behind.high or math.inf)})"
+        clause += f"is {_percent(behind.value)} % behind it ({_range(behind.low, behind.high)})"
     if (lead := find_lead(result.records, places, origin)) is not None:
         place = f"where a measurement may take {_times(lead)}"
         if lead.name == rival.name:
@@ -123,7 +148,7 @@ def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -
     known = [place for place in places if place.name in times and place.name in costs]
     allowed = sorted({times[place.name] for place in known})
     lead: Lead | None = None
-    for first, last in zip(allowed, [*allowed[1:], math.inf], strict=True):
+    for first, last in itertools.pairwise([*allowed, math.inf]):
         # Places are in the order of their cost.
         mine, other = (
             next(
