@@ -115,7 +115,7 @@ def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results
     assert not list(tmp_path.rglob("report.html"))
 
 
-@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 150), ("0", 150), ("wide", 150)])
+@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 100), ("0", 100), ("wide", 100)])
 def test_columns_says_how_wide_what_is_piped_may_be(said, width, monkeypatch):
     monkeypatch.setenv("COLUMNS", said)
     assert terminal.output_width() == width

@@ -19,7 +19,7 @@ from ..evaluation.rollout import Progress
 from ..names import find_competitor, is_learned
 from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
-from ..reports.export import latex_table, records_as_csv
+from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
@@ -35,7 +35,7 @@ from .evaluation import (
     say_departures,
     write,
 )
-from .shown import REPORT, make_report, print_outcome, print_results, print_table
+from .shown import REPORT, make_report, print_headline, print_outcome, print_results
 from .terminal import (
     Backend,
     Cluster,
@@ -333,7 +333,7 @@ def benchmark(
 
         results = run_benchmark(out, options, Callbacks(add_line, print_details, save_figures), workers)
     tables = [headline_table(results)]
-    tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
+    tables += [table for r in results for table in results_tables(r.records, r.knows, LATEX_WIDTH)]
     with whole_files(out) as waiting:
         records_as_csv(waiting / "records.csv", all_records(results))
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
@@ -344,7 +344,7 @@ def benchmark(
     console.print(
         "what the environments are, and who competes in them: filtergym list, docs/environments.md\n"
     )
-    print_table(results)
+    print_headline(results)
 
 
 def animate(

@@ -10,7 +10,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_formats
 from ..papers import paper_module, papers
 from ..reports.results import read_all_results
-from .shown import REPORT, make_report, print_outcome, print_table, report_maker
+from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
 from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
 
 
@@ -34,7 +34,7 @@ def make(
     console.print()
     make_report(found, settings, out)
     console.print()
-    print_table(found)
+    print_headline(found)
 
 
 def reproduce(

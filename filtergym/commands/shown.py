@@ -8,14 +8,11 @@ from ..evaluation.metrics import Record
 from ..reports.headline import headline_table
 from ..reports.outcome import outcome_sentences, protocol_sentences
 from ..reports.ranking import remarks
-from ..reports.reasons import fill
 from ..reports.results import Result, Settings
 from ..reports.tables import results_tables
-from .terminal import console
+from .terminal import console, print_sentence, print_table
 
 REPORT = "report.html"
-SENTENCE_WIDTH, TABLE_WIDTH = 100, 80
-"""Columns that a sentence and the table of the best take at most."""
 
 
 def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
@@ -26,29 +23,24 @@ def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
         knows: what references and bounds know, by their names.
     """
     for table in results_tables(records, knows, console.width):
-        console.print(table)
+        print_table(table)
 
 
 def print_outcome(results: Sequence[Result]) -> None:
     """Print a sentence for each environment, and what they rest on."""
     for sentence in outcome_sentences(results):
-        _print_sentence(sentence)
+        print_sentence(sentence.replace("`", ""))
     console.print()
     for sentence in protocol_sentences(results):
-        _print_sentence(sentence)
+        print_sentence(sentence)
 
 
-def print_table(results: Sequence[Result]) -> None:
+def print_headline(results: Sequence[Result]) -> None:
     """Print the best of every origin as a table, and remarks on it."""
-    console.print(headline_table(results), width=min(console.width, TABLE_WIDTH))
+    print_table(headline_table(results))
     console.print()
     for sentence in remarks(results):
-        _print_sentence(sentence)
-
-
-def _print_sentence(sentence: str) -> None:
-    width = min(console.width, SENTENCE_WIDTH)
-    console.print(fill(sentence.replace("`", ""), width), highlight=False, soft_wrap=True)
+        print_sentence(sentence.replace("`", ""))
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:
