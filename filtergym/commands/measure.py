@@ -321,7 +321,12 @@ def benchmark(
             line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
-        def print_details(result: Result) -> None:
+        def tell_result(result: Result) -> None:
+            first = result.records[0]
+            names = {record.policy for record in result.records}
+            bar.say(
+                f"{result.short}, {result.scenario}: {len(names)} competitors over {first.episodes:,} episodes"
+            )
             if details:
                 print_results(result.records, result.knows)
 
@@ -331,7 +336,7 @@ def benchmark(
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
-        results = run_benchmark(out, options, Callbacks(add_line, print_details, save_figures), workers)
+        results = run_benchmark(out, options, Callbacks(add_line, tell_result, save_figures), workers)
     tables = [headline_table(results)]
     tables += [table for r in results for table in results_tables(r.records, r.knows, LATEX_WIDTH)]
     with whole_files(out) as waiting:

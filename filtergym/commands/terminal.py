@@ -12,10 +12,10 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..reports.lines import fill
+from .progress import progress_bar as progress_bar
 
 # --- what a shell completes; imports wait until it asks
 
@@ -249,22 +249,6 @@ def close_output(*_: Any, **__: Any) -> None:
         raise ValueError(
             f"cannot write to standard output: {console.refusal.strerror or console.refusal}"
         ) from console.refusal
-
-
-def progress_bar() -> Progress:
-    """Return a progress bar on standard error, so that tables can be piped; none where nobody looks."""
-    errors = Console(stderr=True)
-    errors.quiet = not errors.is_terminal  # rich before 14.3 ends a disabled bar with an empty line
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=errors,
-        transient=True,
-        disable=errors.quiet,
-    )
 
 
 def pair(option: str, text: str) -> tuple[float, float]:
