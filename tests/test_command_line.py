@@ -221,6 +221,12 @@ def test_what_has_been_finished_is_said_with_the_time_that_is_left():
 def test_list_names_everything(tmp_path):
     result = in_a_process_of_its_own("list", cwd=tmp_path)
     assert result.returncode == 0
+    lines = result.stdout.splitlines()
+    assert [line.split()[0] for line in lines[: len(catalogue())]] == list(catalogue())
+    assert lines[len(catalogue())] == ""
+    result = in_a_process_of_its_own("list", ENV, cwd=tmp_path)
+    assert result.returncode == 0
+    assert max(map(len, result.stdout.splitlines())) <= 100
     for word in (ENV, "evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt"):
         assert word in result.stdout
     # What a reader needs to judge a number: whose algorithm it is, and what a reference is told.
