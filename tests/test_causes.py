@@ -14,9 +14,9 @@ from filtergym.evaluation.curves import BAND_RESAMPLES, cost_in_stretches, curve
 from filtergym.evaluation.worst_episodes import describe_worst, main_causes, run_episodes, select_worst
 
 import filtergym
+from filtergym.reports.lines import fill
 from filtergym.reports.reasons import (
     explained_by_default,
-    fill,
     largest_reasons,
     reason_sentences,
     reasons_of,
