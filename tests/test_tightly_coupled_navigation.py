@@ -516,6 +516,26 @@ def test_urban_errors_have_the_stated_quantiles():
         assert (held.multipath == s.multipath).all()
 
 
+def test_the_papers_course_rests_goes_along_and_then_flies_across():
+    model = make("paper", heading=(10.0, 80.0))
+    p, rng = model.task.parameters, numpy.random.default_rng(3)
+    truth = model.begin(
+        rng.random((model.task.noise.uniforms, 16)),
+        rng.standard_normal((model.task.noise.initial_normals, 16)),
+    ).truth
+    legs, heading = truth.legs, truth.heading
+    numpy.testing.assert_array_equal(legs.kind, numpy.array([0.0, 1.0, 2.0])[:, None] + numpy.zeros(16))
+    numpy.testing.assert_array_equal(legs.start, numpy.array([0, *p.leg_steps])[:, None] + numpy.zeros(16))
+    assert numpy.ptp(heading) > 0.1
+    for n, angle in enumerate(heading):
+        forward = p.leg_acceleration * numpy.array([math.sin(angle), math.cos(angle), 0.0])
+        # A turn to the right by 90 degrees, seen from above.
+        across = numpy.array([forward[1], -forward[0], 0.0])
+        numpy.testing.assert_allclose(
+            legs.acceleration[..., n], numpy.stack([0.0 * forward, forward, across], axis=1), atol=1e-12
+        )
+
+
 def test_random_course_has_every_leg_and_bounded_strength():
     model = make("random", manoeuvre_throughout=0.0, **UNMIXED)
     rng = numpy.random.default_rng(13)
