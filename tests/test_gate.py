@@ -150,12 +150,14 @@ def opened(name, control, scenario, episodes, **keywords):
 
 
 @pytest.mark.parametrize(("name", "control", "scenario", "keywords"), AS_MODELLED)
+@pytest.mark.claims
 def test_it_stays_shut_where_nothing_is_wrong(name, control, scenario, keywords):
     episodes = 8 if scenario == "matched" else 64
     assert opened(name, control, scenario, episodes, **keywords) < 0.06
 
 
 @pytest.mark.parametrize("name", WRONG)
+@pytest.mark.claims
 def test_alarms_hear_what_is_wrong(name):
     control, scenario, keywords = WRONG[name]
     assert opened(name, control, scenario, 16, **keywords) > 0.6
@@ -327,6 +329,7 @@ def test_a_gate_that_falls_back_on_something_worse_than_the_paper_is_refused():
         GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-tuned")
 
 
+@pytest.mark.claims
 def test_every_environment_falls_back_on_something_better_than_the_paper(env_id):
     problem = problem_of(env_id)
     if not problem.baselines.fallback:

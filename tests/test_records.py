@@ -126,12 +126,14 @@ def test_every_record_is_small_and_shown():
         assert shown.get(file.parent.name, f"{{record-table}} {name}\n") in everything, name
 
 
+@pytest.mark.claims
 def test_readme_shows_the_records():
     """If not: ``python docs/make readme``."""
     page = DOCS.parent / "README.md"
     assert with_numbers(page) == page.read_text(encoding="utf-8")
 
 
+@pytest.mark.claims
 def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = tmp_path / "README.md"

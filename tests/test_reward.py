@@ -49,6 +49,7 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
     assert max(seen) > 0.0
 
 
+@pytest.mark.claims
 def test_one_is_what_the_paper_pays_on_average(env_id):
     """In TightlyCoupledNavigation few lost tracks rule the mean: one is between them and the median episode."""
     paper = baselines_of(env_id).score_paper

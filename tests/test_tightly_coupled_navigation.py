@@ -589,6 +589,7 @@ def within(values, reference, error, allowance=0.0):
     assert abs(root - reference) < 4.0 * numpy.hypot(own, error) + allowance, (root, own, reference)
 
 
+@pytest.mark.claims
 def test_reference_table_of_the_adaptive_filter():
     """Increment course, 24 runs: RMS errors of three legs, NIS, probabilities and adaptation times."""
     N, model = 24, make_model(TightlyCoupledNavigation.id, "evidence", "paper", backend="auto")
@@ -648,6 +649,7 @@ def test_reference_table_of_the_adaptive_filter():
         ("increment", 1, None),
     ],
 )
+@pytest.mark.claims
 def test_loss_of_track_with_the_aperture(course, hypothesis, band):
     """Median time from the motion of the first step of leg 2 to the first of ten lost rates.
 
@@ -666,6 +668,7 @@ def test_loss_of_track_with_the_aperture(course, hypothesis, band):
         assert band[0] <= numpy.median(lasting.argmax(axis=0) + 1) * 0.01 <= band[1]
 
 
+@pytest.mark.claims
 def test_matched_filter_is_consistent():
     """NEES / 17 and NIS / 14 of the Singer filter on its own model: 0.987 +- 0.018 and 1.001."""
     model, N = make("matched", "mode"), 32
