@@ -133,9 +133,12 @@ def test_readme_shows_the_records():
     assert with_numbers(page) == page.read_text(encoding="utf-8")
 
 
-@pytest.mark.claims
 def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):
+    import commands
+
     monkeypatch.chdir(tmp_path)
+    # Places for the names in the picture of one environment take seconds to find.
+    monkeypatch.setattr(commands, "recorded_environments", lambda: ["RadarEsmTracking"])
     page = tmp_path / "README.md"
     page.write_text("no numbers")
     code, _, errors = make_page("readme", page)
