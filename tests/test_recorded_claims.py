@@ -2,7 +2,7 @@
 
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from records import read_record, short_name
 
 pytestmark = pytest.mark.claims

@@ -14,7 +14,7 @@ import json
 from pathlib import Path
 
 import pytest
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 FILE = Path(__file__).parent / "scenarios.json"
 
