@@ -211,7 +211,7 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
     assert (variance[2][is_other] == variance[1][is_other]).all()
 
 
-@pytest.mark.parametrize("name", ["bptt", "kalman-net"])
+@pytest.mark.parametrize("name", [pytest.param("bptt", marks=pytest.mark.slow), "kalman-net"])
 def test_who_is_shown_one_plot_of_many_is_not_trusted(name):
     """The fallback takes in all plots of a scan, and has no density of the one that the agent's filter takes."""
     fallback = baselines_of(ID).fallback
@@ -229,8 +229,8 @@ def test_who_is_shown_one_plot_of_many_is_not_trusted(name):
     [
         ("ManeuveringTarget", "ppo"),
         ("ManeuveringTarget", "kalman-net"),
-        ("UavAutopilot", "ppo"),
-        ("RadarEsmTracking", "ppo"),
+        pytest.param("UavAutopilot", "ppo", marks=pytest.mark.slow),
+        pytest.param("RadarEsmTracking", "ppo", marks=pytest.mark.slow),
         pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
         # Agents that were trained behind a gate, and as a correction: what is around them is compiled, too.
         pytest.param("TightlyCoupledNavigation", "bptt-small", marks=pytest.mark.slow),

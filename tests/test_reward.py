@@ -78,7 +78,7 @@ def test_the_default_is_the_environments_own(env_id, short, random_actions):
 def test_doing_nothing_is_worth_nothing(env_id, short, random_actions):
     """Under "log-relative", to the last bit, under every control; anything else is worth something."""
     for control in make_model(env_id).task.controls:
-        env = TaskVectorEnv(env_id, 3, control=control, reward="log-relative", **short)
+        env = TaskVectorEnv(env_id, 3, control=control, reward="log-relative", backend="numpy", **short)
         env.reset(seed=4)
         space = env.single_action_space
         nothing = np.zeros((3, *space.shape), dtype=space.dtype)

@@ -408,6 +408,7 @@ def step_records(episodes: int) -> dict[str, Record]:
     return {r.metric: r for r in tidy_records(dataset) if r.window in ("transient", "steady")}
 
 
+@pytest.mark.claims
 def test_step_response_of_the_mean_output() -> None:
     found = step_records(6400)
     # The averaged response has noise of 0.003: the response without noise is 0.46 s, 0.54 s, no overshoot.
@@ -623,6 +624,7 @@ def test_a_slow_error_in_the_bank_is_the_one_of_the_told_filter() -> None:
     numpy.testing.assert_allclose(error.sel(policy="bank"), error.sel(policy="matched"), rtol=0, atol=1e-9)
 
 
+@pytest.mark.claims
 def test_the_banks_win_where_they_should_and_the_told_filter_stays_the_limit() -> None:
     """Paired differences of 60 episodes, four standard errors; the told filter is below all."""
     better = {"random": ("level-bank", "level-bank-vague"), "gyro-bias": ("level-bank-vague",)}
