@@ -7,9 +7,9 @@ import typer
 
 from ..agents.export import export_run
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import check_names, nearest
-from ..envs.scenario_choice import read_recording
-from ..evaluation.files import whole_file, writable_file, writable_folder
+from ..envs.engine.catalogue import check_names, nearest
+from ..envs.engine.scenario_choice import read_recording
+from ..evaluation.files import writable_file, writable_folder
 from .terminal import (
     Parameters,
     ScenarioName,
@@ -27,7 +27,7 @@ from .terminal import (
 if TYPE_CHECKING:
     from ..exports.request import ExportRequest
 
-FORMS = ("safetensors", "c", "python", "onnx", "hub")
+FORMS = ("safetensors", "c", "onnx", "hub")
 """What can be written."""
 
 
@@ -52,8 +52,8 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; python, a filter as one "
-            "file that needs NumPy only; onnx, the network of an agent; hub, a folder with an agent and its card.",
+            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
+            "network of an agent; hub, a folder with an agent and its card.",
             autocompletion=one_of(*FORMS),
         ),
     ] = "safetensors",
@@ -82,19 +82,17 @@ def export(
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
-    """Write a filter as C99 or as one file of Python, an agent's network as ONNX, or a run's agent as plain arrays.
+    """Write a filter as C99, an agent's network as ONNX, or a run's agent as plain arrays.
 
     Arrays evaluate without torch and cannot execute anything. Nothing is executed either: training has left them beside
     the model. A folder with the model only takes --trust.
 
-    C needs nothing but math.h, Python nothing but NumPy. What is written was run beside the filter itself, measurement
-    by measurement, over episodes of the scenario, or over a log.
+    C needs nothing but math.h. What is written was run beside the filter itself, measurement by measurement, over
+    episodes of the scenario, or over a log.
 
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
 
     Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to c --out imm
-
-    Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to python --out imm.py
     """
     if to not in FORMS:
         raise nearest("form of an export", to, FORMS)
@@ -104,7 +102,6 @@ def export(
         "safetensors": (),
         "onnx": ("a filter's name",),
         "hub": ("a filter's name",),
-        "python": tuple(o for o in options if o != "--float"),
     }
     for option, given in options.items():
         if given and option not in allowed.get(to, options):
@@ -133,18 +130,10 @@ def export(
     if to == "c":
         _export_c(request, out, "float" if single else "double")
         return
-    ending = ".py" if to == "python" else ".onnx"
-    path = writable_file(out or Path(request.name.replace(":", "_") + ending))
-    if to == "onnx":
-        from ..exports.onnx_network import export_onnx
+    from ..exports.onnx_network import export_onnx
 
-        export_onnx(request, path)
-    else:
-        from ..exports.python_source import export_python
-
-        text = export_python(request)
-        with whole_file(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+    path = writable_file(out or Path(request.name.replace(":", "_") + ".onnx"))
+    export_onnx(request, path)
     console.print(f"saved in {path}", soft_wrap=True)
 
 
