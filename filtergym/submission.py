@@ -475,7 +475,8 @@ def run_protocol(
         experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
         horizon = experiment.make_task().horizon
         requests += [
-            EvaluationRequest(experiment, name, own, known.metrics, horizon) for name, own in makers.items()
+            EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
+            for name, own in makers.items()
         ]
     found = dict(summaries(requests, workers, progress))
     figures: list[Figure] = []
