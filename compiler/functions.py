@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from . import namespace
-from .emission import LANES
+from .block import LANES
 from .library import Library
 from .native import Native, native
 from .program import Graph, Program, Result, program

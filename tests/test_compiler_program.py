@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.compiler import cache, emission, functions, namespace, native
+from filtergym.compiler.block import Block
 from filtergym.compiler.emission import emit
 from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.library import portable
@@ -219,7 +220,7 @@ def test_functions_that_differ_only_in_numbers_have_the_same_text():
             return gain * x + namespace.asarray(table)[index]
 
         special = Specialised(function, Graph(), [np.zeros(8)])
-        return emit(special.program, special.lane_first, portable()), special.program.constants
+        return emit(special.program, special.lane_first, portable(), Block(8)), special.program.constants
 
     (one, values), (other, others) = text(0.3, [1.5, 2.5]), text(0.7, [3.5, np.nan])
     assert one == other
@@ -236,6 +237,6 @@ def test_places_of_what_crosses_cuts_are_used_again(monkeypatch):
         return x
 
     special = Specialised(function, Graph(), [np.zeros(8)])
-    text = emit(special.program, special.lane_first, portable())
+    text = emit(special.program, special.lane_first, portable(), Block(8))
     assert "@part39" in text
     assert "%scratch = alloca <8 x double>, i64 2," in text
