@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..envs.environment import TaskEnv, TaskVectorEnv
+from ..envs.engine.environment import TaskEnv, TaskVectorEnv
 from .gate import Gate
 from .residual import check_residual
 

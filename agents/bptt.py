@@ -26,14 +26,14 @@ import gymnasium
 import numpy
 import torch
 
-from ..envs.backend import host_array
-from ..envs.catalogue import nearest
-from ..envs.environment import TaskVectorEnv
-from ..envs.model import Model
-from ..envs.parameters import check_integer
-from ..envs.scenario_choice import find_mixture
+from ..envs.contract.model import Model
+from ..envs.contract.parameters import check_integer
+from ..envs.engine.catalogue import nearest
+from ..envs.engine.environment import TaskVectorEnv
+from ..envs.engine.scenario_choice import find_mixture
 from ..evaluation.competitors import Policy
 from ..evaluation.seeds import episode_seeds
+from ..filters.array_namespace import host_array
 from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, as_trained
 from .learned_estimator import EstimatorMaker

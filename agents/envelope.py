@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..baselines.alarm import Alarm
-from ..envs.backend import make_model
-from ..envs.catalogue import parameter_names
-from ..envs.model import Model
-from ..envs.parameters import freeze
-from ..envs.scenario_choice import find_mixture, make_task
-from ..envs.task import Task
+from ..envs.contract.model import Model
+from ..envs.contract.parameters import freeze
+from ..envs.contract.task import Task
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import parameter_names
+from ..envs.engine.scenario_choice import find_mixture, make_task
 from ..evaluation.competitors import Policy, make_competitor
 from ..evaluation.rollout import start_lanes
 from ..evaluation.seeds import episode_seeds

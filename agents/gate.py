@@ -21,10 +21,10 @@ import numpy
 
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem, problem_of
-from ..envs.failures import explain_errors
-from ..envs.model import Model
-from ..envs.observation import Array
-from ..envs.task import Task
+from ..envs.contract.failures import explain_errors
+from ..envs.contract.model import Model
+from ..envs.contract.observation import Array
+from ..envs.contract.task import Task
 from ..evaluation.competitors import (
     ConstantPolicy,
     Kind,

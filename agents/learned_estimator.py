@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy
 
 from ..compiler.functions import map_arrays
-from ..envs.filter import Input
-from ..envs.model import Model
-from ..envs.observation import Array
-from ..envs.task import Task
+from ..envs.contract.filter import Input
+from ..envs.contract.model import Model
+from ..envs.contract.observation import Array
+from ..envs.contract.task import Task
 from ..evaluation.competitors import Kind, Likelihood, Policy
 from ..evaluation.steered_filter import Steered, steer
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy
 
-from ..envs.catalogue import short_name, task_class
-from ..envs.model import Model
-from ..envs.task import Task
+from ..envs.contract.model import Model
+from ..envs.contract.task import Task
+from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from ..envs.task import Task
+from ..envs.contract.task import Task
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run

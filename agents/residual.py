@@ -11,8 +11,8 @@ import gymnasium
 import numpy
 
 from ..baselines.problem import Problem
-from ..envs.environment import TaskEnv
-from ..envs.model import Model
+from ..envs.contract.model import Model
+from ..envs.engine.environment import TaskEnv
 from ..evaluation.competitors import Policy, expose_spaces, kind_of, make_competitor, says_traceable
 
 

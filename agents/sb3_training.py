@@ -27,7 +27,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from ..envs.model import Model
+from ..envs.contract.model import Model
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .eager_optimiser import exclude_from_compilation, step_eagerly

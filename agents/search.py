@@ -28,7 +28,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from ..baselines.problem import Problem
-from ..envs.parameters import check_integer
+from ..envs.contract.parameters import check_integer
 from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merge_settings, read_section

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..envs.catalogue import nearest, parameter_names
-from ..envs.task import Task
+from ..envs.contract.task import Task
+from ..envs.engine.catalogue import nearest, parameter_names
 
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 """Numbers such as 1e-3, which YAML 1.1 takes for words."""

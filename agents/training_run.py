@@ -25,14 +25,21 @@ from typing import Any, NamedTuple, NotRequired, TypedDict
 import numpy
 
 from ..baselines.problem import Problem, problem_of
-from ..envs.backend import make_model
-from ..envs.catalogue import catalogue, import_task, importable_name, nearest, parameter_names, task_class
-from ..envs.environment import DTYPES
-from ..envs.model import Episode, Model
-from ..envs.parameters import check_integer
-from ..envs.reward import REWARDS
-from ..envs.scenario_choice import find_mixture, find_scenario
-from ..envs.task import Task
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.parameters import check_integer
+from ..envs.contract.task import Task
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import (
+    catalogue,
+    import_task,
+    importable_name,
+    nearest,
+    parameter_names,
+    task_class,
+)
+from ..envs.engine.environment import DTYPES
+from ..envs.engine.reward import REWARDS
+from ..envs.engine.scenario_choice import find_mixture, find_scenario
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.competitors import kind_of
 from ..evaluation.files import find_folder, settle_folder, whole_folder, writable_folder, write_text

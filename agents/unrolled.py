@@ -11,8 +11,8 @@ from typing import Any
 import numpy
 import torch
 
-from ..envs.environment import TaskVectorEnv
-from ..envs.rollout import Rollout
+from ..envs.engine.environment import TaskVectorEnv
+from ..envs.engine.rollout import Rollout
 from .gate import Gate
 
 LIMIT = 10.0

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from ..envs.recording import Recording
-from ..envs.scenario_choice import make_task
-from ..envs.task import Task
+from ..envs.contract.task import Task
+from ..envs.data.recording import Recording
+from ..envs.engine.scenario_choice import make_task
 from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
-from ..envs.model import Model
+from ..envs.contract.model import Model
 
 LARGER = 3.0
 """Factor on the variance of innovations that an alarm looks for; others are found too, some decisions later."""

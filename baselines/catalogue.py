@@ -9,8 +9,8 @@ import importlib.util
 from functools import cache
 from types import ModuleType
 
-from ..envs.catalogue import folders, nearest
-from ..envs.task import Task
+from ..envs.contract.task import Task
+from ..envs.engine.catalogue import folders, nearest
 from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
 

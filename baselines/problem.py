@@ -6,8 +6,8 @@ from importlib.resources import files
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from ..envs.catalogue import import_task, importable_name, nearest, short_name, task_class
-from ..envs.task import Task
+from ..envs.contract.task import Task
+from ..envs.engine.catalogue import import_task, importable_name, nearest, short_name, task_class
 from ..evaluation.evaluate import OPTIONS, Experiment, run_experiment
 from ..evaluation.parallel import Workers
 from ..evaluation.rollout import Progress

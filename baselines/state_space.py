@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.filter import Initial
-from ..envs.model import Model
-from ..envs.observation import Array
-from ..envs.state_space import Equations, Measurement, StateSpace, Truth
-from ..envs.state_space_banks import HypothesisBank, Mixture
+from ..envs.contract.filter import Initial
+from ..envs.contract.model import Model
+from ..envs.contract.observation import Array
+from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
+from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors import ConstantPolicy, Likelihood, Policy, RandomPolicy
 from ..filters import kalman, unscented
 from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain

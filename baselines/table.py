@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..envs.model import Model
+from ..envs.contract.model import Model
 from ..evaluation.competitors import ConstantPolicy, Policy
 from .alarm import Alarm
 
 if TYPE_CHECKING:
-    from ..envs.recording import Recording
+    from ..envs.data.recording import Recording
 
 if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
     from ..evaluation.own_metrics import OwnMetrics

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..envs.catalogue import nearest, short_name
+from ..envs.engine.catalogue import nearest, short_name
 from ..evaluation.competitors import Kind
 from ..evaluation.files import write_text
 from ..evaluation.stored import fits, read_json

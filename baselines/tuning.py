@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.backend import make_model
-from ..envs.catalogue import nearest, short_name
-from ..envs.model import Episode, Model
-from ..envs.scenario_choice import find_scenario, make_task
-from ..envs.task import Scenario
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.task import Scenario
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import nearest, short_name
+from ..envs.engine.scenario_choice import find_scenario, make_task
 from ..evaluation.competitors import kind_of
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress, run_competitor

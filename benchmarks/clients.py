@@ -380,7 +380,7 @@ def main() -> None:
     elif arguments.recipes:
         recipes()
     else:
-        from filtergym.envs.catalogue import catalogue
+        from filtergym.envs.engine.catalogue import catalogue
 
         table(arguments.client, arguments.environment or list(catalogue()))
 

@@ -23,8 +23,8 @@ from filtergym.agents.bptt import NetworkPolicy, descend_episodes
 from filtergym.agents.training_run import RunOptions, TrainingRun, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.environment import TaskVectorEnv
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.environment import TaskVectorEnv
 from rich.console import Console
 from rich.table import Table
 

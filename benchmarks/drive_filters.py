@@ -10,7 +10,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from filtergym.envs.recording import Recording
+from filtergym.envs.data.recording import Recording
 from filtergym.evaluation.metrics import Record
 from filtergym.papers.grid import markdown_table
 

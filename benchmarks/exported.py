@@ -26,9 +26,9 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.c_source import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
 from filtergym.compiler.native import native
-from filtergym.envs.backend import make_model
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.filter import Input
+from filtergym.envs.contract.filter import Input
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors import kind_of, make_competitor
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import rollout, start_lanes

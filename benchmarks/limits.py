@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy
 import xarray
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.metrics import mean_over_time
 from filtergym.evaluation.statistics import ALL, Statistic
 from filtergym.evaluation.summary import reduce_episodes

@@ -15,8 +15,8 @@ import numpy
 from filtergym.baselines.advice import fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.recording import Recording
-from filtergym.envs.scenario_choice import read_recording
+from filtergym.envs.data.recording import Recording
+from filtergym.envs.engine.scenario_choice import read_recording
 
 ID = "filtergym/ManeuveringTarget-v0"
 ACCELERATION, SIGMA, STATED, T = 0.8, 1.0, 0.5, 0.5

@@ -15,7 +15,7 @@ import numpy
 from filtergym.compiler.counter_code import bind_numbers
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.compiler.functions import empty_lanes
-from filtergym.envs.episode_noise import draw_identity, identities_of_seeds
+from filtergym.envs.engine.episode_noise import draw_identity, identities_of_seeds
 
 import filtergym  # noqa: F401  (registers the environments)
 

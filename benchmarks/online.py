@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy
-from filtergym.envs.recording import Recording
-from filtergym.envs.scenario_choice import read_recording
+from filtergym.envs.data.recording import Recording
+from filtergym.envs.engine.scenario_choice import read_recording
 from filtergym.papers.grid import markdown_table
 
 import filtergym

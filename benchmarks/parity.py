@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 import filtergym
 

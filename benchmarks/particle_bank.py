@@ -21,11 +21,11 @@ from typing import Any
 import numpy
 from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
-from filtergym.envs.backend import make_model
-from filtergym.envs.draws import Draws
+from filtergym.envs.contract.draws import Draws
+from filtergym.envs.contract.schedules import Steps, within
+from filtergym.envs.engine.backend import make_model
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.envs.loosely_coupled_navigation.world import Truth
-from filtergym.envs.schedules import Steps, within
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import receiver_faults

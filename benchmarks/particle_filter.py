@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import coordinated_turn

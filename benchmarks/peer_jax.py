@@ -12,11 +12,11 @@ os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_paralleli
 
 import numpy
 from filtergym.compiler.functions import map_arrays
-from filtergym.envs.catalogue import import_task
-from filtergym.envs.compiled import step_episodes
-from filtergym.envs.lanes import Lanes
-from filtergym.envs.model import Model
-from filtergym.envs.scenario_choice import make_task
+from filtergym.envs.contract.model import Model
+from filtergym.envs.engine.catalogue import import_task
+from filtergym.envs.engine.compiled import step_episodes
+from filtergym.envs.engine.lanes import Lanes
+from filtergym.envs.engine.scenario_choice import make_task
 
 
 def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[], None]:

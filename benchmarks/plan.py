@@ -47,8 +47,8 @@ from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Sessio
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
-from filtergym.envs.catalogue import catalogue, short_name
-from filtergym.envs.scenario_choice import make_task
+from filtergym.envs.engine.catalogue import catalogue, short_name
+from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.files import write_text

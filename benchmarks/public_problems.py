@@ -30,8 +30,8 @@ from filtergym.baselines.state_space import Extended
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuned_values import make_tuned_policy
 from filtergym.baselines.tuning import Search, tune
-from filtergym.envs.catalogue import short_name
-from filtergym.envs.recording import Recording
+from filtergym.envs.data.recording import Recording
+from filtergym.envs.engine.catalogue import short_name
 from filtergym.evaluation.bootstrap import Bootstrap
 
 import filtergym

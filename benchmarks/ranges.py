@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import gymnasium
 import numpy
-from filtergym.envs.catalogue import task_class
+from filtergym.envs.engine.catalogue import task_class
 
 PARALLEL = 100
 

@@ -46,9 +46,9 @@ import peer_imm
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.program import FUNCTIONS, Graph
-from filtergym.envs.backend import make_model
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.reward import cost_reward
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.reward import cost_reward
 
 import filtergym
 

@@ -1,5 +1,6 @@
-"""Tasks, their scenarios, and the Gymnasium classes over them.
+"""Tasks, their scenarios, and the Gymnasium classes over them, in rooms.
 
-The contract stands in :mod:`.task`, :mod:`.world` and :mod:`.filter`. A new environment is a folder of its own beside
-them, found by its name; nothing else in this folder changes.
+A room knows only those before it: ``contract`` (what an author declares), ``data`` (what comes from outside),
+``drawing``, ``engine`` (what runs a task), ``linear`` (models of one's own); then the five problems, each a folder of
+its own, found by the ``ID`` that it says. A new environment adds a folder and changes nothing else here.
 """

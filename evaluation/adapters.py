@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy
 
-from ..envs.task import Array, Task
+from ..envs.contract.task import Array, Task
 from .competitors import Kind
 from .filters import select_lanes
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy
 from PIL import Image
 
-from ..envs.backend import make_model
-from ..envs.environment import TaskEnv
-from ..envs.episode_noise import uniforms_of_seeds
-from ..envs.model import Episode, Model
-from ..envs.parameters import check_integer
-from ..envs.scenario_choice import find_scenario
-from ..envs.task import Task
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.parameters import check_integer
+from ..envs.contract.task import Task
+from ..envs.engine.backend import make_model
+from ..envs.engine.environment import TaskEnv
+from ..envs.engine.episode_noise import uniforms_of_seeds
+from ..envs.engine.scenario_choice import find_scenario
 from .competitors import kind_of, make_competitor
 from .evaluate import control_of
 from .files import whole_file
@@ -94,8 +94,8 @@ def _estimate_frames(
 ) -> list[Image.Image]:
     """Draw the estimates of a filter of its own, which is shown no observation and takes no action."""
     # They bring matplotlib.
-    from ..envs.estimate_picture import EstimatePicture
-    from ..envs.rendering import EpisodePicture
+    from ..envs.drawing.estimate_picture import EstimatePicture
+    from ..envs.drawing.rendering import EpisodePicture
 
     kind, chosen = kind_of(estimator), find_scenario(task, scenario, keywords)
     model = make_model(task, task.controls[0], scenario, **keywords)
@@ -132,7 +132,7 @@ def _palette() -> Image.Image:
     from matplotlib.colors import to_rgb
 
     # Imported here for the same reason as in the environment.
-    from ..envs import rendering
+    from ..envs.drawing import rendering
 
     white = numpy.ones(3)
     share = numpy.arange(SHADES)[:, None] / SHADES

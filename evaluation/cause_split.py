@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
 
-from ..envs.causes import RESERVED
+from ..envs.contract.causes import RESERVED
 from .bootstrap import Bootstrap, Estimate, ratio
 
 if TYPE_CHECKING:

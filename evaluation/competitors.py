@@ -18,9 +18,9 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy
 
-from ..envs.backend import host_array
-from ..envs.model import Model
-from ..envs.task import Array, Task
+from ..envs.contract.model import Model
+from ..envs.contract.task import Array, Task
+from ..filters.array_namespace import host_array
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
@@ -302,8 +302,8 @@ class Estimator(Protocol):
         """Memory at the start of the track.
 
         Args:
-            initial: the initial estimate given to every filter: :class:`~filtergym.envs.filter.Initial` or a NamedTuple
-                with its fields, ``mean`` ``(C, N)`` and ``covariance`` ``(C, C, N)``.
+            initial: the initial estimate given to every filter: :class:`~filtergym.envs.contract.filter.Initial` or a
+                NamedTuple with its fields, ``mean`` ``(C, N)`` and ``covariance`` ``(C, C, N)``.
             N: number of episodes.
         """
 

@@ -12,16 +12,16 @@ import cloudpickle
 import gymnasium
 import numpy
 
-from ..envs.backend import make_model
-from ..envs.catalogue import importable_name, nearest, task_class
-from ..envs.compiled import Report
-from ..envs.episode_noise import uniforms_of_seeds
-from ..envs.model import Episode, Model
-from ..envs.parameters import check_integer
-from ..envs.recording import Recording
-from ..envs.reward import charge
-from ..envs.scenario_choice import find_scenario, make_task, read_files
-from ..envs.task import Scenario, Task
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.parameters import check_integer
+from ..envs.contract.task import Scenario, Task
+from ..envs.data.recording import Recording
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import importable_name, nearest, task_class
+from ..envs.engine.compiled import Report
+from ..envs.engine.episode_noise import uniforms_of_seeds
+from ..envs.engine.reward import charge
+from ..envs.engine.scenario_choice import find_scenario, make_task, read_files
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .cause_split import VARIABLE, cause_coords

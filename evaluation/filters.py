@@ -13,12 +13,12 @@ import numpy
 
 from ..compiler.functions import map_arrays
 from ..compiler.namespace import NotTraceable
-from ..envs.compiled import warn_of
-from ..envs.failures import explain_errors
-from ..envs.filter import Filter, Input
-from ..envs.model import Model
-from ..envs.observation import Array
-from ..envs.task import Task, named_arrays
+from ..envs.contract.failures import explain_errors
+from ..envs.contract.filter import Filter, Input
+from ..envs.contract.model import Model
+from ..envs.contract.observation import Array
+from ..envs.contract.task import Task, named_arrays
+from ..envs.engine.compiled import warn_of
 from ..filters.small_matrices import cholesky
 from .competitors import Kind, Likelihood, check_competitor, compilation_key, make_competitor
 from .dataset import FAULTS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..envs.task import Task
+from ..envs.contract.task import Task
 
 if TYPE_CHECKING:
     import xarray

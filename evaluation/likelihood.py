@@ -16,10 +16,10 @@ from ..compiler import namespace
 from ..compiler.functions import Function, empty_lanes, leaves, map_arrays, round_up_lanes
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
-from ..envs.compiled import AVAILABLE, warn_of
-from ..envs.observation import Array
-from ..envs.recording import Recording, fill_arrays, measure_once
-from ..envs.task import Task
+from ..envs.contract.observation import Array
+from ..envs.contract.task import Task
+from ..envs.data.recording import Recording, fill_arrays, measure_once
+from ..envs.engine.compiled import AVAILABLE, warn_of
 from .competitors import Likelihood
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy
 
 from ..compiler.functions import map_arrays, round_up_lanes
-from ..envs.compiled import filter_stepper
-from ..envs.model import Episode, Model
-from ..envs.parameters import check_integer
-from ..envs.recording import measure_examples
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.parameters import check_integer
+from ..envs.data.recording import measure_examples
+from ..envs.engine.compiled import filter_stepper
 from ..filters.array_namespace import select_nested
 from .competitors import Kind, check_competitor, make_competitor
 from .dataset import FAULTS

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Self
 
 import cloudpickle
 
-from ..envs.catalogue import FOUND_IN, on_path
+from ..envs.engine.catalogue import FOUND_IN, on_path
 from .rollout import Progress
 from .threads import one_thread
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from ..envs.task import Task
+from ..envs.contract.task import Task
 from .bootstrap import Bootstrap, Estimate, ratio
 
 if TYPE_CHECKING:

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy
 
-from ..envs.backend import make_model
-from ..envs.episode_noise import uniforms_of_seeds
-from ..envs.filter import Filter, Initial, Input
-from ..envs.model import Episode, Model
-from ..envs.recording import MOST_NUMBERS, Recording, measure_once
-from ..envs.recording_files import differing
-from ..envs.scenario_choice import find_scenario, make_task, read_files
-from ..envs.task import Task, named_arrays
+from ..envs.contract.filter import Filter, Initial, Input
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.task import Task, named_arrays
+from ..envs.data.recording import MOST_NUMBERS, Recording, measure_once
+from ..envs.data.recording_files import differing
+from ..envs.engine.backend import make_model
+from ..envs.engine.episode_noise import uniforms_of_seeds
+from ..envs.engine.scenario_choice import find_scenario, make_task, read_files
 from .evaluate import Experiment
 from .rollout import Progress, start_lanes
 from .seeds import episode_seeds

@@ -9,12 +9,12 @@ import gymnasium
 import numpy
 
 from ..compiler.functions import Specialised, round_up_lanes
-from ..envs.compiled import CompiledModel, Report, can_step
-from ..envs.environment import check_action
-from ..envs.episode_noise import identities_of_seeds, uniforms_of_seeds
-from ..envs.lanes import Lanes, whole_episode
-from ..envs.model import Episode, Model
-from ..envs.observation import Array
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.observation import Array
+from ..envs.engine.compiled import CompiledModel, Report, can_step
+from ..envs.engine.environment import check_action
+from ..envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
+from ..envs.engine.lanes import Lanes, whole_episode
 from .competitors import Kind, check_competitor, compilation_key, kind_of, make_competitor
 from .filters import put_in_loop
 from .smoothers import SmoothedTrack, check_open_loop, run_forward

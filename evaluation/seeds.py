@@ -2,8 +2,8 @@
 
 import numpy
 
-from ..envs.catalogue import nearest
-from ..envs.parameters import check_integer
+from ..envs.contract.parameters import check_integer
+from ..envs.engine.catalogue import nearest
 
 SPLITS = {"train": 0, "validation": 1, "test": 2}
 

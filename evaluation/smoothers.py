@@ -6,12 +6,12 @@ from typing import Any
 import numpy
 
 from ..compiler.functions import map_arrays
-from ..envs.compiled import can_step
-from ..envs.failures import explain_errors
-from ..envs.filter import Initial
-from ..envs.lanes import Lanes, whole_episode
-from ..envs.model import Episode, Model
-from ..envs.observation import Array
+from ..envs.contract.failures import explain_errors
+from ..envs.contract.filter import Initial
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.observation import Array
+from ..envs.engine.compiled import can_step
+from ..envs.engine.lanes import Lanes, whole_episode
 
 
 class SmoothedTrack:

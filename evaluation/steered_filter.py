@@ -14,10 +14,10 @@ from ..compiler.block import LANES
 from ..compiler.functions import Function, Specialised, leaves, map_arrays
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
-from ..envs.compiled import CompiledModel, warn_of
-from ..envs.filter import Filter, Input
-from ..envs.model import Episode, Model
-from ..envs.observation import Array
+from ..envs.contract.filter import Filter, Input
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.observation import Array
+from ..envs.engine.compiled import CompiledModel, warn_of
 from .competitors import Policy, says_traceable
 
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler.functions import map_arrays, round_up_lanes
-from ..envs.environment import check_action
-from ..envs.model import Model
+from ..envs.contract.model import Model
+from ..envs.engine.environment import check_action
 from .competitors import Policy
 from .steered_filter import compile_policy, trace_decision
 

@@ -9,7 +9,7 @@ from stonesoup.types.detection import Detection
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 
-from ..envs.task import Array
+from ..envs.contract.task import Array
 from .adapters import SingleTrackEstimator
 
 START = datetime(2000, 1, 1)

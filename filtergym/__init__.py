@@ -7,15 +7,15 @@ Without an import of one's own: ``gymnasium.make("filtergym:filtergym/Maneuverin
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from .envs.catalogue import register
+from .envs.engine.catalogue import register
 
 if TYPE_CHECKING:
     from .baselines.table import Baselines
-    from .envs.flights import Flights, read_flights
-    from .envs.recording import Recording
-    from .envs.scenario_choice import read_recording
-    from .envs.task import Task
-    from .envs.trajectory import Trajectory
+    from .envs.contract.task import Task
+    from .envs.data.flights import Flights, read_flights
+    from .envs.data.recording import Recording
+    from .envs.data.trajectory import Trajectory
+    from .envs.engine.scenario_choice import read_recording
     from .evaluation.competitors import FunctionPolicy, Likelihood
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
@@ -40,10 +40,10 @@ __all__ = [
     "tidy_records",
 ]
 MODULES = {
-    "envs.flights": ("Flights", "read_flights"),
-    "envs.recording": ("Recording",),
-    "envs.scenario_choice": ("read_recording",),
-    "envs.trajectory": ("Trajectory",),
+    "envs.data.flights": ("Flights", "read_flights"),
+    "envs.data.recording": ("Recording",),
+    "envs.engine.scenario_choice": ("read_recording",),
+    "envs.data.trajectory": ("Trajectory",),
     "evaluation.competitors": ("FunctionPolicy", "Likelihood"),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),
@@ -63,7 +63,7 @@ def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> N
     by itself.
 
     Args:
-        task: class that keeps the contract of :class:`filtergym.envs.task.Task`.
+        task: class that keeps the contract of :class:`filtergym.envs.contract.task.Task`.
         baselines: what it is compared with; without them random actions are its only policy, and there is no
             score.
 
@@ -72,7 +72,7 @@ def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> N
             taken, or the table does not fit it.
     """
     from .baselines.catalogue import add_baselines
-    from .envs.registration import add_task
+    from .envs.engine.registration import add_task
 
     add_task(task)
     if baselines is not None:

@@ -24,8 +24,8 @@ from rich.console import Console
 from . import __version__
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
-from .envs.catalogue import modules_from
-from .envs.failures import own_line
+from .envs.contract.failures import own_line
+from .envs.engine.catalogue import modules_from
 
 Commands = Mapping[str, Callable[..., None] | str]
 """Functions by the names of their commands; or ``module:function`` of what is imported when it is called."""

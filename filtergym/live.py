@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
-from .envs.backend import make_model
-from .envs.live_input import Feed
-from .envs.scenario_choice import find_scenario
+from .envs.contract.live_input import Feed
+from .envs.engine.backend import make_model
+from .envs.engine.scenario_choice import find_scenario
 from .evaluation.competitors import kind_of, make_competitor
 from .evaluation.evaluate import control_of
 from .evaluation.online import OnlineFilter

@@ -11,11 +11,11 @@ from .agents.gate import GatedMaker
 from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
 from .baselines.fitted_filters import SUFFIX, read_fitted
 from .baselines.problem import Problem, import_problem, problem_of
-from .envs.backend import make_model
-from .envs.catalogue import import_task, import_user_module, nearest
-from .envs.environment import TaskEnv, TaskVectorEnv
-from .envs.model import Model
-from .envs.recording import Recording
+from .envs.contract.model import Model
+from .envs.data.recording import Recording
+from .envs.engine.backend import make_model
+from .envs.engine.catalogue import import_task, import_user_module, nearest
+from .envs.engine.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, make_competitor
 from .evaluation.evaluate import Experiment, check_observation, control_of

@@ -20,8 +20,8 @@ import numpy
 from . import __version__
 from .agents.training_run import training_scenarios
 from .baselines.problem import Problem, import_problem
-from .envs.catalogue import check_names
-from .envs.scenario_choice import find_scenario
+from .envs.engine.catalogue import check_names
+from .envs.engine.scenario_choice import find_scenario
 from .evaluation.evaluate import Experiment
 from .evaluation.files import whole_files
 from .evaluation.rollout import Progress

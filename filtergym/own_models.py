@@ -11,9 +11,9 @@ from . import register_task
 from .baselines.state_space import state_space_baselines
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
-from .envs.catalogue import nearest
-from .envs.model import Model
-from .envs.state_space import (
+from .envs.contract.model import Model
+from .envs.engine.catalogue import nearest
+from .envs.linear.state_space import (
     StateSpace,
     StateSpaceDefinition,
     StateSpaceModel,
@@ -69,8 +69,8 @@ def state_space(
             Filters then are interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
         switching: whether the world switches; otherwise only the filters take it for possible.
-        **parameters: of :class:`filtergym.envs.state_space.StateSpaceParameters` in the training distribution, such as
-            ``horizon`` and ``process_noise``.
+        **parameters: of :class:`filtergym.envs.linear.state_space.StateSpaceParameters` in the training distribution,
+            such as ``horizon`` and ``process_noise``.
 
     Returns:
         The class of the task.

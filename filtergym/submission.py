@@ -28,9 +28,9 @@ from .agents.learned_policy import load_policy, pretrained_path
 from .agents.named_policies import pretrained_agents
 from .agents.training_run import best_agent, training_scenarios
 from .baselines.problem import Problem, problem_of
-from .envs.catalogue import import_user_module, nearest
-from .envs.failures import own_line
-from .envs.scenario_choice import find_mixture
+from .envs.contract.failures import own_line
+from .envs.engine.catalogue import import_user_module, nearest
+from .envs.engine.scenario_choice import find_mixture
 from .evaluation.competitors import RANKED, check_competitor, kind_of
 from .evaluation.files import whole_file
 from .evaluation.parallel import Workers

@@ -1,4 +1,4 @@
-"""The array library that an array belongs to: NumPy or torch, through the array API standard."""
+"""The array library that an array belongs to, NumPy or torch through the array API standard, and ways between them."""
 
 from types import ModuleType
 from typing import Any
@@ -58,3 +58,20 @@ def select_nested(which: Array, one: Any, other: Any) -> Any:
         parts = [select_nested(which, a, b) for a, b in zip(one, other, strict=True)]
         return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
     return namespace(which).where(which, one, other)
+
+
+def is_tensor(values: Any) -> bool:
+    """Whether this is a torch tensor; does not import torch."""
+    return type(values).__module__.partition(".")[0] == "torch"
+
+
+def host_array(values: Any) -> numpy.ndarray:
+    """Return an array or tensor of any device as a NumPy array, without its gradient."""
+    return values.detach().cpu().numpy() if is_tensor(values) else numpy.asarray(values)
+
+
+def tensor_on(values: Any, device: Any) -> Array:
+    """Return a tensor on ``device``: a tensor keeps its gradient and precision, anything else is copied."""
+    import torch
+
+    return values.to(device) if is_tensor(values) else torch.tensor(values, device=device)

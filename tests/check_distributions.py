@@ -11,7 +11,7 @@ import gymnasium
 import numpy
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 import filtergym
 

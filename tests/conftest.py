@@ -14,8 +14,8 @@ import gymnasium as gym
 import hypothesis
 import numpy as np
 import pytest
-from filtergym.envs import compiled
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine import compiled
+from filtergym.envs.engine.catalogue import catalogue
 from models import short_episodes
 
 from filtergym.__main__ import main

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from filtergym.envs import backend
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.model import Model
+from filtergym.envs.contract.model import Model
+from filtergym.envs.engine import backend
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 
@@ -14,7 +14,7 @@ DECISIONS = 5
 
 
 def make_model(id: str, control: str | None = None, scenario: Any = None, **keywords: Any) -> Model:
-    """Make a model as :func:`filtergym.envs.backend.make_model` does."""
+    """Make a model as :func:`filtergym.envs.engine.backend.make_model` does."""
     return backend.make_model(task_class(id), control, scenario, **keywords)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import KalmanModel
-from filtergym.envs.filter import Initial
+from filtergym.envs.contract.filter import Initial
 from filtergym.evaluation.rollout import rollout
 from filtergym.filters import kalman
 from models import make_model

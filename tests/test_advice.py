@@ -15,8 +15,8 @@ from filtergym.baselines.fitting import fit, profile_parameters, with_noise_scal
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.scenario_choice import make_task, read_recording
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation import likelihood as likelihood_module
 from filtergym.evaluation.bootstrap import Estimate
 from filtergym.evaluation.likelihood import Span, WindowLikelihood, cut_windows

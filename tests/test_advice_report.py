@@ -15,7 +15,7 @@ from filtergym.baselines import advice as advice_module
 from filtergym.baselines.advice import advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.scenario_choice import make_task, read_recording
+from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.metrics import chi_square_band
 
 from filtergym.__main__ import main

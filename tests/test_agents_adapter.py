@@ -5,7 +5,7 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 
 pytest.importorskip("stable_baselines3")
 from filtergym.agents import to_sb3

@@ -11,10 +11,10 @@ from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, task_class
-from filtergym.envs.model import Model
-from filtergym.envs.observation import Block
-from filtergym.envs.task import named_arrays
+from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.observation import Block
+from filtergym.envs.contract.task import named_arrays
+from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.evaluation.competitors import ConstantPolicy, FunctionPolicy, kind_of
 from filtergym.evaluation.rollout import run_competitor
 from models import make_model

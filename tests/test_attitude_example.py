@@ -11,8 +11,8 @@ import pytest
 import scipy.io
 import scipy.signal
 from filtergym.baselines import catalogue as baselines
-from filtergym.envs import registration
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine import registration
+from filtergym.envs.engine.backend import make_model
 from gymnasium.utils.env_checker import check_env
 from records import markdown_tables, read_record
 from scipy.linalg import expm

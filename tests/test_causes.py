@@ -6,8 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
+from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.cause_split import held_causes, opponent_of, phrases_of, reason_weight
 from filtergym.evaluation.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 yaml = pytest.importorskip("yaml")
 CITATION = yaml.safe_load((Path(__file__).parent.parent / "CITATION.cff").read_text(encoding="utf-8"))

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import commands
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Search, tune
-from filtergym.envs import compiled as compiled_tasks
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.compiled import CompiledModel
-from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.engine import compiled as compiled_tasks
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.compiled import CompiledModel
+from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
 from filtergym.evaluation.recording import NoFilter
@@ -196,7 +196,7 @@ def test_backends_by_name(monkeypatch):
     with pytest.raises(ValueError, match="threads must be an integer of at least 1"):
         gym.make_vec("filtergym/UavAutopilot-v0", num_envs=2, threads=0)
     # Without llvmlite.
-    monkeypatch.setattr("filtergym.envs.backend.AVAILABLE", False)
+    monkeypatch.setattr("filtergym.envs.engine.backend.AVAILABLE", False)
     monkeypatch.setattr(compiled_tasks, "AVAILABLE", False)
     assert gym.make("filtergym/UavAutopilot-v0").unwrapped.backend == "numpy"
     with pytest.raises(ImportError, match=r"pip install 'filtergym\[fast\]'"):

@@ -7,7 +7,7 @@ import sys
 import pytest
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 from filtergym.__main__ import main
 

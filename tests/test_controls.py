@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from filtergym.envs.controls import bank_probabilities
+from filtergym.envs.contract.controls import bank_probabilities
 
 LOG_PREDICTED = np.log([[0.2, 0.5], [0.8, 0.5]])
 LOG_LIKELIHOOD = np.array([[-1.0, -2.0], [-3.0, 0.5]])

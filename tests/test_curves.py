@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import xarray
-from filtergym.envs.catalogue import task_class
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.curves import curves_of
 from filtergym.evaluation.dataset import windows_of

@@ -14,8 +14,8 @@ from filtergym.baselines.fitted_filters import families_of, read_fitted, write_f
 from filtergym.baselines.maneuvering_target.anchored import DeadReckoning, regress_odometry
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.recording import Recording, join_recordings
-from filtergym.envs.scenario_choice import make_task
+from filtergym.envs.data.recording import Recording, join_recordings
+from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.likelihood import Span, cut_windows
 from filtergym.filters import dead_reckoning
 

@@ -14,7 +14,7 @@ import pytest
 from environment_page import TABLES, environment_tables
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, parameter_names
+from filtergym.envs.engine.catalogue import catalogue, parameter_names
 from models import make_model
 from records import FOLDER, read_record, short_name
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.draws import Draws
+from filtergym.envs.contract.draws import Draws
 
 RUNS = 20000
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
-from filtergym.envs import strapdown
+from filtergym.envs.data import strapdown
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.filters import loosely_coupled as ins_gnss
 from models import make_model

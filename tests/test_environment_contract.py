@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue, register
-from filtergym.envs.environment import TaskEnv, TaskVectorEnv
-from filtergym.envs.model import Episode
+from filtergym.envs.contract.model import Episode
+from filtergym.envs.engine.catalogue import catalogue, register
+from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 from filtergym.evaluation.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 from models import make_model

@@ -3,8 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, task_class
-from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.engine.catalogue import catalogue, task_class
+from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 from filtergym.evaluation.seeds import episode_seeds
 from models import make_model
 

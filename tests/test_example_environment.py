@@ -11,7 +11,7 @@ import pytest
 from environment_page import environment_tables
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
-from filtergym.envs import registration
+from filtergym.envs.engine import registration
 from gymnasium.utils.env_checker import check_env
 from models import make_model
 

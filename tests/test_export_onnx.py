@@ -6,7 +6,7 @@ import pytest
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, pretrained_path
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import import_problem
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine.backend import make_model
 
 from filtergym.exports.onnx_network import export_onnx, network_graph
 from filtergym.exports.request import request_export

@@ -9,7 +9,7 @@ import numpy
 import pytest
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import import_problem
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import rollout, start_lanes

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.filter import Initial
+from filtergym.envs.contract.filter import Initial
 from filtergym.filters import kalman
 
 from filtergym.exports import c_source

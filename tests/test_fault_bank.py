@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.table import Variant
-from filtergym.envs.filter import Initial
+from filtergym.envs.contract.filter import Initial
 from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.evaluation.filters import put_in_loop

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors import Likelihood
 from filtergym.evaluation.dataset import FAULTS
 from filtergym.evaluation.filters import find_fault, is_lacking, put_in_loop

@@ -13,9 +13,9 @@ import numpy as np
 import pymap3d
 import pytest
 import xarray
-from filtergym.envs import flight_tables
-from filtergym.envs.flight_cleaning import fit_parabolas
-from filtergym.envs.flights import read_flights
+from filtergym.envs.data import flight_tables
+from filtergym.envs.data.flight_cleaning import fit_parabolas
+from filtergym.envs.data.flights import read_flights
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import flight_records
 from filtergym.filters.geodesy import east_north

@@ -16,7 +16,7 @@ from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.envs import registration
+from filtergym.envs.engine import registration
 from filtergym.evaluation.competitors import ConstantPolicy, Policy
 from models import make_model
 from scipy.stats import norm
@@ -511,7 +511,7 @@ def test_gradient_through_the_gate_is_that_of_torch():
     pytest.importorskip("llvmlite")
     from filtergym.agents.bptt import NetworkPolicy, descend_episodes
     from filtergym.agents.unrolled import Unrolled
-    from filtergym.envs.environment import TaskVectorEnv
+    from filtergym.envs.engine.environment import TaskVectorEnv
 
     keywords = {"control": "gain", "horizon": 12, "reward": "cost", "autoreset_mode": "Disabled"}
     envs = [TaskVectorEnv(ID, 6, backend=backend, **keywords) for backend in ("torch", "compiled")]

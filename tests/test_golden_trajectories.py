@@ -17,7 +17,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from models import make_model
 from rounding import REPETITIONS, assert_near, move_roundings, moved_parameters, tolerance
 

@@ -5,8 +5,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs import backend
-from filtergym.envs.environment import TaskVectorEnv
+from filtergym.envs.engine import backend
+from filtergym.envs.engine.environment import TaskVectorEnv
 
 pytest.importorskip("torch")
 pytest.importorskip("llvmlite")

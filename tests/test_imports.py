@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import folders
+from filtergym.envs.engine.catalogue import folders
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
@@ -23,16 +23,27 @@ ROOMS = (
     "docs/make",
 )
 """The last two are not installed, so nothing in the package may import them."""
+INNER_ROOMS = {"envs": ("contract", "data", "drawing", "engine", "linear", *folders().values())}
+"""Rooms inside a room, in the same order; the environments come last and know nothing of each other."""
 FILES = [path.relative_to(ROOT) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
 PAPERS = {path.stem for path in (ROOT / "papers").iterdir()}
 """``filtergym.papers`` itself, which finds them, is part of the front room."""
 PAGES = {path.stem for path in (ROOT / "docs" / "make").glob("*.py")}
 
 
-def imported_rooms(file: Path) -> Iterator[str]:
-    """Names of the rooms that a file imports anything from; the package itself is the front room."""
+def imported_modules(file: Path, types: bool = True) -> Iterator[list[str]]:
+    """Everything that a file imports, part by part; what only type checkers import where ``types``."""
     package = ["filtergym", *(part for part in file.parent.parts if part != "filtergym")]
-    for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    for_types = {
+        inside
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for inside in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if node in for_types and not types:
+            continue
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) + 1 - node.level] if node.level else []
             module = [*base, *(node.module or "").split(".")] if node.module else base
@@ -41,12 +52,17 @@ def imported_rooms(file: Path) -> Iterator[str]:
             names = [alias.name.split(".") for alias in node.names]
         else:
             continue
-        for first, *rest in names:
-            if first in PAGES:
-                yield "docs/make"
-            elif first == "filtergym":
-                room = rest[0] if rest else ""
-                yield room if room in ROOMS and (room != "papers" or PAPERS & {*rest[1:]}) else "filtergym"
+        yield from names
+
+
+def imported_rooms(file: Path) -> Iterator[str]:
+    """Names of the rooms that a file imports anything from; the package itself is the front room."""
+    for first, *rest in imported_modules(file):
+        if first in PAGES:
+            yield "docs/make"
+        elif first == "filtergym":
+            room = rest[0] if rest else ""
+            yield room if room in ROOMS and (room != "papers" or PAPERS & {*rest[1:]}) else "filtergym"
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -60,6 +76,32 @@ def test_a_room_knows_only_those_before_it(room: str) -> None:
         if other not in allowed
     }
     assert not wrong
+
+
+@pytest.mark.parametrize("room", INNER_ROOMS)
+def test_an_inner_room_knows_only_those_before_it(room: str) -> None:
+    inner, environments = INNER_ROOMS[room], folders().values()
+    wrong = {
+        f"{file} imports {'.'.join(module)}"
+        for file in FILES
+        if file.parts[0] == room and len(file.parts) > 2
+        for module in imported_modules(file, types=False)
+        if module[:2] == ["filtergym", room] and len(module) > 2
+        if module[2] != file.parts[1]
+        and (module[2] in environments or inner.index(module[2]) > inner.index(file.parts[1]))
+    }
+    assert not wrong
+
+
+@pytest.mark.parametrize("room", INNER_ROOMS)
+def test_every_inner_room_is_small_and_says_what_it_is(room: str) -> None:
+    assert {path.name for path in (ROOT / room).iterdir() if path.suffix == ".py"} == {"__init__.py"}
+    for inner in INNER_ROOMS[room]:
+        files = {path.name for path in (ROOT / room / inner).glob("*.py")}
+        assert len(files) <= 16 or inner in folders().values(), (
+            f"{room}/{inner} holds more files than one looks through"
+        )
+        assert ast.get_docstring(ast.parse((ROOT / room / inner / "__init__.py").read_text(encoding="utf-8")))
 
 
 def test_the_check_sees_every_kind_of_import() -> None:

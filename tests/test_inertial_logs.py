@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
-from filtergym.envs import strapdown
+from filtergym.envs.data import strapdown
+from filtergym.envs.data.recording import Recording
 from filtergym.envs.loosely_coupled_navigation.inertial import (
     ACCELERATIONS,
     RATES,
@@ -16,7 +17,6 @@ from filtergym.envs.loosely_coupled_navigation.inertial import (
     measurements_beside,
     regular_times,
 )
-from filtergym.envs.recording import Recording
 from filtergym.filters import geodesy
 
 from filtergym import evaluate, read_recording

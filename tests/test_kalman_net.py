@@ -8,10 +8,10 @@ import scipy.stats
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, write_arrays
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.draws import Draws
+from filtergym.envs.contract.draws import Draws
+from filtergym.envs.contract.model import Episode
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.maneuvering_target import kalman_net as radar
-from filtergym.envs.model import Episode
 from filtergym.envs.radar_esm_tracking import kalman_net as fusion
 from filtergym.envs.tightly_coupled_navigation import kalman_net as satellites
 from filtergym.envs.uav_autopilot import kalman_net as aircraft

@@ -7,13 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.compiler.counter_numbers import numbers
-from filtergym.envs import episode_noise
-from filtergym.envs.compiled import share_world
-from filtergym.envs.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
-from filtergym.envs.lanes import Lanes
-from filtergym.envs.model import Model
-from filtergym.envs.reward import OWN_PAY, reference
-from filtergym.envs.task import Task
+from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.task import Task
+from filtergym.envs.engine import episode_noise
+from filtergym.envs.engine.compiled import share_world
+from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
+from filtergym.envs.engine.lanes import Lanes
+from filtergym.envs.engine.reward import OWN_PAY, reference
 from filtergym.evaluation.rollout import start_lanes
 from models import make_model
 

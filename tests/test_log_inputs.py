@@ -7,9 +7,9 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.flight_tables import seconds
-from filtergym.envs.scenario_choice import make_task
+from filtergym.envs.data.flight_tables import seconds
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.estimates import write_estimates
 
 from filtergym import evaluate, read_recording, tidy_records

@@ -19,9 +19,9 @@ from filtergym.baselines.loosely_coupled_navigation.metrics import (
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
-from filtergym.envs.catalogue import task_class
+from filtergym.envs.contract.schedules import within
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.loosely_coupled_navigation.fault_bank import VAGUE
-from filtergym.envs.schedules import within
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled, receiver_faults

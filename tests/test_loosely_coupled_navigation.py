@@ -6,10 +6,10 @@ from collections import deque
 import numpy as np
 import pytest
 from filtergym.baselines.loosely_coupled_navigation.policies import FixedGain
-from filtergym.envs.draws import Draws
+from filtergym.envs.contract.draws import Draws
+from filtergym.envs.contract.model import Model
 from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
 from filtergym.envs.loosely_coupled_navigation.task import TASK
-from filtergym.envs.model import Model
 from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
 from models import make_model
 

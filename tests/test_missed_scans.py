@@ -8,9 +8,9 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.policies import AdaptiveGain, InteractingMultipleModel
 from filtergym.baselines.maneuvering_target.references import KnownInputBound
-from filtergym.envs.backend import host_array
 from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
+from filtergym.filters.array_namespace import host_array
 from models import make_model
 from naive import episode_numbers
 from scipy.stats import multivariate_normal

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation import rollout as rollouts
 from filtergym.evaluation.competitors import Policy, kind_of
 from filtergym.evaluation.evaluate import _limits, _measurement_and_track, control_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.task import named_arrays
+from filtergym.envs.contract.task import named_arrays
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.rollout import rollout
 from models import make_model

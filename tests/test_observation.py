@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from filtergym.envs.observation import (
+from filtergym.envs.contract.observation import (
     BOUNDED_LOG,
     KEPT_AS_LOG1P,
     LOG1P,

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.envs.backend import make_model
-from filtergym.envs.live_input import LiveInput
-from filtergym.envs.scenario_choice import read_recording
-from filtergym.envs.task import named_arrays
+from filtergym.envs.contract.live_input import LiveInput
+from filtergym.envs.contract.task import named_arrays
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.scenario_choice import read_recording
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import run_competitor, start_lanes

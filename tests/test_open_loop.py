@@ -8,8 +8,8 @@ import sys
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.lanes import Lanes
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.lanes import Lanes
 from filtergym.evaluation.competitors import Policy
 from filtergym.evaluation.seeds import episode_seeds
 from models import make_model

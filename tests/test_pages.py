@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 from filtergym.__main__ import application
 from filtergym.names import find_competitor

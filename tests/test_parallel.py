@@ -21,8 +21,8 @@ from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuned_values import TunedValues
-from filtergym.envs import registration
-from filtergym.envs.catalogue import task_class
+from filtergym.envs.engine import registration
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation import code, parallel, summary
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.store import Store

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from filtergym.envs.parameters import TaskParameters, check_length, parameter, square_matrix
+from filtergym.envs.contract.parameters import TaskParameters, check_length, parameter, square_matrix
 from models import make_model
 
 from filtergym.commands.terminal import parse_settings

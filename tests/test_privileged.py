@@ -6,9 +6,9 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.privileged import context_shapes
-from filtergym.envs.world import World
+from filtergym.envs.contract.world import World
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.privileged import context_shapes
 from models import make_model
 
 from filtergym import evaluate, make_policy

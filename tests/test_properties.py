@@ -8,9 +8,9 @@ import functools
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.data.trajectory import Trajectory
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
-from filtergym.envs.trajectory import Trajectory
 from filtergym.filters import class_fusion, imm
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings

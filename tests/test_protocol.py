@@ -9,9 +9,9 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs import rendering
-from filtergym.envs.environment import TaskEnv, TaskVectorEnv
-from filtergym.envs.trajectory import Trajectory
+from filtergym.envs.data.trajectory import Trajectory
+from filtergym.envs.drawing import rendering
+from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy
 from filtergym.baselines import catalogue as baselines
-from filtergym.envs import registration
+from filtergym.envs.engine import registration
 
 ROOT = Path(__file__).parent.parent
 

@@ -4,7 +4,7 @@ import math
 
 import numpy
 import pytest
-from filtergym.envs.model import Model
+from filtergym.envs.contract.model import Model
 from filtergym.envs.radar_esm_tracking.task import TASK
 from filtergym.filters import class_fusion, imm
 

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 README = Path(__file__).parent.parent / "README.md"
 INDEX_PAGE = README.parent / "docs" / "package_index.md"

@@ -8,8 +8,8 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
-from filtergym.envs import receiver_logs
-from filtergym.envs.flight_tables import read_table
+from filtergym.envs.data import receiver_logs
+from filtergym.envs.data.flight_tables import read_table
 from filtergym.filters import geodesy
 
 from filtergym import evaluate, read_flights, read_recording
@@ -274,7 +274,7 @@ def test_what_holds_no_sentence_is_refused(pynmea2, content, sentence, tmp_path)
 
 
 def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
-    monkeypatch.setattr("filtergym.envs.flight_tables.MOST_ROWS", COUNT - 1)
+    monkeypatch.setattr("filtergym.envs.data.flight_tables.MOST_ROWS", COUNT - 1)
     rows = [(round(1e6 * time), *place, 2.0, 3) for time, place in zip(TIME, places().T, strict=True)]
     pytest.importorskip("pyulog", reason="not installed: pip install 'filtergym[logs]'")
     for path in (

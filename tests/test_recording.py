@@ -15,14 +15,14 @@ import pandas
 import pytest
 import xarray
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.compiled import AVAILABLE
-from filtergym.envs.episode_noise import uniforms_of_seeds
-from filtergym.envs.lanes import Lanes
+from filtergym.envs.contract.task import named_arrays
+from filtergym.envs.data.recorded_tables import Columns
+from filtergym.envs.data.recording import measure_once
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.engine.compiled import AVAILABLE
+from filtergym.envs.engine.episode_noise import uniforms_of_seeds
+from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
-from filtergym.envs.recorded_tables import Columns
-from filtergym.envs.recording import measure_once
-from filtergym.envs.task import named_arrays
 from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.estimates import write_estimates
 from filtergym.evaluation.metrics import chi_square_band
@@ -732,7 +732,7 @@ def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
 
 
 def test_too_many_rows_are_refused_early(tmp_path, monkeypatch):
-    monkeypatch.setattr("filtergym.envs.flight_tables.MOST_ROWS", 1000)
+    monkeypatch.setattr("filtergym.envs.data.flight_tables.MOST_ROWS", 1000)
     (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + b"1,2,3\n" * 1002)
     with pytest.raises(ValueError, match="more than 1,000 rows"):
         read_recording(tmp_path / "long.csv", TARGET)
@@ -823,8 +823,8 @@ def test_a_single_mistake_of_arrays_is_told(recordings):
 
 
 def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
+    from filtergym.envs.contract.world import World
     from filtergym.envs.maneuvering_target.world import RadarWorld
-    from filtergym.envs.world import World
 
     monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
     with pytest.raises(ValueError, match="does not say what an error costs"):

@@ -14,11 +14,11 @@ import pytest
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import import_problem
 from filtergym.baselines.table import Baselines
-from filtergym.envs import registration
-from filtergym.envs.catalogue import catalogue, task_class
+from filtergym.envs.contract.observation import Block, Quantity
+from filtergym.envs.contract.task import Task
+from filtergym.envs.engine import registration
+from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
-from filtergym.envs.observation import Block, Quantity
-from filtergym.envs.task import Task
 from filtergym.evaluation.competitors import ConstantPolicy
 from filtergym.evaluation.parallel import Workers
 from models import make_model
@@ -95,7 +95,7 @@ def test_gymnasium_makes_and_renders_it(package):
     vector = gymnasium.make_vec(ID, num_envs=3, control="gain", horizon=5)
     np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
     assert "mine/Turns-v0" in catalogue()
-    assert "mine/Turns-v0" not in filtergym.envs.catalogue.folders()
+    assert "mine/Turns-v0" not in filtergym.envs.engine.catalogue.folders()
 
 
 def test_a_spawned_process_finds_it(package):
@@ -297,8 +297,8 @@ def fail(*_):
         (with_world(advance=fail), "fails in measure: KeyError"),
         (ManeuveringTarget, "'filtergym/ManeuveringTarget-v0' is there already"),
         (broken(id="filtergym/UavAutopilot-v0"), "'filtergym/UavAutopilot-v0' is there already"),
-        ("mine/Turns-v0", "subclass of filtergym.envs.task.Task"),
-        (int, "subclass of filtergym.envs.task.Task"),
+        ("mine/Turns-v0", "subclass of filtergym.envs.contract.task.Task"),
+        (int, "subclass of filtergym.envs.contract.task.Task"),
         (type("Empty", (Task,), {}), "Empty lacks the class attributes id"),
         (broken(id="Turns"), "such as 'mine/Broken-v0', got 'Turns'"),
         (broken(banks={}), "needs at least one control"),

@@ -7,11 +7,11 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.envs import estimate_picture, rendering
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.environment import TaskEnv
+from filtergym.envs.contract.model import Model
+from filtergym.envs.drawing import estimate_picture, rendering
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.engine.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
-from filtergym.envs.model import Model
 from filtergym.evaluation.animation import episode_frames, write_animation
 
 from filtergym import evaluate

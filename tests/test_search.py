@@ -21,7 +21,7 @@ from filtergym.agents.search import (
 )
 from filtergym.agents.training_run import RunOptions, load_run, new_run, save_run
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 
 ID = "filtergym/ManeuveringTarget-v0"
 SPACE = {"learning_rate": {"low": 1e-4, "high": 1e-2, "log": True, "prefix": "lin_"}, "hidden_size": [2, 4]}

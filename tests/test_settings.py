@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import task_class
+from filtergym.envs.engine.catalogue import task_class
 
 from filtergym import evaluate
 

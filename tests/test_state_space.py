@@ -20,10 +20,10 @@ from filtergym.compiler import namespace as traced_namespace
 from filtergym.compiler.functions import Function
 from filtergym.compiler.program import Graph
 from filtergym.compiler.vector_functions import VectorFunction
-from filtergym.envs import registration
-from filtergym.envs.backend import make_model
-from filtergym.envs.catalogue import task_class
-from filtergym.envs.state_space import Measurement
+from filtergym.envs.engine import registration
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.linear.state_space import Measurement
 from gymnasium.utils.env_checker import check_env
 
 import filtergym

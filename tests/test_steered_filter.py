@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.compiler.namespace import NotTraceable
-from filtergym.envs.backend import make_model
+from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors import make_competitor
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import run_competitor, start_lanes

@@ -11,7 +11,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 from filtergym.baselines.tuning import Search, tune
-from filtergym.envs.filter import Initial
+from filtergym.envs.contract.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement

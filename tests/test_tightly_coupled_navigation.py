@@ -4,7 +4,7 @@ import math
 
 import numpy
 import pytest
-from filtergym.envs.model import Episode, Model
+from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.tightly_coupled_navigation.parameters import (
     SINGER,
     TightlyCoupledNavigationParameters,

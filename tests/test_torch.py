@@ -6,9 +6,9 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.envs.catalogue import catalogue
-from filtergym.envs.environment import TaskVectorEnv
-from filtergym.envs.reward import charge
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.engine.reward import charge
 from models import make_model
 from rounding import REPETITIONS, assert_same, move_roundings
 

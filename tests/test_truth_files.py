@@ -3,7 +3,7 @@
 import numpy as np
 import pandas
 import pytest
-from filtergym.envs.truth_files import LONGEST_GAP, offset_note
+from filtergym.envs.data.truth_files import LONGEST_GAP, offset_note
 
 from filtergym import read_recording
 

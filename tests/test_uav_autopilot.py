@@ -3,8 +3,8 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.envs.model import Episode, Model
-from filtergym.envs.task import Scenario
+from filtergym.envs.contract.model import Episode, Model
+from filtergym.envs.contract.task import Scenario
 from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.envs.uav_autopilot.parameters import COORDINATES, UavAutopilotParameters
 from filtergym.envs.uav_autopilot.task import UavAutopilot

@@ -2,8 +2,8 @@
 
 import numpy
 
-from ...envs.model import Model
-from ...envs.observation import symlog
+from ...envs.contract.model import Model
+from ...envs.contract.observation import symlog
 from ..alarm import Alarm, innovation_evidence
 
 SYMLOG_VARIANCE = 0.38684360137

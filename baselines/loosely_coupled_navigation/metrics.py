@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy
 
+from ...envs.engine.scenario_choice import make_task
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...envs.scenario_choice import make_task
 from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.cause_split import VARIABLE, held_causes
 from ...evaluation.dataset import keywords_of

@@ -2,7 +2,7 @@
 
 import numpy
 
-from ...envs.model import Model
+from ...envs.contract.model import Model
 from ..alarm import Alarm, certain, innovation_evidence
 
 ROUNDING = 1e-6

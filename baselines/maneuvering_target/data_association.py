@@ -5,10 +5,10 @@ Equations: ``filters/data_association.py``. Without clutter each is the estimato
 
 import math
 
+from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement, Plots
-from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters import data_association, kalman
 from ...filters.ordered_sums import ordered_sum

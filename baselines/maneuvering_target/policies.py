@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy
 
+from ...envs.contract.model import Model
 from ...envs.maneuvering_target.banks import GainBank
-from ...envs.model import Model
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-from ...envs.faults import GaussMarkov
-from ...envs.filter import Initial
+from ...envs.contract.faults import GaussMarkov
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
-from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters import bounds, kalman, polar
 from ...filters.small_matrices import apply

@@ -7,10 +7,10 @@ say; scans that missed the target are prediction only, backward too.
 from collections.abc import Sequence
 from typing import Any
 
-from ...envs.filter import Initial
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...envs.observation import Array
 from ...filters import coordinated_turn, imm, smoothing
 from ...filters.small_matrices import apply
 from ..table import Variant

@@ -4,7 +4,7 @@ import math
 
 import numpy
 
-from ...envs.model import Model
+from ...envs.contract.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...filters import class_fusion, imm
 from ..alarm import Alarm

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.observation import Array
+from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start
 from ...evaluation.competitors import Likelihood

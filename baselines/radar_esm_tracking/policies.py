@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy
 
-from ...envs.model import Model
+from ...envs.contract.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm

@@ -7,7 +7,7 @@ Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sect
 
 from typing import NamedTuple
 
-from ...envs.observation import Array
+from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start, Truth
 from ...evaluation.competitors import Likelihood

@@ -3,8 +3,8 @@
 The filters stand in ``envs/tightly_coupled_navigation/fault_hypotheses.py``, because an action may steer them, too.
 """
 
-from ...envs.filter import Initial
-from ...envs.observation import Array
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter, Hypotheses
 from ...envs.tightly_coupled_navigation.world import Measurement
 from ...evaluation.competitors import Likelihood

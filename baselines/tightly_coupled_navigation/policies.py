@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy
 
-from ...envs.model import Model
+from ...envs.contract.model import Model
 from ...envs.tightly_coupled_navigation.fault_hypotheses import TRAINING, VAGUE, FaultPrior
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.filter import Initial
-from ...envs.observation import Array
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.parameters import LINE, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement, Truth

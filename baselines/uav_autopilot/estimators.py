@@ -8,8 +8,8 @@ and a noisier sensor asks for another change of the filter than stronger gusts d
 import math
 from typing import Any, ClassVar, NamedTuple
 
-from ...envs.filter import Initial
-from ...envs.observation import Array
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start
 from ...evaluation.competitors import Likelihood

@@ -3,8 +3,8 @@
 The filters stand in ``envs/uav_autopilot/level_bank.py``, because an action may steer them, too.
 """
 
-from ...envs.filter import Initial
-from ...envs.observation import Array
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.level_bank import LevelFilter
 from ...envs.uav_autopilot.world import Measurement
 from ...evaluation.competitors import Likelihood

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy
 
-from ...envs.model import Model
+from ...envs.contract.model import Model
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelPrior
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy

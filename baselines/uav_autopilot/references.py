@@ -5,8 +5,8 @@ Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 
 import numpy
 
-from ...envs.filter import Initial
-from ...envs.observation import Array
+from ...envs.contract.filter import Initial
+from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
 from ...evaluation.competitors import Likelihood

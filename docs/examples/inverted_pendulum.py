@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 from filtergym.baselines.table import Baselines
-from filtergym.envs.draws import Draws
-from filtergym.envs.observation import ACTION, LOG1P, SIGNED_LOG, Array, Block
-from filtergym.envs.parameters import TaskParameters, parameter
-from filtergym.envs.filter import Bank, Initial
-from filtergym.envs.model import Model
-from filtergym.envs.task import Component, PaperPolicy, Scenario, Task
-from filtergym.envs.world import World
+from filtergym.envs.contract.draws import Draws
+from filtergym.envs.contract.observation import ACTION, LOG1P, SIGNED_LOG, Array, Block
+from filtergym.envs.contract.parameters import TaskParameters, parameter
+from filtergym.envs.contract.filter import Bank, Initial
+from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.task import Component, PaperPolicy, Scenario, Task
+from filtergym.envs.contract.world import World
 from filtergym.evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from filtergym.filters import kalman
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.rollout import ProcessorTime
 from filtergym.evaluation.times import PYTHON_MARK, time_text
 from filtergym.papers.grid import markdown_table

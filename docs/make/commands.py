@@ -10,7 +10,7 @@ import training_seeds
 import typer
 from filtergym.agents.export import export_run
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.scenario_choice import find_scenario
+from filtergym.envs.engine.scenario_choice import find_scenario
 from filtergym.evaluation.files import writable_file, write_text
 from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.parallel import Workers

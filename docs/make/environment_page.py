@@ -12,12 +12,12 @@ import typing
 from typing import Any
 
 from filtergym.baselines.problem import Problem
-from filtergym.envs.backend import make_model
-from filtergym.envs.catalogue import nearest
-from filtergym.envs.model import Model
-from filtergym.envs.observation import Block
-from filtergym.envs.parameters import Limits, field_limits
-from filtergym.envs.task import Task
+from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.observation import Block
+from filtergym.envs.contract.parameters import Limits, field_limits
+from filtergym.envs.contract.task import Task
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.catalogue import nearest
 from filtergym.papers.grid import markdown_table
 
 PARTS_SHOWN = 4

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.catalogue import catalogue, nearest
+from filtergym.envs.engine.catalogue import catalogue, nearest
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.stored import read_json

@@ -9,7 +9,7 @@ path is record, row and column of a table of text, see :func:`.records.table_cel
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from filtergym.envs.catalogue import catalogue
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.times import ProcessorTime, time_text
 from records import BENCHMARK, FOLDER, SEEDS, read_record, short_name, table_cell
 

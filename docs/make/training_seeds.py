@@ -17,7 +17,7 @@ import numpy
 import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.scenario_choice import make_task
+from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.code import files_digest
 from filtergym.evaluation.competitors import kind_of

@@ -14,9 +14,9 @@ import numpy
 from ...filters import imm
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..controls import bank_action_space, bank_probabilities
-from ..filter import Bank, Initial
-from ..observation import (
+from ..contract.controls import bank_action_space, bank_probabilities
+from ..contract.filter import Bank, Initial
+from ..contract.observation import (
     ACTION,
     KEPT_AS_LOG,
     KEPT_AS_LOG1P,
@@ -27,7 +27,7 @@ from ..observation import (
     Compression,
     Quantity,
 )
-from ..task import Task
+from ..contract.task import Task
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .world import Measurement
 

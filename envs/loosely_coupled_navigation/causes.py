@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from ..causes import MISSED, OUTLIER, Cause, Moment
-from ..observation import Array
-from ..schedules import within
+from ..contract.causes import MISSED, OUTLIER, Cause, Moment
+from ..contract.observation import Array
+from ..contract.schedules import within
 
 UNREPORTED = 1.2
 """Noise of the receiver over what it reports, from which it is not reported."""

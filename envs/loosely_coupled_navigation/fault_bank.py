@@ -27,9 +27,9 @@ from ...filters import imm
 from ...filters import receiver_faults as faults
 from ...filters.loosely_coupled import AugmentedCovariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..filter import Initial
-from ..observation import Array
-from ..task import Task
+from ..contract.filter import Initial
+from ..contract.observation import Array
+from ..contract.task import Task
 from .world import Measurement
 
 LEVELS = tuple(100 ** (i / 3) for i in range(-2, 5))

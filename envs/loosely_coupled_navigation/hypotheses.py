@@ -28,9 +28,9 @@ from ...filters import receiver_faults as faults
 from ...filters.array_namespace import namespace
 from ...filters.loosely_coupled import AugmentedCovariance, Sampling
 from ...filters.ordered_sums import ordered_sum
-from ..filter import Initial
-from ..observation import ACTION, BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
-from ..task import Task
+from ..contract.filter import Initial
+from ..contract.observation import ACTION, BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
+from ..contract.task import Task
 from .banks import Innovations, KalmanBucyBank
 from .fault_bank import FaultFilter, Hypotheses, Memory, Noises
 from .world import Measurement

@@ -20,8 +20,8 @@ import gymnasium
 import numpy
 
 from ...filters import loosely_coupled as ins_gnss
-from ..filter import Initial
-from ..observation import SIGNED_LOG, Array, Block
+from ..contract.filter import Initial
+from ..contract.observation import SIGNED_LOG, Array, Block
 from .banks import NOISES, Augmented, NoiseBank
 from .world import Measurement
 

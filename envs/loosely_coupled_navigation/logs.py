@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy
 
-from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..plausibility import check_extents
-from ..recorded_tables import Columns
+from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..data.plausibility import check_extents
+from ..data.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
 
 COLUMNS = {

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import Array
-from ..parameters import TaskParameters, check, field_limits, parameter
+from ..contract.parameters import TaskParameters, check, field_limits, parameter
 
 AXES = ("x", "y", "z")
 

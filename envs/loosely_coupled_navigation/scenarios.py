@@ -8,7 +8,7 @@ When something befalls the receiver is drawn for each episode, so that it cannot
 
 from collections.abc import Mapping
 
-from ..task import Scenario
+from ..contract.task import Scenario
 
 DECADE = (10**-0.5, 10**0.5)
 """A decade around the modelled value."""

@@ -13,8 +13,8 @@ Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 an
 
 from typing import Any
 
-from ..model import Model
-from ..task import Component, PaperPolicy, Task
+from ..contract.model import Model
+from ..contract.task import Component, PaperPolicy, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES

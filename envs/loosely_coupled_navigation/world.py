@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy
 
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, draw_between
-from ..faults import GaussMarkov, Outliers
-from ..filter import Initial
-from ..observation import Array
-from ..schedules import Steps, within
-from ..task import Task
-from ..world import World
+from ..contract.draws import Draws, draw_between
+from ..contract.faults import GaussMarkov, Outliers
+from ..contract.filter import Initial
+from ..contract.observation import Array
+from ..contract.schedules import Steps, within
+from ..contract.task import Task
+from ..contract.world import World
 from .parameters import LooselyCoupledNavigationParameters
 
 NEVER = 1e9

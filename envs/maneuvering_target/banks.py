@@ -15,9 +15,9 @@ import numpy
 from ...filters import alpha_beta, imm
 from ...filters.gaussian import log_density
 from ...filters.ordered_sums import weighted_sum
-from ..controls import bank_action_space, bank_probabilities
-from ..filter import Bank, Initial
-from ..observation import (
+from ..contract.controls import bank_action_space, bank_probabilities
+from ..contract.filter import Bank, Initial
+from ..contract.observation import (
     AVERAGE_OF_LOG1P,
     KEPT_AS_LOG,
     KEPT_AS_LOG1P,

@@ -1,7 +1,7 @@
 """What makes a radar track of ManeuveringTarget costly: manoeuvres, scans that miss the target, outliers, range."""
 
-from ..causes import MISSED, OUTLIER, Cause, Moment, bins, context_flag
-from ..observation import Array
+from ..contract.causes import MISSED, OUTLIER, Cause, Moment, bins, context_flag
+from ..contract.observation import Array
 
 AFTERMATH = 5.0
 """Scans in which a filter recovers from a manoeuvre."""

@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 from ...filters import data_association, polar
-from ..draws import Draws
-from ..observation import Array
-from ..task import Task
+from ..contract.draws import Draws
+from ..contract.observation import Array
+from ..contract.task import Task
 from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...filters import kalman
 from ...filters.small_matrices import outer
-from ..observation import Array
+from ..contract.observation import Array
 from .world import Measurement
 
 if TYPE_CHECKING:

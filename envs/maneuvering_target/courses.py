@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws
-from ..observation import Array
-from ..schedules import Steps
-from ..task import Task
+from ..contract.draws import Draws
+from ..contract.observation import Array
+from ..contract.schedules import Steps
+from ..contract.task import Task
 from .parameters import ManeuveringTargetParameters
 
 Motion = tuple[Array, Array]

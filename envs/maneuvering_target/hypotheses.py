@@ -25,8 +25,8 @@ from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses
 from ...filters.small_matrices import apply, product, transpose
-from ..filter import Initial
-from ..observation import BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
+from ..contract.filter import Initial
+from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
 from .banks import RadarBank
 from .kalman_net import FRAME, frame_of
 from .semi_markov import SemiMarkovFilter, SemiMarkovTrack, Tables

@@ -33,8 +33,8 @@ import numpy
 from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.small_matrices import apply, outer, product, transpose
-from ..filter import Bank, Initial
-from ..observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block
+from ..contract.filter import Bank, Initial
+from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement

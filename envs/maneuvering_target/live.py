@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, Memory
 from .logs import COLUMNS
 from .world import Measurement, Odometry
 

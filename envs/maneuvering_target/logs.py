@@ -12,11 +12,11 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..live_input import Feed
-from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..plausibility import check_bearings
-from ..recorded_tables import Columns
-from ..recording import Recording
+from ..contract.live_input import Feed
+from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..data.plausibility import check_bearings
+from ..data.recorded_tables import Columns
+from ..data.recording import Recording
 from .parameters import ManeuveringTargetParameters
 
 COLUMNS = {

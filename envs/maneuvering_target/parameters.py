@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..parameters import TaskParameters, check_length, parameter, square_matrix
+from ..contract.parameters import TaskParameters, check_length, parameter, square_matrix
 
 PLOT_SLOTS = 12
 """Plots of a scan at most, where there is clutter."""

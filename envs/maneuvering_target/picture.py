@@ -10,8 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from ...filters import imm
-from ..model import Episode, Model
-from ..rendering import (
+from ..contract.model import Episode, Model
+from ..drawing.rendering import (
     BLACK,
     BLUE,
     FIGURE_SIZE,

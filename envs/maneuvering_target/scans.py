@@ -2,9 +2,9 @@
 
 from typing import Any, NamedTuple
 
-from ..draws import Draws
-from ..observation import Array
-from ..task import Task
+from ..contract.draws import Draws
+from ..contract.observation import Array
+from ..contract.task import Task
 from .courses import Course, Motion
 from .parameters import ManeuveringTargetParameters
 

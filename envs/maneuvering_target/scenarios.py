@@ -10,7 +10,7 @@ strength; likewise in ``glint``, ``biased`` and ``clutter``, whose faults no tra
 
 from collections.abc import Mapping
 
-from ..task import Scenario
+from ..contract.task import Scenario
 
 _AROUND = {"start_spread": 5e3, "course_spread": 30.0, "mirrored": 0.5, "leg_spread": 0.5}
 

@@ -14,8 +14,8 @@ from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_
 from ...filters.ordered_sums import weighted_sum
 from ...filters.semi_markov import Hypotheses
 from ...filters.small_matrices import mirror_lower
-from ..filter import Initial
-from ..observation import Array
+from ..contract.filter import Initial
+from ..contract.observation import Array
 from .constant_velocity import ConstantVelocityModel
 from .world import Measurement
 

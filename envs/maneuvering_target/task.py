@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy
 
-from ..flights import Flights, flight_of
-from ..model import Model
-from ..parameters import check, field_limits, freeze
-from ..task import Component, PaperPolicy, Scenario, Task
-from ..trajectory import Trajectory
+from ..contract.model import Model
+from ..contract.parameters import check, field_limits, freeze
+from ..contract.task import Component, PaperPolicy, Scenario, Task
+from ..data.flights import Flights, flight_of
+from ..data.trajectory import Trajectory
 from . import ID
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .causes import CAUSES

@@ -4,12 +4,12 @@ import math
 from typing import Any, NamedTuple
 
 from ...filters import polar
-from ..draws import Draws
-from ..faults import GaussMarkov, Outliers
-from ..filter import Initial
-from ..observation import Array
-from ..task import Task
-from ..world import World
+from ..contract.draws import Draws
+from ..contract.faults import GaussMarkov, Outliers
+from ..contract.filter import Initial
+from ..contract.observation import Array
+from ..contract.task import Task
+from ..contract.world import World
 from .clutter import Clutter, ClutterState, Echo, Plots, Track
 from .courses import course_of
 from .parameters import ManeuveringTargetParameters

@@ -13,9 +13,9 @@ import numpy
 
 from ...filters import class_fusion, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..controls import bank_action_space, bank_probabilities
-from ..filter import Bank
-from ..observation import (
+from ..contract.controls import bank_action_space, bank_probabilities
+from ..contract.filter import Bank
+from ..contract.observation import (
     AVERAGE_OF_LOG1P,
     BOUNDED_LOG,
     KEPT_AS_LOG1P,

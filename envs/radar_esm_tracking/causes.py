@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from ..causes import OUTLIER, Cause, Moment, bins
-from ..observation import Array
+from ..contract.causes import OUTLIER, Cause, Moment, bins
+from ..contract.observation import Array
 
 AFTERMATH = 20.0
 """Scans after a change of class: 10 s."""

@@ -25,8 +25,8 @@ import numpy
 from ...filters import class_fusion, imm, packed_covariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.small_matrices import apply, cholesky
-from ..controls import bank_probabilities
-from ..observation import ACTION, KEPT_AS_LOG, Array, Block
+from ..contract.controls import bank_probabilities
+from ..contract.observation import ACTION, KEPT_AS_LOG, Array, Block
 from .banks import ClassBank
 from .world import Measurement, Start
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, Memory
 from .logs import COLUMNS, start_track
 from .world import Measurement, Start
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..recorded_tables import Columns
+from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..data.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
 COLUMNS = {

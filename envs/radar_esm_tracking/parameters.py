@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ...filters import singer
-from ..parameters import Limits, TaskParameters, check, check_length, parameter, square_matrix
+from ..contract.parameters import Limits, TaskParameters, check, check_length, parameter, square_matrix
 
 STANDARD_GRAVITY = 9.81
 """m/s^2."""

@@ -6,8 +6,8 @@ from typing import Any
 import numpy
 from matplotlib.figure import Figure
 
-from ..model import Episode, Model
-from ..rendering import (
+from ..contract.model import Episode, Model
+from ..drawing.rendering import (
     BLACK,
     BLUE,
     CURVES,

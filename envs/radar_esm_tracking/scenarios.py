@@ -6,7 +6,7 @@ Windows are scan numbers, first and last included; at 0.5 s a scan they are 0.5-
 from collections.abc import Mapping
 from typing import Any
 
-from ..task import Scenario
+from ..contract.task import Scenario
 
 _WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}
 

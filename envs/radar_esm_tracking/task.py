@@ -11,9 +11,9 @@ import numpy
 
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
-from ..model import Episode, Model
-from ..observation import Array
-from ..task import Component, PaperPolicy, Task
+from ..contract.model import Episode, Model
+from ..contract.observation import Array
+from ..contract.task import Component, PaperPolicy, Task
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of

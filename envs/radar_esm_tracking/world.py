@@ -7,10 +7,10 @@ import numpy
 
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, category, draw_between
-from ..faults import GaussMarkov, Outliers
-from ..observation import Array
-from ..world import World
+from ..contract.draws import Draws, category, draw_between
+from ..contract.faults import GaussMarkov, Outliers
+from ..contract.observation import Array
+from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
-from ..controls import bank_action_space, bank_probabilities
-from ..filter import Bank, Initial
-from ..observation import ACTION, BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity, within
-from ..task import Task
+from ..contract.controls import bank_action_space, bank_probabilities
+from ..contract.filter import Bank, Initial
+from ..contract.observation import ACTION, BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity, within
+from ..contract.task import Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
 

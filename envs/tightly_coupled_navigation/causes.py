@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from ..causes import Cause, Moment
-from ..observation import Array
+from ..contract.causes import Cause, Moment
+from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
 
 PULLED = 5.0

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..draws import Draws, draw_between
-from ..observation import Array
+from ..contract.draws import Draws, draw_between
+from ..contract.observation import Array
 from .parameters import DEGREE, LINE, REST, SINGER
 
 if TYPE_CHECKING:

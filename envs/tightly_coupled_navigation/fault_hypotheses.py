@@ -28,8 +28,8 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm, range_errors
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
-from ..filter import Initial
-from ..observation import Array
+from ..contract.filter import Initial
+from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
 from .world import Measurement
 

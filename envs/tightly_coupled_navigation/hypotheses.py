@@ -24,8 +24,8 @@ import numpy
 
 from ...filters import gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..filter import Initial
-from ..observation import BOUNDED_LOG, KEPT_AS_LOG, SHARE, Array, Block
+from ..contract.filter import Initial
+from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, SHARE, Array, Block
 from .banks import HypothesisBank
 from .fault_hypotheses import Factors, FaultFilter, Hypotheses
 from .parameters import HYPOTHESES

@@ -24,8 +24,8 @@ import numpy
 
 from ...filters import gnss_ins
 from ...filters.packed_covariance import diagonal, pack, unpack
-from ..filter import Initial
-from ..observation import KEPT_AS_LOG, Array, Block
+from ..contract.filter import Initial
+from ..contract.observation import KEPT_AS_LOG, Array, Block
 from .banks import Filters, Prediction, RobustBank
 from .parameters import HYPOTHESES, SINGER
 from .world import Measurement

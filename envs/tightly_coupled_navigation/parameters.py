@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy
 
 from ...filters import gnss_ins, satellites
-from ..parameters import TaskParameters, check_length, parameter, square_matrix
+from ..contract.parameters import TaskParameters, check_length, parameter, square_matrix
 
 REST, LINE, SINGER = 0, 1, 2
 HYPOTHESES = ("rest", "constant-velocity", "singer")

@@ -7,18 +7,8 @@ import numpy
 from matplotlib.figure import Figure
 
 from ...filters import gnss_ins
-from ..model import Episode, Model
-from ..rendering import (
-    BLACK,
-    BLUE,
-    CURVES,
-    FIGURE_SIZE,
-    PALE,
-    History,
-    Picture,
-    Strip,
-    grown,
-)
+from ..contract.model import Episode, Model
+from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, grown
 from .parameters import HYPOTHESES, LINE, REST, SINGER
 from .task import TightlyCoupledNavigation
 

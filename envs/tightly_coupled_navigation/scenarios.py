@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from ..task import Scenario
+from ..contract.task import Scenario
 
 WINDOWS = MappingProxyType({"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000)})
 """Steady parts of the three legs of the paper's experiment."""

@@ -21,9 +21,9 @@ from typing import Any
 import numpy
 
 from ...filters import gnss_ins, satellites
-from ..model import Model
-from ..observation import Array
-from ..task import Component, PaperPolicy, Task
+from ..contract.model import Model
+from ..contract.observation import Array
+from ..contract.task import Component, PaperPolicy, Task
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES

@@ -9,12 +9,12 @@ import numpy
 
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, draw_between
-from ..faults import GaussMarkov
-from ..filter import Initial
-from ..observation import Array
-from ..task import Task
-from ..world import World
+from ..contract.draws import Draws, draw_between
+from ..contract.faults import GaussMarkov
+from ..contract.filter import Initial
+from ..contract.observation import Array
+from ..contract.task import Task
+from ..contract.world import World
 from .course import Course, Legs
 from .parameters import DEGREE, SINGER, TightlyCoupledNavigationParameters
 

@@ -9,8 +9,8 @@ import numpy
 
 from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
-from ..filter import Bank
-from ..observation import (
+from ..contract.filter import Bank
+from ..contract.observation import (
     ACTION,
     KEPT_AS_LOG,
     LARGEST_LOG,

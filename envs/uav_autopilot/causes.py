@@ -1,7 +1,7 @@
 """What makes a loop of UavAutopilot costly: commands, gusts, noisy sensors, dropouts."""
 
-from ..causes import MISSED, Cause, Moment
-from ..observation import Array
+from ..contract.causes import MISSED, Cause, Moment
+from ..contract.observation import Array
 
 SETTLING = 20.0
 """Measurements in which the loop follows a new command."""

@@ -23,7 +23,7 @@ import numpy
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import ordered_sum
-from ..observation import ACTION, BOUNDED_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block, within
+from ..contract.observation import ACTION, BOUNDED_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block, within
 from .banks import AutopilotBank
 from .level_bank import LevelFilter, grid
 from .world import Measurement, Start

@@ -23,7 +23,7 @@ import gymnasium
 import numpy
 
 from ...filters import packed_covariance
-from ..observation import ACTION, SIGNED_LOG, Array, Block
+from ..contract.observation import ACTION, SIGNED_LOG, Array, Block
 from .banks import NoiseBank
 from .world import Measurement, Start
 

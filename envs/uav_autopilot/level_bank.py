@@ -18,8 +18,8 @@ import numpy
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import weighted_sum
-from ..filter import Initial
-from ..observation import Array
+from ..contract.filter import Initial
+from ..contract.observation import Array
 from .plant import Model, pitch_channel
 from .world import Measurement, Start
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, Memory
 
 
 class SensorInput(LiveInput):

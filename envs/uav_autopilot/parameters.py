@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..parameters import Limits, TaskParameters, check, check_length, parameter
-from ..task import Component
+from ..contract.parameters import Limits, TaskParameters, check, check_length, parameter
+from ..contract.task import Component
 
 COORDINATES: Mapping[str, tuple[Component, ...]] = {
     "P": (Component("position", "m"), Component("rate", "m/s")),

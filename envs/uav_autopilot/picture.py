@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 
-from ..model import Episode, Model
-from ..rendering import Picture, Strip, error_strip
+from ..contract.model import Episode, Model
+from ..drawing.rendering import Picture, Strip, error_strip
 from .banks import MODES, AutopilotBank, Filter
 from .hypotheses import HypothesesBank, SteeredLevels
 from .task import UavAutopilot

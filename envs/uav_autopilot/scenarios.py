@@ -8,7 +8,7 @@ that knows the time can be better there than the filter, which is optimal for a 
 
 from collections.abc import Mapping
 
-from ..task import Scenario
+from ..contract.task import Scenario
 
 _RANDOM = {
     "command_amplitude": (0.25, 1.0),

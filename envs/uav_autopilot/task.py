@@ -19,9 +19,9 @@ far from one. Reading: the noise printed in (10) has mean zero and is unknown, s
 
 from typing import Any
 
-from ..model import Episode, Model
-from ..observation import Array
-from ..task import PaperPolicy, Task
+from ..contract.model import Episode, Model
+from ..contract.observation import Array
+from ..contract.task import PaperPolicy, Task
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES

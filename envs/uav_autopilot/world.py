@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ...filters import linear_systems
-from ..draws import Draws
-from ..faults import GaussMarkov
-from ..observation import Array
-from ..schedules import Steps, within
-from ..world import World
+from ..contract.draws import Draws
+from ..contract.faults import GaussMarkov
+from ..contract.observation import Array
+from ..contract.schedules import Steps, within
+from ..contract.world import World
 from .parameters import UavAutopilotParameters
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import check_names, nearest, short_name
-from ..envs.recording import Recording
-from ..envs.scenario_choice import make_task, read_recording
+from ..envs.data.recording import Recording
+from ..envs.engine.catalogue import check_names, nearest, short_name
+from ..envs.engine.scenario_choice import make_task, read_recording
 from ..evaluation.files import writable_file, write_text
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table, further_sentences, parameter_lines

@@ -13,12 +13,12 @@ from rich.table import Table
 from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
-from ..envs.backend import make_model
-from ..envs.catalogue import nearest
-from ..envs.flights import names_flights, read_flights
-from ..envs.recording import Recording
-from ..envs.recording_files import is_recording
-from ..envs.scenario_choice import make_task, read_recording
+from ..envs.data.flights import names_flights, read_flights
+from ..envs.data.recording import Recording
+from ..envs.data.recording_files import is_recording
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import nearest
+from ..envs.engine.scenario_choice import make_task, read_recording
 from ..evaluation.bootstrap import Estimate
 from ..evaluation.cause_split import phrases_of
 from ..evaluation.competitors import RandomPolicy

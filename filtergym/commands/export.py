@@ -7,8 +7,8 @@ import typer
 
 from ..agents.export import export_run
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import check_names, nearest
-from ..envs.scenario_choice import read_recording
+from ..envs.engine.catalogue import check_names, nearest
+from ..envs.engine.scenario_choice import read_recording
 from ..evaluation.files import whole_file, writable_file, writable_folder
 from .terminal import (
     Parameters,

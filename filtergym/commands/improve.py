@@ -11,8 +11,8 @@ from ..agents.training_run import RunOptions, Session
 from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune
-from ..envs.catalogue import nearest
-from ..envs.scenario_choice import read_recording
+from ..envs.engine.catalogue import nearest
+from ..envs.engine.scenario_choice import read_recording
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store

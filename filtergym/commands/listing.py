@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from ..baselines.problem import problem_of
-from ..envs.catalogue import catalogue
+from ..envs.engine.catalogue import catalogue
 from ..reports.listing import environment_lines
 from .terminal import complete_environment, console, import_environments
 

@@ -8,8 +8,8 @@ import xarray
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
-from ..envs.catalogue import check_names
-from ..envs.recording import Recording
+from ..envs.data.recording import Recording
+from ..envs.engine.catalogue import check_names
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.parallel import Workers

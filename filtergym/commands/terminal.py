@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 def complete_environment(incomplete: str) -> list[str]:
     """Environment ids; without ``filtergym/`` where that is how a word begins."""
-    from ..envs.catalogue import catalogue
+    from ..envs.engine.catalogue import catalogue
 
     ids = list(catalogue())
     found = [id for id in ids if id.startswith(incomplete)]
@@ -28,7 +28,7 @@ def complete_environment(incomplete: str) -> list[str]:
 
 def import_environments(given: Any) -> Any:
     """Import the modules of environments that the command line names as ``module:id``; returns what was given."""
-    from ..envs.catalogue import import_task
+    from ..envs.engine.catalogue import import_task
 
     for word in [given] if isinstance(given, str) else given or ():
         if ":" in word:
@@ -38,7 +38,7 @@ def import_environments(given: Any) -> Any:
 
 def _environments_of(ctx: typer.Context) -> list[str]:
     """Ids of the environment that the words so far name, or of all if they name none."""
-    from ..envs.catalogue import catalogue, task_class
+    from ..envs.engine.catalogue import catalogue, task_class
 
     named = ctx.params.get("environment")
     # An option that still lacks its value keeps click from telling the arguments: then the words as shells give them.
@@ -51,7 +51,7 @@ def _environments_of(ctx: typer.Context) -> list[str]:
 
 def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
     """Names of the environment's scenarios."""
-    from ..envs.catalogue import catalogue
+    from ..envs.engine.catalogue import catalogue
 
     names = dict.fromkeys(name for id in _environments_of(ctx) for name in catalogue()[id].scenarios)
     return [name for name in names if name.startswith(incomplete)]
@@ -59,7 +59,7 @@ def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
     """Names of the environment's scenarios that agents may be trained on."""
-    from ..envs.catalogue import catalogue
+    from ..envs.engine.catalogue import catalogue
 
     scenarios = [own for id in _environments_of(ctx) for own in catalogue()[id].scenarios.values()]
     names = dict.fromkeys(own.name for own in scenarios if own.training)

@@ -12,11 +12,11 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..envs.model import Model
-from ..envs.observation import Blocks
-from ..envs.parameters import TaskParameters
-from ..envs.task import Task
-from ..envs.world import World
+from ..envs.contract.model import Model
+from ..envs.contract.observation import Blocks
+from ..envs.contract.parameters import TaskParameters
+from ..envs.contract.task import Task
+from ..envs.contract.world import World
 from .definition_text import WIDTH, DefinitionText
 from .definitions import SPACE, Definitions, ExportError, External, Key, is_named_tuple, source_of
 

@@ -27,7 +27,7 @@ SIMPLER = {
 }
 """Functions that are simpler where there is NumPy alone, by module and name."""
 SIMPLER_METHODS = {
-    ("filtergym.envs.task", "Task", "constant"): '''    def constant(self, values: Any) -> Array:
+    ("filtergym.envs.contract.task", "Task", "constant"): '''    def constant(self, values: Any) -> Array:
         """Turn numbers into an array."""
         return numpy.asarray(values, dtype=numpy.float64)''',
 }

@@ -6,11 +6,11 @@ import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
 from ..baselines.table import ConstantMode
-from ..envs.model import Model
-from ..envs.recording import RecordedWorld
-from ..envs.scenario_choice import make_task
-from ..envs.task import Task
-from ..envs.world import World
+from ..envs.contract.model import Model
+from ..envs.contract.task import Task
+from ..envs.contract.world import World
+from ..envs.data.recording import RecordedWorld
+from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors import (
     RANKED,
     ConstantPolicy,

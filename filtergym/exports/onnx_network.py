@@ -13,8 +13,8 @@ import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import OBSERVATION_LIMIT, StoredPolicy
-from ..envs.backend import make_model
-from ..envs.model import Model
+from ..envs.contract.model import Model
+from ..envs.engine.backend import make_model
 from ..evaluation.files import whole_file
 from .request import ExportRequest
 

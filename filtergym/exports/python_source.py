@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .. import __version__
-from ..envs.model import Episode, Model
+from ..envs.contract.model import Episode, Model
 from ..evaluation.rollout import rollout, start_lanes
 from .constants import Constants, ConstantsText, call_text, word
 from .definition_text import WIDTH, DefinitionText

@@ -10,8 +10,8 @@ import numpy
 from ..agents.learned_policy import LearnedPolicy
 from ..compiler.functions import leaves
 from ..compiler.interpretation import interpret
-from ..envs.backend import make_model
-from ..envs.model import Episode, Model
+from ..envs.contract.model import Episode, Model
+from ..envs.engine.backend import make_model
 from ..evaluation.competitors import kind_of
 from ..evaluation.evaluate import control_of
 from ..evaluation.rollout import rollout, start_lanes

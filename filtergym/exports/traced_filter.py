@@ -25,9 +25,9 @@ from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
 from ..compiler.program import Graph, Program, Result, program
-from ..envs.filter import Input
-from ..envs.model import Model
-from ..envs.task import Task
+from ..envs.contract.filter import Input
+from ..envs.contract.model import Model
+from ..envs.contract.task import Task
 from ..evaluation.competitors import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.steered_filter import Decider, Decisions, Steered, SteeredFilter, steer
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 from .. import envs
-from ..envs.catalogue import nearest
+from ..envs.engine.catalogue import nearest
 
 # Of an installed package this is the folder of this file, which holds no paper.
 __path__ = [str(Path(envs.__path__[0]).parent / "papers")]

@@ -12,7 +12,7 @@ import xarray
 
 from ..baselines.advice import Advice
 from ..baselines.fitting import DROP
-from ..envs.task import Task
+from ..envs.contract.task import Task
 from ..evaluation.innovations import received
 from ..evaluation.likelihood import Span
 from ..evaluation.metrics import chi_square_band

@@ -12,8 +12,8 @@ import xarray
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
-from ..envs.backend import make_model
-from ..envs.catalogue import catalogue
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import catalogue
 from ..evaluation.cause_split import CAUSE_METRICS, phrases_of
 from ..evaluation.competitors import RandomPolicy
 from ..evaluation.dataset import groups_of, notes_of

@@ -6,10 +6,10 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem
 from ..compiler.library import fastest
 from ..compiler.native import processor
-from ..envs.backend import make_model
-from ..envs.catalogue import USER_TASKS, parameter_names
-from ..envs.compiled import AVAILABLE
-from ..envs.task import Task
+from ..envs.contract.task import Task
+from ..envs.engine.backend import make_model
+from ..envs.engine.catalogue import USER_TASKS, parameter_names
+from ..envs.engine.compiled import AVAILABLE
 
 
 def _backend(cls: type[Task]) -> str:

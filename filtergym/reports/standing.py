@@ -14,7 +14,7 @@ from rich.table import Table
 from ..agents import training_run
 from ..agents.named_policies import find_learned_policy
 from ..agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
-from ..envs.model import Episode, Model
+from ..envs.contract.model import Episode, Model
 from ..evaluation.bootstrap import Bootstrap, Estimate
 from ..evaluation.competitors import RandomPolicy
 from ..filters.gaussian import log_density

@@ -6,7 +6,7 @@ import json
 from ..agents.learned_policy import pretrained_path
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem
-from ..envs.catalogue import short_name
+from ..envs.engine.catalogue import short_name
 from ..evaluation.evaluate import Experiment
 from ..evaluation.store import Work
 from ..evaluation.summary import EvaluationRequest

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.backend import make_model
-from ...envs.filter import Initial
+from ...envs.contract.filter import Initial
+from ...envs.engine.backend import make_model
+from ...envs.engine.scenario_choice import make_task
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.scenario_choice import make_task
 from ...evaluation.parallel import Workers
 from ...evaluation.rollout import start_lanes
 from ...evaluation.seeds import episode_seeds

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...baselines.problem import problem_of
-from ...envs.backend import make_model
+from ...envs.contract.model import Episode, Model
+from ...envs.engine.backend import make_model
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...envs.model import Episode, Model
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
 from ...filters import kalman_bucy

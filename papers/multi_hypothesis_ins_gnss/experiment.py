@@ -8,8 +8,8 @@ import numpy
 from ...baselines.tightly_coupled_navigation.metrics import lasting, switches
 from ...baselines.tightly_coupled_navigation.policies import chain
 from ...baselines.tightly_coupled_navigation.references import KnownMode
-from ...envs.backend import make_model
-from ...envs.model import Episode, Model
+from ...envs.contract.model import Episode, Model
+from ...envs.engine.backend import make_model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import Policy

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...baselines.uav_autopilot.policies import BASELINES
-from ...envs.backend import make_model
-from ...envs.model import Episode, Model
+from ...envs.contract.model import Episode, Model
+from ...envs.engine.backend import make_model
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds

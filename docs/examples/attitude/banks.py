@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
-from filtergym.envs.filter import Bank
-from filtergym.envs.observation import ACTION, Array, Block
+from filtergym.envs.contract.filter import Bank
+from filtergym.envs.contract.observation import ACTION, Array, Block
 
 from . import gradient_filters, indicators, quaternions, vqf
 from .parameters import AttitudeParameters

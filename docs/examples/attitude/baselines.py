@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import numpy
 from filtergym.baselines.table import Baselines, tunable
-from filtergym.envs.model import Model
-from filtergym.envs.observation import Array
+from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.observation import Array
 from filtergym.evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 
 from . import gradient_filters, quaternions, vqf

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy
 import scipy.io
-from filtergym.envs.recording import Recording, side_by_side
+from filtergym.envs.data.recording import Recording, side_by_side
 from scipy.spatial.transform import Rotation
 
 from . import quaternions

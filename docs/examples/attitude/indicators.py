@@ -6,7 +6,7 @@ An average over the time constant tau is an exponential one, from the first meas
 import math
 from typing import Any, NamedTuple
 
-from filtergym.envs.observation import LOG1P, SHARE, SIGNED_LOG, Array, Block
+from filtergym.envs.contract.observation import LOG1P, SHARE, SIGNED_LOG, Array, Block
 from filtergym.filters.array_namespace import namespace
 
 from .quaternions import DEGREES, TINY, length, square, to_world

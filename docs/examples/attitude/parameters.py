@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from filtergym.envs.parameters import TaskParameters, parameter
+from filtergym.envs.contract.parameters import TaskParameters, parameter
 
 
 @dataclass(frozen=True)

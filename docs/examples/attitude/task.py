@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from filtergym.envs.causes import Cause
-from filtergym.envs.observation import Array
-from filtergym.envs.task import Component, PaperPolicy, Scenario, Task
+from filtergym.envs.contract.causes import Cause
+from filtergym.envs.contract.observation import Array
+from filtergym.envs.contract.task import Component, PaperPolicy, Scenario, Task
 
 from . import quaternions
 from .banks import MadgwickBank, MahonyBank, VQFBank

@@ -3,9 +3,9 @@
 import math
 from typing import Any, NamedTuple
 
-from filtergym.envs.draws import Draws
-from filtergym.envs.observation import Array
-from filtergym.envs.world import World
+from filtergym.envs.contract.draws import Draws
+from filtergym.envs.contract.observation import Array
+from filtergym.envs.contract.world import World
 
 from . import motion, quaternions
 from .parameters import AttitudeParameters

@@ -1,0 +1,45 @@
+"""Errors in a user's code, in one sentence with the line that raised them."""
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ...compiler.namespace import NotTraceable
+
+PACKAGE = __name__.partition(".")[0]
+PYTHON = str(Path(traceback.__file__).parent)
+"""Folder of Python's own modules."""
+
+
+def own_line(error: BaseException) -> str:
+    """Return the last line of a user's own code that an error came through, such as " (mine.py, line 12)", or "".
+
+    Code of this package and of installed libraries is not the user's own.
+    """
+    found = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        module = frame.f_globals.get("__package__") or frame.f_globals.get("__name__", "")
+        file = frame.f_code.co_filename
+        installed = "site-packages" in file or file.startswith(("<", PYTHON))
+        if module.partition(".")[0] != PACKAGE and not installed:
+            found = f" ({Path(file).name}, line {line})"
+    return found
+
+
+@contextmanager
+def explain_errors(what: str) -> Iterator[None]:
+    """Turn what a user's code raises into one sentence with the line that raised it.
+
+    Args:
+        what: beginning of the sentence.
+
+    Raises:
+        ValueError: for any error but that of code that cannot be traced.
+    """
+    try:
+        yield
+    except NotTraceable:
+        raise
+    except Exception as error:
+        raise ValueError(f"{what}: {type(error).__name__}: {error}{own_line(error)}") from error

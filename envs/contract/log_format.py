@@ -1,0 +1,79 @@
+"""What tables of real measurements look like to an environment, and what it makes of them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+if TYPE_CHECKING:
+    from ..data.recorded_tables import Columns
+
+
+class TrackStart(NamedTuple):
+    """The start of the tracks of E episodes, made of their first measurements."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """Those after the start, ``(E, T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """The initial estimate, ``(E, ...)``."""
+    used: int
+    """Measurements that the start took."""
+
+
+class TrackLog(NamedTuple):
+    """The measurements of one track, made of the columns of a table; T measurements."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """``(T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """The initial estimate, ``(...)``."""
+    rows: numpy.ndarray
+    """Row of the table that each measurement is of, ``(T,)``; -1 where it is of none."""
+    parameters: Mapping[str, Any]
+    """Parameters of the environment that follow from the table."""
+    start: float
+    """Time of the start of the track, s, as in the table."""
+    time: numpy.ndarray
+    """Of the measurements, likewise, ``(T,)``."""
+    notes: tuple[str, ...] = ()
+    """What was done to the table, a line each."""
+    typical: Mapping[str, float] = {}
+    """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
+    nobody has set them."""
+
+
+class Predicted(NamedTuple):
+    """A coordinate of a measurement that an estimate predicts."""
+
+    name: str
+    unit: str
+    group: str
+    """Of coordinates whose errors are one length, such as a position."""
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """The tables of real measurements that an environment reads."""
+
+    columns: Mapping[str, str]
+    """Names of the columns beside ``time``, and what they hold."""
+    read: "Callable[[Columns], TrackLog]"
+    """Makes the measurements of one track of its columns; raises :class:`ValueError` for what lacks or cannot be."""
+    start: Callable[[Mapping[str, numpy.ndarray], numpy.ndarray, Any], TrackStart]
+    """Makes the start of the tracks of measurements ``(E, T, ...)`` by name, of their times ``(E, T)``, s, and of the
+    parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""
+    targets_move: bool = False
+    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    scale_noise: Callable[[Any, Any], Any] | None = None
+    """Multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None where none are."""
+    predict: Callable[[Any, Any, Any], tuple[Any, Any]] | None = None
+    """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
+    was received: from the mean ``(C, N)`` after the measurement before, the ``Measurement`` and the parameters."""
+    predicted: tuple[Predicted, ...] = ()
+    """What is predicted, at least m, the main ones first."""
+    plane: tuple[str, ...] = ()
+    """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
+    empty where they may not."""
+    longest_interval: float = float("inf")
+    """Between measurements, s: what is longer in a table is taken for another unit."""

@@ -1,0 +1,173 @@
+"""Cleaning of one recorded flight: units that cannot be, positions far off the track, gaps and jumps."""
+
+import itertools
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ..contract.parameters import Limits, check, freeze
+from .plausibility import check_speed, check_velocity, find_outliers, speeds_of
+from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Cleaning(NamedTuple):
+    """Where the radar is, and what a flight may look like; see :func:`~.flights.read_flights`."""
+
+    site: tuple[float, float] | None
+    longest_gap: float
+    speeds: tuple[float, float]
+    reach: float
+    smoothing: float
+
+    def check(self) -> None:
+        """Raise ValueError if a limit cannot be."""
+        check("longest_gap", self.longest_gap, float, Limits(above=0.0))
+        check("speeds", freeze(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
+        check("reach", self.reach, float, Limits(above=0.0))
+        check("smoothing", self.smoothing, float, Limits(at_least=0.0))
+
+
+CLEANING_COUNTS: dict[str, Any] = {
+    "ground": (("row on the ground", "rows on the ground"), lambda limits: ""),
+    "missing": (("row without position", "rows without position"), lambda limits: ""),
+    "repeated": (("repeated position",), lambda limits: ""),
+    "far": (("row", "rows"), lambda limits: f" beyond {limits.reach / 1e3:g} km"),
+    "outliers": (("outlier",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
+    "gaps": (("gap",), lambda limits: f" over {limits.longest_gap:g} s"),
+    "jumps": (("jump",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
+}
+"""What is counted while a flight is cleaned, and how it is told."""
+
+
+LANDED = 1800.0
+"""s; after a longer gap an aircraft flies another flight."""
+
+
+def clean_flight(
+    name: str, rows: "pandas.DataFrame", limits: Cleaning
+) -> tuple[list[Trajectory], dict[str, int]]:
+    """Cut one flight into pieces.
+
+    Args:
+        name: of the flight.
+        rows: with the columns time (s), x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
+            longitude these too; ground, whether it is on the ground.
+        limits: what it may look like.
+
+    Returns:
+        The pieces, and how much of what ``CLEANING_COUNTS`` names there was.
+
+    Raises:
+        ValueError: if it cannot be a flight, with the likely cause.
+    """
+    counts = dict.fromkeys(CLEANING_COUNTS, 0)
+
+    def keep(good: Any, what: str) -> None:
+        nonlocal rows
+        counts[what] += int((~good).sum())
+        rows = rows[good]
+
+    degrees = [column for column in ("latitude", "longitude") if column in rows]
+    rates = [column for column in ("vx", "vy") if column in rows]
+    if degrees:
+        # A receiver repeats the last position where it has no new one, and the altitude goes on.
+        rows = rows.assign(repeated=(rows[degrees].diff() == 0.0).all(axis=1))
+    keep(~rows["ground"], "ground")
+    keep(rows[["x", "y", *rates]].notna().all(axis=1), "missing")
+    time = rows["time"].to_numpy()
+    steps = numpy.diff(time)
+    if (steps <= 0.0).any():
+        row = int((steps <= 0.0).argmax()) + 1
+        raise ValueError(f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s")
+    if degrees:
+        keep(~rows["repeated"], "repeated")
+        keep(numpy.hypot(rows["x"], rows["y"]) <= limits.reach, "far")
+        if rows.empty:
+            raise ValueError(f"it never comes within {limits.reach / 1e3:g} km of the site")
+    if len(rows) < 2:
+        raise ValueError(f"a flight needs at least two positions, got {len(rows)}")
+    _check_units(*_arrays(rows), limits)
+    highest = limits.speeds[1]
+
+    time, position, _ = _arrays(rows)
+    keep(~find_outliers(time, position, lambda elapsed: highest * elapsed), "outliers")
+    time, position, velocity = _arrays(rows)
+    gaps, jumps = numpy.diff(time) > limits.longest_gap, speeds_of(time, position) > highest
+    counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
+    ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
+    parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+    long = [part for part in parts if part.stop - part.start > 1]
+    begins = [True, *(time[b.start] - time[a.stop - 1] > LANDED for a, b in itertools.pairwise(long))]
+    flights = numpy.cumsum(begins).tolist()
+    pieces = []
+    for number, (part, flight) in enumerate(zip(long, flights, strict=True), 1):
+        flown, moving = position[part], None if velocity is None else velocity[part]
+        if limits.smoothing and len(flown) >= FEWEST_IN_WINDOW:
+            flown, moving = fit_parabolas(time[part], flown, limits.smoothing)
+        own = name if len(parts) == 1 else f"{name} {number}/{len(long)}"
+        whole = name if flights[-1] == 1 else f"{name} flight {flight}"
+        pieces.append(Trajectory(time[part], flown, moving, own, whole))
+    return pieces, counts
+
+
+def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
+    """Times ``(n,)``, positions and velocities ``(n, 2)``."""
+    # In the order of rows in memory, on which the last bit of a fit depends.
+    pairs = [
+        numpy.ascontiguousarray(rows[[*pair]].to_numpy())
+        for pair in (("x", "y"), ("vx", "vy"))
+        if pair[0] in rows
+    ]
+    return rows["time"].to_numpy(), pairs[0], pairs[1] if len(pairs) > 1 else None
+
+
+FEWEST_IN_WINDOW = 5
+"""Positions that a parabola is fitted to at least."""
+
+
+def fit_parabolas(
+    time: numpy.ndarray, position: numpy.ndarray, half_width: float
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Position and velocity of the parabolas that fit best around each time.
+
+    Args:
+        time: s, ``(n,)``, n >= ``FEWEST_IN_WINDOW``.
+        position: m, ``(n, 2)``.
+        half_width: of the window on either side, s; where it holds few positions it is as wide as it takes.
+    """
+    count = len(time)
+    row = numpy.arange(count)
+    first = numpy.minimum(numpy.searchsorted(time, time - half_width), row - FEWEST_IN_WINDOW // 2)
+    first = first.clip(0, count - FEWEST_IN_WINDOW)
+    last = numpy.maximum(numpy.searchsorted(time, time + half_width, side="right"), first + FEWEST_IN_WINDOW)
+    widest = int((last - first).max())
+    found = numpy.empty((count, 3, 2))
+    portion = max(1_000_000 // widest, 1)  # bounded memory
+    for begin in range(0, count, portion):
+        some = slice(begin, begin + portion)
+        index = first[some, None] + numpy.arange(widest)
+        inside = (index < last[some, None]).astype(float)
+        index = index.clip(None, count - 1)
+        away = (time[index] - time[some, None]) / half_width
+        powers = inside[..., None] * numpy.stack([away**0, away, away**2], axis=-1)
+        turned = powers.swapaxes(-1, -2)
+        found[some] = numpy.linalg.solve(turned @ powers, turned @ position[index])
+    return found[:, 0], found[:, 1] / half_width
+
+
+def _check_units(
+    time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: Cleaning
+) -> None:
+    """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
+    check_speed(time, position, limits.speeds)
+    step = float(numpy.median(numpy.diff(time)))
+    if step > limits.longest_gap:
+        raise ValueError(
+            f"its positions are {step:g} s apart, longer than the longest gap of {limits.longest_gap:g} s: allow a "
+            "longer gap"
+        )
+    if velocity is not None:
+        check_velocity("vx, vy", time, position, velocity)

@@ -1,0 +1,384 @@
+"""Whether what a file says of a track can be true: units, clocks, and positions that no target can reach.
+
+Flights (:mod:`.flight_cleaning`) and recordings (:func:`check_recording`) use these checks. What cannot be is refused
+in one sentence with the likely cause. What is possible and noteworthy becomes a note: nothing of a recording is changed
+or left out, because a sensor may have said it.
+"""
+
+import difflib
+import itertools
+import math
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+if TYPE_CHECKING:
+    from ..contract.task import Task
+    from .recording import Recording
+
+HARDEST = 100.0
+"""m/s^2; no target accelerates more: ten g."""
+FEWEST = 10
+"""Values from which on noise is estimated."""
+MOST_NOTES = 10
+"""Of a file; the rest is counted."""
+SPEED_UNITS = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
+"""Numbers of a unit in one m/s."""
+DEVIATIONS = ("sigma", "std", "stddev", "deviation", "variance", "var", "accuracy", "uncertainty", "rms")
+"""Words in the names of columns that say how large errors are."""
+
+
+def speeds_of(time: numpy.ndarray, position: numpy.ndarray) -> numpy.ndarray:
+    """Speed from each position ``(n, k)`` to the next, m/s, ``(n - 1,)``."""
+    return numpy.asarray(_length(numpy.diff(position, axis=0)) / numpy.diff(time))
+
+
+def _length(vectors: numpy.ndarray) -> numpy.ndarray:
+    return numpy.asarray(numpy.sqrt(numpy.square(vectors).sum(axis=-1)))
+
+
+def check_speed(
+    time: numpy.ndarray,
+    position: numpy.ndarray,
+    speeds: tuple[float, float],
+    sigma: float = 0.0,
+    moving: bool = True,
+) -> None:
+    """Check that positions in metres and times in seconds give a possible speed.
+
+    Args:
+        time: s, ``(n,)``, increasing.
+        position: m, ``(n, k)``.
+        speeds: lowest and highest that are possible, m/s.
+        sigma: of the error of a position, m, which looks like speed.
+        moving: whether a target that stands still cannot be.
+
+    Raises:
+        ValueError: with the likely cause, if the median speed is out of the limits.
+    """
+    speed = float(numpy.median(speeds_of(time, position)))
+    step = float(numpy.median(numpy.diff(time)))
+    lowest, highest = speeds
+    if moving and speed < lowest:
+        inside = position.shape[1] == 2 and any(
+            (numpy.abs(position) <= limits).all() for limits in ((360.0, 90.0), (90.0, 360.0))
+        )
+        if inside and 10.0 <= 111e3 * speed <= 400.0:
+            cause = "are x, y degrees? then call them longitude and latitude"
+        elif lowest <= 1e3 * speed <= highest:
+            cause = "are the times milliseconds?" if step >= 100.0 else "are x, y kilometres?"
+        else:
+            cause = "does it move at all? else allow lower speeds"
+        raise ValueError(f"median speed {speed:.2g} m/s: {cause}")
+    if speed - 4.0 * sigma / step > highest:
+        factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+        unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
+        cause = (
+            f"are the times {unit}?"
+            if unit
+            else "are x, y metres and the times seconds? else allow higher speeds"
+        )
+        raise ValueError(f"median speed {speed:.4g} m/s: {cause}")
+
+
+def check_velocity(what: str, time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray) -> None:
+    """Check that velocities are what exact positions say.
+
+    Args:
+        what: names of the velocities.
+        time: s, ``(n,)``.
+        position: m, ``(n, k)``.
+        velocity: m/s, ``(n, k)``.
+
+    Raises:
+        ValueError: with the likely unit, if not.
+    """
+    speed = float(numpy.median(speeds_of(time, position)))
+    if not speed:
+        return
+    ratio = float(numpy.median(_length(velocity))) / speed
+    if not 0.8 <= ratio <= 1.25:
+        unit = next((unit for unit, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < 0.05), None)
+        raise ValueError(
+            f"{what} are {ratio:.3g} times what the positions say: "
+            + (f"are they {unit}?" if unit else "are they m/s, and the positions metres?")
+        )
+
+
+def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
+    """Raise ValueError for angles beyond so many degrees."""
+    largest = float(numpy.nanmax(numpy.abs(values), initial=0.0))
+    if largest > most:
+        cause = ": is it metres?" if largest > 1000.0 else ""
+        raise ValueError(
+            f"{name} reaches {largest:g}, and degrees from {-most:g} to {most:g} are expected{cause}"
+        )
+
+
+def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma: float) -> None:
+    """Check that bearings are degrees.
+
+    Args:
+        name: of the column.
+        time: s, ``(n,)``.
+        values: ``(n,)``, NaN where there is none.
+        sigma: stated standard deviation, degrees.
+
+    Raises:
+        ValueError: for angles beyond a full turn, and for such that lie and scatter as radians do.
+    """
+    check_degrees(name, values, 360.0)
+    there = numpy.isfinite(values)
+    if there.sum() < FEWEST or numpy.nanmax(numpy.abs(values)) > 2.0 * math.pi:
+        return
+    scatter = float(numpy.median(numpy.abs(_deviations(time[there], values[there, None])))) * 1.4826
+    if 0.25 < math.degrees(scatter) / sigma < 4.0:
+        raise ValueError(
+            f"{name} scatters by {scatter:.2g} degrees where {sigma:g} are stated, and stays within 2 pi: is it "
+            "radians? else state its deviation"
+        )
+
+
+def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarray) -> None:
+    """Raise ValueError if the one of two series of the same positions, ``(n, k)``, is metres and the other kilometres;
+    NaN where there is none.
+    """
+    extents = [
+        _length(numpy.nanmax(values, axis=0) - numpy.nanmin(values, axis=0)) for values in (one, other)
+    ]
+    for (name, extent), (against, least) in itertools.permutations(zip(names, extents, strict=True)):
+        if 0.5 * extent < 1e3 * least < 2.0 * extent:
+            raise ValueError(
+                f"{name} extends over {extent:.3g} m and {against} over {least:.3g} m: is {against} kilometres?"
+            )
+
+
+def check_interval(step: float, longest: float) -> None:
+    """Raise ValueError if times are farther apart than measurements of a sensor are, s."""
+    if step > longest:
+        raise ValueError(
+            f"times are {step:g} s apart, and at most {longest:g} s are expected: are they milliseconds? else name "
+            "sampling_interval"
+        )
+
+
+def find_outliers(
+    time: numpy.ndarray, position: numpy.ndarray, reach: Callable[[numpy.ndarray], Any]
+) -> numpy.ndarray:
+    """Return which positions lie off the track: too far from the one before and the next, which agree, ``(n,)``.
+
+    Args:
+        time: s, ``(n,)``.
+        position: m, ``(n, k)``.
+        reach: how far apart two positions can be that lie so many seconds apart, m.
+    """
+
+    def far(apart: int) -> numpy.ndarray:
+        moved = _length(position[apart:] - position[:-apart])
+        return numpy.asarray(moved > reach(time[apart:] - time[:-apart]))
+
+    alone = numpy.zeros(len(time), dtype=bool)
+    if len(time) > 2:
+        alone[1:-1] = far(1)[:-1] & far(1)[1:] & ~far(2)
+    return alone
+
+
+def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
+    """Deviation of values ``(n, k)`` from the line through their neighbours, each as large as their noise,
+    ``(n - 2, k)``.
+    """
+    before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, None]
+    line = before * values[:-2] + (1.0 - before) * values[2:]
+    return numpy.asarray((values[1:-1] - line) / numpy.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
+
+
+def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str]:
+    """Return the notes on columns of a table that nobody reads.
+
+    Args:
+        names: of the columns, in lower case.
+        known: names that are read.
+
+    Raises:
+        ValueError: for a name that is nearly a known one, or says how large errors are: who wrote it wants it read.
+    """
+    given, known = list(names), list(known)
+    ignored = [name for name in given if name not in known]
+    for name in ignored:
+        close = [k for k in difflib.get_close_matches(name, known, n=3, cutoff=0.75) if k not in given]
+        deviations = [k for k in known if "sigma" in k and k not in given]
+        if not close and any(word in DEVIATIONS for word in name.replace("-", "_").split("_")):
+            close = deviations
+        if close:
+            raise ValueError(
+                f"it has the column {name}, which is not read: did you mean {' or '.join(close)}? else leave it out"
+            )
+    return [f"not read: column{'s' * (len(ignored) > 1)} {', '.join(ignored)}"] if ignored else []
+
+
+# --- recordings
+
+
+def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, float]) -> list[str]:
+    """Check every episode of a recording.
+
+    Args:
+        recording: what was read.
+        task: that replays it.
+        speeds: lowest and highest that are possible, m/s; the lowest holds where targets always
+            move, see :class:`.LogFormat`.
+
+    Returns:
+        What is noteworthy, a line each.
+
+    Raises:
+        ValueError: for the first episode that cannot be true.
+    """
+    world: Any = task.world  # a RecordedWorld
+    moving = task.log_format is not None and task.log_format.targets_move
+    seen, sigma = world.all_observations()
+    metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
+    measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
+    usual = getattr(task.parameters, "sampling_interval", None)
+    notes: list[str] = []
+    first = 0
+    for episode, rows in enumerate(recording.rows.tolist()):
+        own, first = slice(first, first + rows), first + rows
+        name = f"recording {recording.names[episode]!r}: " if len(recording.names) > 1 else ""
+        time = recording.seconds[episode, :rows]
+        truth = None if recording.truth is None else recording.truth[episode, :rows]
+        try:
+            if usual is not None and rows > 1:
+                check_interval(float(numpy.median(numpy.diff(time))), 100.0 * usual)
+            if measured:
+                there = numpy.isfinite(seen[measured, own]).all(axis=0)
+                position, deviation = seen[measured, own].T[there], _length(sigma[measured, own].T[there])
+            known = len(measured) > 0 and there.sum() >= 3
+            if known:
+                _check_scale(time[there], position, deviation, speeds, moving)
+            if truth is not None and rows >= 3:
+                _check_truth(time, truth, [component.name for component in task.components])
+            if not known:
+                continue
+            if truth is not None:
+                _check_apart(position, truth[there][:, measured], deviation)
+            found = _notes(time[there], position, deviation, 1 + numpy.flatnonzero(there), moving)
+        except ValueError as error:
+            raise ValueError(f"{name}{error}") from error
+        notes += [f"{name}{note}" for note in found]
+    return limit_notes(notes)
+
+
+def limit_notes(notes: list[str]) -> list[str]:
+    """Return as many notes as somebody reads, and count the rest."""
+    more = [f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)
+    return [*notes[:MOST_NOTES], *more]
+
+
+def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) -> None:
+    """Check true velocities against the differences of true positions."""
+    pairs = [
+        (i, names.index(rate))
+        for i, name in enumerate(names)
+        for rate in (name.replace("position", "velocity"), f"{name}_rate")
+        if rate != name and rate in names
+    ]
+    if pairs:
+        places, rates = map(list, zip(*pairs, strict=True))
+        what = ", ".join(f"truth_{names[i]}" for i in rates)
+        known = numpy.isfinite(truth[:, [*places, *rates]]).all(axis=1)
+        if known.sum() >= 3:
+            check_velocity(what, time[known], truth[known][:, places], truth[known][:, rates])
+
+
+def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
+    """Raise ValueError if the truth is nowhere near what was measured."""
+    known = numpy.isfinite(truth).all(axis=1)
+    if not known.any():
+        return
+    position, truth, sigma = position[known], truth[known], sigma[known]
+    apart = float(numpy.median(_length(position - truth)))
+    if apart > 100.0 * float(numpy.median(sigma)):
+        ratio = float(numpy.median(_length(truth)) / numpy.median(_length(position)))
+        cause = "kilometres" if 0.5 < 1e3 * ratio < 2.0 else "metres, of the same origin and the same clock"
+        raise ValueError(f"truth lies {apart:,.0f} m from what was measured: is it {cause}?")
+
+
+def _check_scale(
+    time: numpy.ndarray,
+    position: numpy.ndarray,
+    sigma: numpy.ndarray,
+    speeds: tuple[float, float],
+    moving: bool,
+) -> None:
+    """Check that measured positions are metres, by their speed and by their noise."""
+    check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
+    if len(time) < FEWEST:
+        return
+    # From end to end: from one to the next a speed may be all noise.
+    speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))
+    noise = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, position))))
+    stated = float(numpy.median(sigma)) / math.sqrt(position.shape[1])
+    if 0.25 < 1e3 * noise / stated < 4.0 and speed < 1.0 <= 1e3 * speed <= speeds[1]:
+        raise ValueError(
+            f"positions scatter by {noise:.2g} m where {stated:.3g} m are stated, at a speed of {speed:.2g} m/s: "
+            "are they kilometres? else state their deviation"
+        )
+
+
+def _notes(
+    time: numpy.ndarray, position: numpy.ndarray, sigma: numpy.ndarray, number: numpy.ndarray, moving: bool
+) -> list[str]:
+    """Return what is noteworthy of the measured positions of one episode.
+
+    Args:
+        time: s, ``(n,)``.
+        position: m, ``(n, k)``.
+        sigma: stated, m, ``(n,)``.
+        number: of each measurement.
+        moving: whether a target that stands still cannot be.
+
+    Raises:
+        ValueError: if the clock jumped, and not the target.
+    """
+    moved, steps = _length(numpy.diff(position, axis=0)), numpy.diff(time)
+    step, error, notes = float(numpy.median(steps)), float(numpy.median(sigma)), []
+    for gap in numpy.flatnonzero(steps > max(10.0 * step, 60.0)).tolist():
+        where = f"between measurements {number[gap]} and {number[gap + 1]}"
+        usual = 3.0 * float(numpy.median(moved)) + 6.0 * error
+        if moving and moved[gap] < usual < 0.3 * steps[gap] * float(numpy.median(moved / steps)):
+            raise ValueError(
+                f"{steps[gap]:,.0f} s pass {where}, in which the target moves {moved[gap]:,.0f} m: did the clock "
+                "change, as in daylight saving time? Write times in UTC, or cut it there"
+            )
+        notes.append(f"nothing was received for {steps[gap]:,.0f} s {where}")
+    # What is usual nearby: noise is not the same everywhere.
+    around = numpy.pad(moved, (5, 4), mode="edge")
+    nearby = numpy.median(numpy.lib.stride_tricks.sliding_window_view(around, 10), axis=1)
+
+    def reach(elapsed: numpy.ndarray) -> numpy.ndarray:
+        usual = numpy.maximum(nearby[: len(elapsed)], nearby[-len(elapsed) :])
+        return numpy.asarray(
+            5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * HARDEST * elapsed**2
+        )
+
+    alone = find_outliers(time, position, reach)
+    if alone.any():
+        farthest = float(_length(_deviations(time, position)).max())
+        notes.append(
+            f"{_list_measurements(number[alone])} off the track, by up to {farthest:,.0f} m: an outlier decides every "
+            "mean of likelihoods"
+        )
+    repeated = numpy.append(False, moved == 0.0)
+    if repeated.any():
+        notes.append(
+            f"{_list_measurements(number[repeated])} the same as before: does the sensor repeat its last value?"
+        )
+    return notes
+
+
+def _list_measurements(numbers: numpy.ndarray) -> str:
+    """Name some measurements, and count them."""
+    shown = ", ".join(map(str, numbers[:5].tolist())) + ", ..." * (len(numbers) > 5)
+    return f"measurement {shown} is" if len(numbers) == 1 else f"{len(numbers):,} measurements ({shown}) are"

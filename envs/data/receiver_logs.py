@@ -1,0 +1,620 @@
+"""Logs of receivers in formats of their own, as columns by the names that tables have.
+
+* RTKLIB's ``.pos``: geodetic or Earth-fixed positions or baselines in metres, with standard deviations.
+* NMEA 0183, ``.nmea``: positions of GGA and RMC, standard deviations of GST.
+* ULog of PX4, ``.ulg``: positions of the topic ``vehicle_gps_position``, or ``sensor_gps``.
+* Bags of ROS 1, ``.bag``, and of ROS 2, ``.db3`` or ``.mcap``: ``NavSatFix``, with ``Odometry`` for a second sensor, or
+  positions of ``Odometry`` or of poses.
+
+What each becomes is a table with ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x``, ``sigma_y``, as far
+as the log knows them, or ``x`` and ``y`` of a baseline. Libraries that read the last three are imported when such a
+file is read. A file is data and nothing more: no code, type or path that it holds is used, and what is too large is
+refused before it fills the memory.
+"""
+
+import bz2
+import contextlib
+import datetime
+import functools
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ...filters.geodesy import east_north_up, geodetic
+
+if TYPE_CHECKING:
+    import pandas
+
+LONGEST_LINE = 4096
+"""Bytes; what goes on is taken for another line."""
+MOST_BROKEN = 0.5
+"""Share of lines that may be broken: more is a file of another kind."""
+MOST_CHUNK = 256_000_000
+"""Bytes of a part of a bag when it is unpacked."""
+EXTRA = "pip install 'filtergym[logs]'"
+DAY = 86400.0
+WEEK = 7 * DAY
+
+
+class ReceiverLog(NamedTuple):
+    """What was read of a log."""
+
+    columns: Mapping[str, Any]
+    """By name, of one length."""
+    notes: tuple[str, ...] = ()
+    """What is to be told of the reading, a line each."""
+
+
+def _count_of(count: int, what: str) -> str:
+    return f"{count:,} {what}{'s' * (count != 1)}"
+
+
+def _check_rows(count: int, most: int) -> None:
+    if count > most:
+        raise ValueError(f"it has more than {most:,} rows: split it, or keep fewer a second")
+
+
+def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
+    """Return the note on lines that were left out.
+
+    Raises:
+        ValueError: if most lines are broken.
+    """
+    if count > MOST_BROKEN * (count + good):
+        raise ValueError(f"{_count_of(count, 'line')} of {count + good:,} {what}: is it whole?")
+    return (f"{_count_of(count, 'line')} {what}: left out",) if count else ()
+
+
+def _read_lines(file: Path) -> Iterator[bytes]:
+    with file.open("rb") as content:
+        while line := content.readline(LONGEST_LINE):
+            yield line
+
+
+# --- RTKLIB
+
+QUALITY = ("none", "fixed", "float", "SBAS", "DGPS", "single", "PPP")
+"""Of a solution, by its number."""
+
+
+def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
+    """Read a solution of RTKLIB, as its manual 2.4.2, B.1, describes it.
+
+    Args:
+        file: its path.
+        most_rows: that it may have.
+
+    Raises:
+        ValueError: if it is none, or larger.
+    """
+    names: list[str] = []
+    system, rows, broken = "", [], 0
+    for line in _read_lines(file):
+        text = line.decode("utf-8", "replace").strip().lstrip("\ufeff")
+        if text.startswith("%"):
+            words = text.lstrip("% ").replace(",", " ").split()
+            if words and words[0] in ("GPST", "UTC", "JST"):
+                system, names = words[0], [re.sub(r"\(.*", "", word) for word in words[1:]]
+                if any("'" in word for word in words):
+                    raise ValueError(
+                        "latitude and longitude are degrees, minutes and seconds: write them as ddd.ddddddd"
+                    )
+            continue
+        cells = re.split(r"[,;\s]+", text)
+        if not text:
+            continue
+        if not names:
+            raise ValueError(
+                "it lacks RTKLIB's line with the names of its columns, such as % GPST latitude(deg) longitude(deg)"
+            )
+        try:
+            # What newer versions append, such as velocities, has names of its own.
+            rows.append((*_rtklib_time(cells), *map(float, cells[2 : 2 + len(names)])))
+            if len(rows[-1]) != 2 + len(names):
+                rows.pop()
+                raise ValueError
+        except ValueError:
+            broken += 1
+        _check_rows(len(rows), most_rows)
+    notes = _note_broken(broken, len(rows), "are no solutions")
+    if not rows:
+        raise ValueError("it holds no solution of RTKLIB")
+    written, seconds, *values = zip(*rows, strict=True)
+    found = dict(zip(names, map(numpy.array, values), strict=True))
+    columns, said = _rtklib_positions(found)
+    notes += said
+    if "Q" in found:
+        counted = Counter(QUALITY[int(q)] if 0 <= q < len(QUALITY) else f"{q:g}" for q in found["Q"].tolist())
+        notes += (f"quality: {', '.join(f'{count:,} {name}' for name, count in counted.most_common())}",)
+    dates = all(written)
+    notes += (f"times are {system}" if dates else f"times are seconds of {system} since 1980",)
+    return ReceiverLog({"time": list(written) if dates else numpy.array(seconds), **columns}, notes)
+
+
+def _rtklib_time(cells: Sequence[str]) -> tuple[str, float]:
+    """Date and time as they are written; or of a week and its seconds, seconds since 1980 and no date."""
+    if "/" in cells[0]:
+        return f"{cells[0]} {cells[1]}", 0.0
+    return "", WEEK * int(cells[0]) + float(cells[1])
+
+
+def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Positions and deviations, and what is to be told of them."""
+    if {"latitude", "longitude"} <= {*found}:
+        columns = {"latitude": found["latitude"], "longitude": found["longitude"]}
+        if "height" in found:
+            columns["altitude"] = found["height"]
+        if {"sde", "sdn"} <= {*found}:
+            columns |= {"sigma_x": found["sde"], "sigma_y": found["sdn"]}
+        return columns, ()
+    if {"e-baseline", "n-baseline"} <= {*found}:
+        columns = {"x": found["e-baseline"], "y": found["n-baseline"]}
+        if {"sde", "sdn"} <= {*found}:
+            columns |= {"sigma_x": found["sde"], "sigma_y": found["sdn"]}
+        return columns, ("x is east and y north of RTKLIB's base station",)
+    axes = ["x-ecef", "y-ecef", "z-ecef"]
+    if {*axes} <= {*found}:
+        latitude, longitude, height = geodetic(numpy.stack([found[axis] for axis in axes]))
+        columns = {
+            "latitude": numpy.degrees(latitude),
+            "longitude": numpy.degrees(longitude),
+            "altitude": height,
+        }
+        deviations = ["sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"]
+        if {*deviations} <= {*found}:
+            sigmas = numpy.stack([found[name] for name in deviations])
+            columns |= _rotate_sigmas(sigmas, float(latitude[0]), float(longitude[0]))
+        return columns, ()
+    raise ValueError(
+        f"RTKLIB wrote {', '.join(found)}; what is read are latitude and longitude, x-ecef and so on, or e-baseline "
+        "and so on"
+    )
+
+
+def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
+    """Deviations east and north of Earth-fixed ones.
+
+    Args:
+        sigmas: of x, y, z, and roots of their covariances xy, yz, zx with the signs of these, ``(6, n)``.
+        latitude: rad, likewise what follows.
+        longitude: of where east and north are.
+    """
+    xx, yy, zz, xy, yz, zx = numpy.sign(sigmas) * sigmas**2
+    covariance = numpy.array([[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]])
+    rotation = east_north_up(latitude, longitude)
+    variance = numpy.einsum("ij,jkn,ik->in", rotation, covariance, rotation)
+    # Rounded as they are written, covariances of little deviations may not be positive.
+    east, north, _ = numpy.sqrt(numpy.maximum(variance, 1e-8))
+    return {"sigma_x": east, "sigma_y": north}
+
+
+# --- NMEA
+
+SENTENCE = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GST),[^\r\n$]*")
+
+
+class _Epoch:
+    """What sentences say of one time."""
+
+    def __init__(self, time: float) -> None:
+        self.time = time
+        self.date: datetime.date | None = None
+        self.place: tuple[float, float] | None = None
+        self.altitude = math.nan
+        self.sigmas: tuple[float, float] | None = None
+        self.positioned = False
+        """Whether a sentence that gives positions was there."""
+
+
+def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
+    """Read GGA, RMC and GST of NMEA 0183; other sentences are passed over.
+
+    Args:
+        file: its path; lines may begin with something else, such as a time of the logger.
+        most_rows: that it may have.
+
+    Raises:
+        ValueError: if it holds none, or more.
+    """
+    try:
+        import pynmea2
+    except ImportError as error:
+        raise ValueError(f"NMEA needs one more package: {EXTRA}") from error
+    epochs: list[_Epoch] = []
+    good = broken = 0
+    for line in _read_lines(file):
+        for found in SENTENCE.findall(line):
+            try:
+                message = pynmea2.parse(found.decode("ascii").strip(), check=True)
+                _add_sentence(message, epochs)
+                good += 1
+            except (ValueError, TypeError, AttributeError, pynmea2.ParseError):
+                broken += 1
+        _check_rows(len(epochs), most_rows)
+    epochs = [epoch for epoch in epochs if epoch.positioned]
+    if not epochs:
+        raise ValueError(f"it holds no sentence GGA or RMC that is whole, and {broken:,} broken ones")
+    notes = _note_broken(broken, good, "have a wrong checksum or are no sentence")
+    days = _find_dates(epochs)
+    places = numpy.array([epoch.place or (math.nan, math.nan) for epoch in epochs])
+    columns: dict[str, Any] = {"latitude": places[:, 0], "longitude": places[:, 1]}
+    columns["time"] = [_format_time(epoch.time, day) for epoch, day in zip(epochs, days, strict=True)]
+    columns["altitude"] = numpy.array([epoch.altitude for epoch in epochs])
+    if any(epoch.sigmas for epoch in epochs):
+        columns |= _fill_sigmas([epoch.sigmas for epoch in epochs])
+    else:
+        notes += (
+            "no GST sentence says how large errors are: HDOP tells how satellites stand, and no metres",
+        )
+    missing = int(numpy.isnan(places[:, 0]).sum())
+    if missing:
+        notes += (f"{_count_of(missing, 'time')} without a position",)
+    return ReceiverLog(columns, notes)
+
+
+def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
+    """Add what a sentence says to the epoch of its time.
+
+    Raises:
+        ValueError: for what is no number or no time.
+        AttributeError: likewise.
+    """
+    clock: datetime.time = message.timestamp
+    time = 3600.0 * clock.hour + 60.0 * clock.minute + clock.second + 1e-6 * clock.microsecond
+    kind = message.sentence_type
+    place, altitude, sigmas = None, math.nan, None
+    if kind == "GST":
+        sigmas = float(message.std_dev_longitude), float(message.std_dev_latitude)
+    elif message.gps_qual > 0 if kind == "GGA" else message.status == "A":
+        if not message.lat or not message.lon:
+            raise ValueError("a position that is none")
+        place = float(message.latitude), float(message.longitude)
+        if kind == "GGA" and message.altitude is not None:
+            altitude = float(message.altitude) + float(message.geo_sep or 0.0)
+    if not epochs or epochs[-1].time != time:
+        epochs.append(_Epoch(time))
+    epoch = epochs[-1]
+    epoch.positioned |= kind != "GST"
+    epoch.place, epoch.sigmas = epoch.place or place, epoch.sigmas or sigmas
+    if not math.isnan(altitude):
+        epoch.altitude = altitude
+    if kind == "RMC" and isinstance(message.datestamp, datetime.date):
+        epoch.date = message.datestamp
+
+
+def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
+    """Date of every epoch, of which some say it; None if none does."""
+    known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
+    if known is None:
+        return [None] * len(epochs)
+    # Midnight lies where a time of day comes back by more than half a day.
+    steps = numpy.diff([epoch.time for epoch in epochs]) < -0.5 * DAY
+    nights = numpy.append(0, numpy.cumsum(steps))
+    first: Any = epochs[known].date
+    found, shift = [], 0
+    for epoch, night in zip(epochs, (nights - nights[known]).tolist(), strict=True):
+        if epoch.date is not None:
+            shift = (epoch.date - first).days - night
+        found.append(first + datetime.timedelta(days=night + shift))
+    return found
+
+
+def _format_time(time: float, day: datetime.date | None) -> str:
+    """Time of day, with its date where it is known."""
+    clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
+    return clock if day is None else f"{day.isoformat()}T{clock}Z"
+
+
+def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
+    """Deviations east and north; where none are said, those said before, and at first those said next."""
+    import pandas
+
+    said = pandas.DataFrame([pair or (math.nan, math.nan) for pair in sigmas], columns=["sigma_x", "sigma_y"])
+    return {str(name): values.to_numpy() for name, values in said.ffill().bfill().items()}
+
+
+# --- ULog
+
+TOPICS = ("vehicle_gps_position", "sensor_gps")
+"""With positions of a receiver, the first that a log has."""
+
+
+def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
+    """Read positions of the receiver from a log of PX4.
+
+    Reading: ``eph`` is the deviation of the distance in the plane, so that of each axis is ``eph / sqrt(2)``.
+
+    Args:
+        file: its path.
+        most_rows: that it may have.
+
+    Raises:
+        ValueError: if it holds none, or more.
+    """
+    try:
+        import pyulog
+    except ImportError as error:
+        raise ValueError(f"ULog needs one more package: {EXTRA}") from error
+    # The library prints what it finds strange.
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
+        log = pyulog.ULog(str(file), list(TOPICS))
+    held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
+    chosen = min(held, key=lambda key: (TOPICS.index(key[0]), key[1]), default=None)
+    if chosen is None:
+        raise ValueError(f"it holds neither {' nor '.join(TOPICS)}")
+    data = held[chosen]
+    _check_rows(len(data["timestamp"]), most_rows)
+
+    def column(*names: tuple[str, float]) -> Any:
+        """Return the first of some fields, in units of so much."""
+        return next((data[name] * unit for name, unit in names if name in data), None)
+
+    places = {
+        "latitude": column(("latitude_deg", 1.0), ("lat", 1e-7)),
+        "longitude": column(("longitude_deg", 1.0), ("lon", 1e-7)),
+        "altitude": column(("altitude_ellipsoid_m", 1.0), ("alt_ellipsoid", 1e-3)),
+    }
+    if places["latitude"] is None or places["longitude"] is None:
+        raise ValueError(f"its {chosen[0]} has no latitude and longitude; it has {', '.join(data)}")
+    # From 2 on a fix has a position in the plane.
+    fixed = data["fix_type"] >= 2 if "fix_type" in data else numpy.ones(len(data["timestamp"]), dtype=bool)
+    columns = {"time": 1e-6 * data["timestamp"]}
+    columns |= {name: numpy.where(fixed, v, math.nan) for name, v in places.items() if v is not None}
+    if "eph" in data:
+        sigma = data["eph"].astype(float) / math.sqrt(2.0)
+        columns |= {"sigma_x": sigma, "sigma_y": sigma}
+    notes = [f"positions are of {chosen[0]}, times seconds since the start of the autopilot"]
+    if not fixed.all():
+        notes.append(f"{_count_of(int((~fixed).sum()), 'row')} without a fix")
+    return ReceiverLog(columns, tuple(notes))
+
+
+# --- ROS
+
+NAVSAT = "sensor_msgs/msg/NavSatFix"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
+"""Messages with positions, the first that a bag without :data:`NAVSAT` has."""
+UNKNOWN_COVARIANCE, NO_FIX = 0, -1
+
+
+class _Bag(NamedTuple):
+    """An open bag, of ROS 1 or 2."""
+
+    reader: Any
+    parse: Callable[[bytes, str], Any]
+    digests: Callable[[str], str] | None
+    """Of a type's definition as the library knows it; None where a bag holds none."""
+
+    def busiest(self, kind: str) -> tuple[str, int]:
+        """Topic that has most messages of a type, and how many; no topic where there are none."""
+        counts: Counter[str] = Counter()
+        for connection in self.reader.connections:
+            if connection.msgtype == kind:
+                counts[connection.topic] += connection.msgcount
+        return next(iter(counts.most_common(1)), ("", 0))
+
+    def rows(
+        self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int
+    ) -> numpy.ndarray:
+        """Numbers of the messages of a topic, a column each: messages take a hundred times as much.
+
+        Raises:
+            ValueError: if there are none or too many, or they are of another definition.
+        """
+        chosen = [c for c in self.reader.connections if c.topic == topic and c.msgtype == kind]
+        _check_rows(sum(connection.msgcount for connection in chosen), most)
+        if self.digests is not None and any(c.digest != self.digests(kind) for c in chosen):
+            raise ValueError(f"its {kind} is another than that of ROS 1")
+        found = []
+        for _, _, raw in self.reader.messages(chosen):
+            found.append(values(self.parse(raw, kind)))
+            _check_rows(len(found), most)
+        if not found:
+            raise ValueError(f"its topic {topic} has no messages")
+        return numpy.array(found).T
+
+
+@contextlib.contextmanager
+def _open_bag(file: Path) -> Iterator[_Bag]:
+    """Open a bag with types as the library knows them: definitions in a bag become code.
+
+    Raises:
+        ValueError: if the library is missing.
+    """
+    try:
+        from rosbags.rosbag1 import Reader as FirstReader
+        from rosbags.rosbag2 import Reader as SecondReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ValueError(f"a bag needs one more package: {EXTRA}") from error
+    if file.suffix == ".bag":
+        types = get_typestore(Stores.ROS1_NOETIC)
+        with FirstReader(file) as bag:
+            for place, chunk in bag.chunks.items():
+                bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
+            yield _Bag(bag, types.deserialize_ros1, lambda kind: types.generate_msgdef(kind)[1])
+        return
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    # The file alone: metadata.yaml of its folder could name files elsewhere.
+    with _bound_chunks(), SecondReader(file) as bag:
+        yield _Bag(bag, types.deserialize_cdr, None)
+
+
+def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
+    """Read positions from a bag of ROS 1 or a storage file of ROS 2, those of the topic that has the most.
+
+    Messages ``NavSatFix``, and beside them displacements of ``Odometry`` for a second sensor; else positions of
+    ``Odometry`` or of poses, metres in their own frame.
+
+    Args:
+        file: its path.
+        most_rows: that it may have.
+
+    Raises:
+        ValueError: if it holds none, or more.
+    """
+    with _open_bag(file) as bag:
+        topic, _ = bag.busiest(NAVSAT)
+        source, _ = bag.busiest(ODOMETRY)
+        if topic:
+            found = _navsat_columns(bag.rows(topic, NAVSAT, _fix_values, most_rows), topic)
+            if source:
+                found = _add_odometry(found, bag.rows(source, ODOMETRY, _pose_values, most_rows), source)
+            return found
+        for kind in POSES:
+            topic, _ = bag.busiest(kind)
+            if topic:
+                return _pose_columns(bag.rows(topic, kind, _pose_values, most_rows), topic)
+        held = sorted({connection.msgtype for connection in bag.reader.connections})
+        raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(held) or 'nothing'}")
+
+
+def _seconds(header: Any) -> float:
+    return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
+
+
+def _fix_values(fix: Any) -> tuple[float, ...]:
+    """Time, status, latitude, longitude, altitude, variances east and north, and what is known of them."""
+    variances = fix.position_covariance.reshape(3, 3).diagonal()
+    place = fix.latitude, fix.longitude, fix.altitude
+    known = fix.position_covariance_type
+    return _seconds(fix.header), fix.status.status, *place, *variances[:2].tolist(), known
+
+
+def _pose_values(message: Any) -> tuple[float, ...]:
+    """Time, x, y, and their variances, zero where they are not told."""
+    pose, variances = message.pose, (0.0, 0.0)
+    if hasattr(pose, "covariance"):
+        diagonal = pose.covariance.reshape(6, 6).diagonal()
+        pose, variances = pose.pose, (float(diagonal[0]), float(diagonal[1]))
+    return _seconds(message.header), pose.position.x, pose.position.y, *variances
+
+
+def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Return a function that unpacks no more than a chunk of a bag of ROS 1 may have."""
+    packed_by = next((word for word in ("bz2", "lz4") if word in str(decompress.__module__)), "")
+    return lambda packed: _unpack(packed, packed_by)
+
+
+@contextlib.contextmanager
+def _bound_chunks() -> Iterator[None]:
+    """Let the library unpack no more of a chunk of MCAP than that may have."""
+    from rosbags.rosbag2 import storage_mcap
+
+    table: dict[str, Any] = storage_mcap.DECOMPRESSORS
+    before = dict(table)
+    for name in ("lz4", "zstd"):
+        table[name] = functools.partial(lambda name, packed, _: _unpack(packed, name), name)
+    try:
+        yield
+    finally:
+        table.update(before)
+
+
+def _unpack(packed: bytes, packed_by: str) -> bytes:
+    """Unpack a chunk.
+
+    Raises:
+        ValueError: if it is larger than a chunk may be.
+    """
+    if not packed_by:
+        return packed
+    unpacker: Any
+    if packed_by == "lz4":
+        import lz4.frame
+
+        unpacker = lz4.frame.LZ4FrameDecompressor()
+    elif packed_by == "zstd":
+        from rosbags.rosbag2 import storage_mcap
+
+        unpacker = storage_mcap.zstd.ZstdDecompressor()
+    else:
+        unpacker = bz2.BZ2Decompressor()
+    found: bytes = unpacker.decompress(packed, max_length=MOST_CHUNK)
+    if len(found) >= MOST_CHUNK:
+        raise ValueError(f"a part of it is larger than {MOST_CHUNK / 1e6:g} MB")
+    return found
+
+
+def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Columns of messages, of which there are ``values`` as :func:`_fix_values` returns them, ``(8, n)``."""
+    time, status, latitude, longitude, altitude, east, north, covariance_type = values
+    fixed = status != NO_FIX
+    columns = {"time": time, "altitude": altitude}
+    columns["latitude"] = numpy.where(fixed, latitude, math.nan)
+    columns["longitude"] = numpy.where(fixed, longitude, math.nan)
+    notes = [f"positions are of the topic {topic}"]
+    if (covariance_type == UNKNOWN_COVARIANCE).any():
+        notes.append("messages do not say how large errors are")
+    else:
+        columns["sigma_x"] = numpy.sqrt(numpy.maximum(east, 0.0))
+        columns["sigma_y"] = numpy.sqrt(numpy.maximum(north, 0.0))
+    if not fixed.all():
+        notes.append(f"{_count_of(int((~fixed).sum()), 'message')} without a fix")
+    return ReceiverLog(columns, tuple(notes))
+
+
+def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Columns of messages, of which there are ``values`` as :func:`_pose_values` returns them, ``(5, n)``."""
+    time, x, y, *variances = values
+    columns = {"time": time, "x": x, "y": y}
+    notes = (f"positions are of the topic {topic}, metres in its own frame",)
+    if not (numpy.array(variances) > 0.0).all():
+        return ReceiverLog(columns, (*notes, "messages do not say how large errors are"))
+    sigma_x, sigma_y = numpy.sqrt(variances)
+    return ReceiverLog({**columns, "sigma_x": sigma_x, "sigma_y": sigma_y}, notes)
+
+
+def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Add displacements since the row before, of poses ``(5, n)`` as :func:`_pose_values` returns them."""
+    order = numpy.argsort(values[0], kind="stable")
+    time, x, y, *_ = values[:, order]
+    now = log.columns["time"]
+    moved = {}
+    for name, axis in (("odometry_x", x), ("odometry_y", y)):
+        at = numpy.interp(now, time, axis, left=math.nan, right=math.nan)
+        moved[name] = numpy.append(math.nan, numpy.diff(at))
+    if not numpy.isfinite(moved["odometry_x"]).any():
+        return log
+    note = f"the second sensor is the topic {topic}: it must not be made of the positions themselves"
+    return ReceiverLog({**log.columns, **moved}, (*log.notes, note))
+
+
+RECEIVER_READERS: Mapping[str, Callable[[Path, int], ReceiverLog]] = {
+    ".pos": read_rtklib,
+    ".nmea": read_nmea,
+    ".ulg": read_ulog,
+    ".bag": read_rosbag,
+    ".db3": read_rosbag,
+    ".mcap": read_rosbag,
+}
+"""By the end of a file's name."""
+
+
+def receiver_columns(file: Path, suffix: str, most_rows: int) -> tuple["pandas.DataFrame", tuple[str, ...]]:
+    """Return the columns of a log of a receiver, and what is to be told of the reading.
+
+    Args:
+        file: its path.
+        suffix: among ``RECEIVER_READERS``.
+        most_rows: that it may have.
+
+    Raises:
+        ValueError: if it cannot be read.
+    """
+    import pandas
+
+    try:
+        found = RECEIVER_READERS[suffix](file, most_rows)
+    except Exception as error:  # libraries raise whatever a broken file makes them stumble over
+        if isinstance(error, ValueError) and not isinstance(error, UnicodeError):
+            raise
+        raise ValueError(f"it cannot be read as a log {suffix}: {error or type(error).__name__}") from error
+    return pandas.DataFrame(dict(found.columns)), found.notes

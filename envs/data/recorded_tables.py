@@ -1,0 +1,459 @@
+"""Tables of what sensors really said, made into recordings.
+
+An environment says which columns it knows and makes measurements of them (:class:`.LogFormat`). What every table has
+in common is here: times, missing values, rows that come twice, several recordings in one file, latitude and longitude,
+and true values, ``truth_NAME`` for the components of the environment.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ...filters.geodesy import east_north
+from ..contract.log_format import TrackLog
+from ..contract.task import Task
+from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, numbers, read_table, seconds
+from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
+from .recording import Recording, measure_once, side_by_side
+from .truth_files import match_truth, offset_note, read_truth
+
+if TYPE_CHECKING:
+    import pandas
+
+TIME = ("time", "timestamp", "seconds")
+RECORDING = "recording"
+TRUTH = "truth_"
+GEODETIC = ("latitude", "longitude", "altitude")
+"""Columns, of which the last may lack; they may be called as in flights."""
+MOST_TWICE = 0.1
+"""Share of rows that may have the time of the row before and say something else."""
+UNEVEN = 0.01
+"""Share of the sampling interval by which a time may be off where measurements must be regular."""
+
+
+class Columns:
+    """Columns of one recording, in the order of its times.
+
+    Args:
+        name: of the recording.
+        table: numbers by the names of the columns, missing where a cell is empty, with ``time`` in seconds. Its index
+            counts the rows of the file.
+        given: parameters that the user has named.
+        log_time: times as they stand in the file, numbers or words, ``(rows,)``; default: those of the table.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        table: "pandas.DataFrame",
+        given: Mapping[str, Any],
+        log_time: numpy.ndarray | None = None,
+    ) -> None:
+        self.name, self.table, self.given = name, table, given
+        self.log_time = self.time if log_time is None else log_time
+        self.notes: list[str] = []
+        """What was done to the table, a line each."""
+        self.origin: tuple[float, float] | None = None
+        """Latitude and longitude, degrees, of which metres east and north were made; None where they were given."""
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these columns are there."""
+        return {*names} <= {*self.table}
+
+    @property
+    def time(self) -> numpy.ndarray:
+        """Times, s, ``(rows,)``."""
+        return self["time"]
+
+    @property
+    def true(self) -> list[str]:
+        """Names of the columns that say what is true."""
+        return [name for name in self.table if name.startswith(TRUTH)]
+
+    def __getitem__(self, name: str) -> numpy.ndarray:
+        """Column, NaN where a cell is empty."""
+        return self.table[name].to_numpy()
+
+    def only(self, rows: numpy.ndarray) -> "Columns":
+        """Some rows of the same."""
+        return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
+
+    def drop_duplicates(self) -> None:
+        """Leave out rows that have the time of the row before, and say so.
+
+        Raises:
+            ValueError: if many of them say something else than the row before.
+        """
+        same = numpy.append(False, numpy.diff(self.time) == 0.0)
+        if not same.any():
+            return
+        kept = self.table[~same]
+        first = kept.iloc[numpy.cumsum(~same) - 1].set_axis(self.table.index)
+        other = same & ~((self.table == first) | (self.table.isna() & first.isna())).all(axis=1).to_numpy()
+        row, count = int(same.argmax()), int(same.sum())
+        if other.sum() > MOST_TWICE * len(same):
+            raise ValueError(
+                f"time is the same in rows {row - 1} and {row}: {other.sum():,} of {len(same):,} rows have the time of "
+                "the row before and other values; write times with their fractions of a second"
+            )
+        what = "row has" if count == 1 else "rows have"
+        differing = f", {other.sum():,} of them with other values" if other.any() else ""
+        self.notes.append(
+            f"{count:,} {what} the time of the row before{differing}: left out, the first is row {row}"
+        )
+        self.table, self.log_time = kept, self.log_time[~same]
+
+    def project_to_plane(self, plane: tuple[str, ...]) -> None:
+        """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
+        position, and say where that is.
+
+        Args:
+            plane: names of the columns to make, see :attr:`.LogFormat.plane`.
+
+        Raises:
+            ValueError: if one of them is there already, or an angle is none.
+        """
+        for true, names in (("", plane[:2]), (TRUTH, plane[2:])):
+            latitude, longitude, altitude = (true + name for name in GEODETIC)
+            if not (self.has(latitude) or self.has(longitude)):
+                continue
+            for name in (latitude, longitude):
+                if not self.has(name):
+                    raise ValueError(
+                        f"it lacks the column {name}, which belongs to {latitude} and {longitude}"
+                    )
+            for name in names:
+                if self.has(name):
+                    raise ValueError(f"it has {name} and {latitude}: leave one of them out")
+            check_degrees(latitude, self[latitude], 90.0)
+            check_degrees(longitude, self[longitude], 360.0)
+            there = numpy.isfinite(self[latitude]) & numpy.isfinite(self[longitude])
+            if self.origin is None:
+                if true:
+                    raise ValueError(f"it has {latitude} and no latitude: nobody knows where x and y begin")
+                if not there.any():
+                    raise ValueError(f"no row has {latitude} and {longitude}")
+                first = int(there.argmax())
+                self.origin = float(self[latitude][first]), float(self[longitude][first])
+                self.notes.append(
+                    f"x is east and y north of latitude {self.origin[0]:.8f}, longitude {self.origin[1]:.8f}, the "
+                    "first position"
+                )
+            height = self._height(altitude if self.has(altitude) else GEODETIC[2])
+            found = east_north(
+                numpy.radians(self[latitude]),
+                numpy.radians(self[longitude]),
+                height,
+                (numpy.radians(self.origin[0]), numpy.radians(self.origin[1])),
+            )
+            self.table = self.table.assign(**dict(zip(names, found, strict=True)))
+
+    def note_offset(self, plane: tuple[str, ...]) -> None:
+        """Say which offset of its clock would bring the truth nearer to what was measured.
+
+        Args:
+            plane: names of the columns, see :attr:`.LogFormat.plane`.
+        """
+        if self.has(*plane):
+            x, y, true_x, true_y = (self[name] for name in plane)
+            found = offset_note(self.time, numpy.stack([x, y], axis=1), numpy.stack([true_x, true_y], axis=1))
+            self.notes += [found] * bool(found)
+
+    def _height(self, name: str) -> numpy.ndarray:
+        """A column of heights, the median where it says nothing, ``(rows,)``, m; zero where there is none."""
+        height = self[name] if self.has(name) else numpy.zeros(len(self.time))
+        there = numpy.isfinite(height)
+        usual = float(numpy.median(height[there])) if there.any() else 0.0
+        return numpy.where(there, height, usual)
+
+    def whole(self, *names: str) -> numpy.ndarray:
+        """Columns without an empty cell, ``(rows, columns)``.
+
+        Raises:
+            ValueError: if there is one.
+        """
+        for name in names:
+            missing = self.table[name].isna()
+            if missing.any():
+                raise ValueError(
+                    f"{name} has no value in row {missing.idxmax()}, and here nothing may be missing"
+                )
+        return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
+
+    def sigmas(self, *names: str) -> numpy.ndarray:
+        """Standard deviations without an empty cell, ``(rows, columns)``.
+
+        Raises:
+            ValueError: if one is not above zero.
+        """
+        found = self.whole(*names)
+        for name in names:
+            values = self.table[name]
+            if (values <= 0.0).any():
+                row = (values <= 0.0).idxmax()
+                raise ValueError(
+                    f"{name} is a standard deviation, above zero, and row {row} has {values[row]:g}"
+                )
+        return found
+
+    def interval(self) -> float:
+        """Sampling interval, s: the one that the user has named, or the median of those in the table."""
+        if "sampling_interval" in self.given:
+            return float(self.given["sampling_interval"])
+        # Rounded as times are: files of one sensor have the same then.
+        return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
+
+    def regular(self, why: str) -> float:
+        """Sampling interval of measurements that must be regular, s.
+
+        Args:
+            why: who needs that, at the end of the sentence.
+
+        Raises:
+            ValueError: if they are not.
+        """
+        interval = self.interval()
+        steps = numpy.diff(self.time)
+        off = numpy.abs(steps - interval) > UNEVEN * interval
+        if off.any():
+            row = int(off.argmax())
+            raise ValueError(
+                f"times are {steps[row]:g} s apart after row {row} and {interval:g} s elsewhere: {why}, so resample "
+                "it, or cut it at the gap"
+            )
+        return interval
+
+
+class TruthFile(NamedTuple):
+    """A file of the truth, see :mod:`.truth_files`."""
+
+    path: Path
+    offset: float = 0.0
+    """Added to its times, s."""
+
+
+def read_columns(
+    path: Path, cls: type[Task], keywords: Mapping[str, Any], truth: TruthFile | None = None
+) -> Recording:
+    """Read a table of what sensors said.
+
+    Args:
+        path: of a file.
+        cls: the environment.
+        keywords: parameters of it.
+        truth: in a file of its own.
+
+    Raises:
+        ValueError: if it cannot be read, or lacks what the environment needs.
+    """
+    log_format = cls.log_format
+    if log_format is None:
+        measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
+        raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
+    known = _ColumnNames({*TIME, RECORDING, *log_format.columns})
+    if log_format.plane:
+        known |= {true + alias for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
+    if not path.name.endswith(FLIGHT_SUFFIXES):
+        raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
+    read, names, notes = read_table(path, known)
+    names = [name.lower() for name in names]
+    if log_format.plane:
+        read, names = _rename_aliases(read, names)
+    time_name = next((name for name in TIME if name in read), None)
+    if time_name is None or not any(name in read for name in log_format.columns):
+        raise ValueError(
+            f"it has the columns {', '.join(names) or 'none'}, and {cls.id} reads time and "
+            f"{', '.join(log_format.columns)}"
+        )
+    table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
+    for name in table:
+        table[name] = numbers(name, table[name])
+        if numpy.isinf(table[name]).any():
+            raise ValueError(f"{name} is not finite in row {numpy.isinf(table[name]).idxmax()}")
+    table.insert(0, "time", seconds(read[time_name]))
+    if truth is not None:
+        table, told = _add_truth(table, read[time_name], cls, keywords, truth)
+        notes = (*notes, *told)
+    parts = []
+    log_time = _times_as_written(read[time_name])
+    for name, rows in _by_recording(table, read.get(RECORDING)).items():
+        own = Columns(
+            name or path.name.partition(".")[0], rows.reset_index(drop=True), keywords, log_time[rows.index]
+        )
+        try:
+            _check_times(own.time)
+            own.drop_duplicates()
+            if log_format.plane:
+                own.project_to_plane(log_format.plane)
+                if truth is not None:
+                    own.note_offset(log_format.plane)
+            if "sampling_interval" not in keywords:
+                check_interval(own.interval(), log_format.longest_interval)
+            parts.append((own, log_format.read(own)))
+        except ValueError as error:
+            if not name:
+                raise
+            raise ValueError(f"recording {name!r}: {error}") from error
+    return _side_by_side(path, cls, keywords, parts, names, notes)
+
+
+def _add_truth(
+    table: "pandas.DataFrame",
+    times: "pandas.Series",
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    truth: TruthFile,
+) -> tuple["pandas.DataFrame", tuple[str, ...]]:
+    """Add the truth of a file of its own to the rows of a log, and say how many have one.
+
+    Raises:
+        ValueError: if it cannot be read or matched, or the log has a truth already.
+    """
+    log_format: Any = cls.log_format
+    here = [name for name in table if name.startswith(TRUTH)]
+    if here:
+        raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
+    components = [component.name for component in cls(cls.Parameters(**keywords)).components]
+    try:
+        found = read_truth(truth.path, log_format, components, TRUTH, TIME)
+        columns, note = match_truth(found, times, truth.offset)
+    except ValueError as error:
+        raise ValueError(f"truth {truth.path}: {error}") from error
+    return table.assign(**columns), (note, *(f"truth: {each}" for each in found.notes))
+
+
+def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
+    """Call latitude, longitude and altitude by these names, and leave out what further names they have.
+
+    Args:
+        read: columns.
+        names: of all columns of the file.
+    """
+    renamed: dict[str, str] = {}
+    for true in ("", TRUTH):
+        for name in GEODETIC:
+            first, *others = [true + alias for alias in COLUMNS[name] if true + alias in read] or [""]
+            read = read.drop(columns=others)
+            renamed |= {first: true + name} if first else {}
+    return read.rename(columns=renamed), [renamed.get(name, name) for name in names]
+
+
+def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
+    """Times as they stand in a table: numbers, or what is written of dates."""
+    try:
+        return numbers("time", values).to_numpy()
+    except ValueError:
+        return values.astype(str).to_numpy(dtype=str)
+
+
+class _ColumnNames(set[str]):
+    """Names of columns; and all that begin with ``truth_``, because components follow from the parameters."""
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or str(name).startswith(TRUTH)
+
+
+def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
+    """Rows of every recording of a table, in their order."""
+    if names is None:
+        return {"": table}
+    words = names.astype(object).where(names.notna(), "").astype(str)
+    return {str(name): rows for name, rows in table.groupby(words, sort=False)}
+
+
+def _check_times(time: numpy.ndarray) -> None:
+    if len(time) < 2:
+        raise ValueError(f"it has {len(time)} row{'s' * (len(time) != 1)}, and a recording needs several")
+    if not numpy.isfinite(time).all():
+        raise ValueError(f"time has no value in row {int((~numpy.isfinite(time)).argmax())}")
+    steps = numpy.diff(time)
+    if (steps < 0.0).any():
+        row = int((steps < 0.0).argmax())
+        hint = ", in UTC if the clock was changed" if steps[row] <= -1800.0 else ""
+        raise ValueError(
+            f"time decreases between rows {row} and {row + 1}: rows must be in the order of their times{hint}"
+        )
+
+
+def _side_by_side(
+    path: Path,
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    parts: list[tuple[Columns, TrackLog]],
+    names: list[str],
+    said: Iterable[str],
+) -> Recording:
+    """Put the recordings of a file, whose columns have these names, side by side; ``said`` was told of its reading."""
+    first, known = parts[0][0], parts[0][1].parameters
+    task = cls(cls.Parameters(**{**known, **keywords}))
+    true = _true_columns(task, first)
+    log_format: Any = cls.log_format
+    places = [TRUTH + name for name in GEODETIC if log_format.plane]
+    components = [TRUTH + component.name for component in task.components]
+    read = [*TIME, RECORDING, *log_format.columns, *components, *places]
+    notes = [*said, *unknown_column_notes(names, read)]
+    unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
+    if any(true) and unknown:
+        notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")
+    recordings = []
+    for own, found in parts:
+        if found.parameters != known:
+            raise ValueError(
+                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {first.name!r} "
+                f"{dict(known)}: put them into files of their own"
+            )
+        prefix = f"recording {own.name!r}: " if len(parts) > 1 else ""
+        notes += [prefix + note for note in (*own.notes, *found.notes)]
+        recordings.append(
+            Recording(
+                environment=cls.id,
+                measurements={name: numpy.asarray(v)[None] for name, v in found.measurements.items()},
+                initial={name: numpy.asarray(v)[None] for name, v in found.initial.items()},
+                seconds=(found.time - found.start)[None],
+                lengths=numpy.array([len(found.rows)]),
+                truth=_truth_of_rows(own, found.rows, true)[None] if any(true) else None,
+                names=(own.name,),
+                parameters={**known, **keywords},
+                name=path.name.partition(".")[0],
+                source=str(path),
+                log_time=_take_rows(own.log_time, found.rows)[None],
+                started=numpy.array([found.start - own.time[0]]),
+                typical={name: value for name, value in found.typical.items() if name not in keywords},
+            )
+        )
+    return side_by_side(recordings, notes=tuple(limit_notes(notes)))
+
+
+def _true_columns(task: Task, columns: Columns) -> list[str]:
+    """Names of the columns with the truth of every component; empty where it has none.
+
+    Raises:
+        ValueError: if a table has a part of a position only, say, or nothing that is a component.
+    """
+    names = [TRUTH + component.name for component in task.components]
+    found = [name if columns.has(name) else "" for name in names]
+    if columns.true and not any(found):
+        raise ValueError(
+            f"{', '.join(columns.true)} is no truth of {task.id}, whose components are {', '.join(names)}"
+        )
+    for group, parts in task.groups.items():
+        missing = [TRUTH + part for part in parts if not columns.has(TRUTH + part)]
+        if 0 < len(missing) < len(parts):
+            raise ValueError(
+                f"truth of the {group} needs all of it: the column {', '.join(missing)} is missing"
+            )
+    return found
+
+
+def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
+    """Values ``(T, ...)`` of the rows that measurements are of; NaN, or no word, where they are of none."""
+    shaped = (rows >= 0).reshape(-1, *[1] * (values.ndim - 1))
+    return numpy.where(shaped, values[rows], "" if values.dtype.kind == "U" else numpy.nan)
+
+
+def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
+    """Truth of every component, ``(T, C)``; NaN where it is not known."""
+    unknown = numpy.full(len(columns.time), numpy.nan)
+    return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

@@ -1,0 +1,606 @@
+"""Recorded measurements in place of a simulated world: what sensors really said, replayed to any policy.
+
+A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, what everyone is told of the
+start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`RecordedWorld` in the
+place of the task's own: an episode replays one recording, which its first uniform number draws. Banks,
+estimators, backends and evaluations know nothing of it.
+
+What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names
+and shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed
+loop they do, and no recording can answer what the sensors would have said to another estimate.
+
+Where there is no truth there is no error and no cost, and rewards are zero.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...compiler.functions import map_arrays
+from ..contract.draws import Draws
+from ..contract.model import Model
+from ..contract.observation import Array
+from ..contract.parameters import check, field_limits, freeze
+from ..contract.task import Scenario, Task, named_arrays
+from ..contract.world import World
+
+MOST_NUMBERS = 50_000_000
+"""Of a recording: 400 MB; to replay it takes twice as much again."""
+
+
+class Replayed(NamedTuple):
+    """Where an episode is in the tables of a recording."""
+
+    number: Array
+    """Of the recording, ``(N,)``, as a float; likewise all that follows."""
+    count: Array
+    """Measurements so far."""
+    first: Array
+    """Column of the first measurement."""
+    last: Array
+    """Column of the last one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded episodes of one environment, E of them; the longest has T measurements.
+
+    Args:
+        environment: its id.
+        measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
+        initial: every array of what everyone is told of the start of the track, ``(E, ...)``.
+        seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
+        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
+            otherwise the last measurement again.
+        truth: true values of the task's components in their units, ``(E, T, C)``; NaN where one is not known, None
+            where none is.
+        names: of the episodes; default: their numbers.
+        parameters: of the environment, where they differ from the defaults; a horizon makes episodes shorter.
+        name: of the whole, in reports.
+        source: where the data come from, in words.
+        licence: of the data, in words.
+        notes: what is to be told of the reading, a line each.
+        log_time: times of the measurements as they stand in the log, numbers or words, ``(E, T)``; NaN or empty where
+            the log has no row. None: there is no other time than ``seconds``.
+        started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
+        typical: parameters that follow from what the log states of its errors, where nobody names them.
+
+    Raises:
+        ValueError: for arrays that do not fit each other, or are not finite where they must be.
+    """
+
+    environment: str
+    measurements: Mapping[str, numpy.ndarray]
+    initial: Mapping[str, numpy.ndarray]
+    seconds: numpy.ndarray
+    lengths: numpy.ndarray
+    truth: numpy.ndarray | None = None
+    names: tuple[str, ...] = ()
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "recording"
+    source: str = ""
+    licence: str = ""
+    notes: tuple[str, ...] = ()
+    log_time: numpy.ndarray | None = None
+    started: Any = None
+    typical: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        episodes, _ = self.seconds.shape
+        if not self.names:
+            object.__setattr__(self, "names", tuple(str(i) for i in range(episodes)))
+        if self.started is None:
+            object.__setattr__(self, "started", numpy.zeros(episodes))
+        arrays = {**self.measurements, "truth": self.truth, "log_time": self.log_time}
+        for name, values in arrays.items():
+            if values is not None and values.shape[:2] != self.seconds.shape:
+                raise ValueError(
+                    f"{name} must have shape {self.seconds.shape} as seconds has, and further axes, got {values.shape}"
+                )
+        for name, values in {"length": self.lengths, "started": self.started, **self.initial}.items():
+            if numpy.shape(values)[:1] != (episodes,):
+                raise ValueError(
+                    f"{name} must be of {episodes} episodes, got the shape {numpy.shape(values)}"
+                )
+        if len(set(self.names)) != episodes:
+            raise ValueError(
+                f"the {episodes} episodes of a recording need as many different names, got {self.names!r:.80}"
+            )
+        rows = self.rows
+        for episode, name in enumerate(self.names):
+            self._check_episode(episode, int(rows[episode]), name)
+
+    def _check_episode(self, episode: int, rows: int, name: str) -> None:
+        """Raise ValueError for an episode that cannot be replayed."""
+        if not 1 <= self.lengths[episode] <= rows:
+            raise ValueError(
+                f"recording {name!r}: length must be from 1 to its {rows} measurements, got {self.lengths[episode]}"
+            )
+        times = self.seconds[episode]
+        if not numpy.isfinite(times[:rows]).all():
+            raise ValueError(f"recording {name!r}: seconds are not finite at measurement {_first(times) + 1}")
+        if rows > 1 and not (numpy.diff(times[:rows]) > 0.0).all():
+            wrong = int(numpy.argmax(numpy.diff(times[:rows]) <= 0.0))
+            raise ValueError(
+                f"recording {name!r}: seconds must increase, and measurement {wrong + 2} has {times[wrong + 1]:g} s "
+                f"after {times[wrong]:g} s"
+            )
+        if self.truth is not None and numpy.isinf(self.truth[episode, :rows]).any():
+            raise ValueError(f"recording {name!r}: truth is infinite; what is not known of it is NaN")
+        for what, values in self.measurements.items():
+            if not numpy.isfinite(values[episode, :rows]).all():
+                raise ValueError(
+                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; what is "
+                    "missing has the value zero, where the environment can say so"
+                )
+        for what, values in self.initial.items():
+            if not numpy.isfinite(values[episode]).all():
+                raise ValueError(f"recording {name!r}: initial_{what} is not finite")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
+        """Share it: nothing in it changes."""
+        return self
+
+    def __repr__(self) -> str:
+        true = "with truth" if self.truth is not None else "without truth"
+        return f"<Recording {self.name!r} of {self.environment}: {len(self.names)} episodes {true}>"
+
+    @functools.cached_property
+    def rows(self) -> numpy.ndarray:
+        """Measurements that there are of each episode, ``(E,)``."""
+        there = numpy.isfinite(self.seconds)
+        # From the last one backwards: what is missing before it is a mistake, and not the end.
+        return self.seconds.shape[1] - numpy.argmax(there[:, ::-1], axis=1) * there.any(axis=1)
+
+    @functools.cached_property
+    def truth_known(self) -> numpy.ndarray:
+        """Which components of the truth are known at some measurement of every episode, booleans, ``(C,)``.
+
+        The truth must not be None.
+        """
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        truth: Any = self.truth
+        known: numpy.ndarray = numpy.logical_and(numpy.isfinite(truth), there[..., None]).any(axis=1)
+        return numpy.asarray(known.all(axis=0))
+
+    @functools.cached_property
+    def has_whole_truth(self) -> bool:
+        """Whether every component of the truth is known at every measurement."""
+        if self.truth is None:
+            return False
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        return bool(numpy.isfinite(self.truth[there]).all())
+
+    def has_interval(self, seconds: float) -> bool:
+        """Whether measurements come that many seconds apart, the first that far from the start of the track."""
+        times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
+        late = numpy.abs(self.seconds - times)
+        # NaN beyond the end of a shorter episode. Times in a file are rounded.
+        return bool(numpy.nanmax(late, initial=0.0) <= 1e-6 * seconds + 1e-9 * times[-1])
+
+    # --- as a scenario
+
+    def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
+        """Measurements acted on in each episode, whole decisions, none beyond the horizon."""
+        lengths = numpy.minimum(self.lengths, horizon)
+        return tuple((lengths - lengths % decision_interval).tolist())
+
+    def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario that replays this, one recording in every episode.
+
+        Args:
+            cls: the environment.
+            keywords: parameters that win over those of the recording.
+
+        Raises:
+            ValueError: if it is of another environment, or does not fit the parameters.
+        """
+        if self.environment != cls.id:
+            raise ValueError(f"recording {self.name!r} is of {self.environment}, not of {cls.id}")
+        defaults = {f.name: f.default for f in dataclasses.fields(cls.Parameters)}
+        unknown = [name for name in self.parameters if name not in defaults]
+        if unknown:
+            raise ValueError(
+                f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
+            )
+        named = {**self.parameters, **keywords}
+        own = cls.recorded_decision_interval or defaults["decision_interval"]
+        interval = freeze(named.get("decision_interval", own))
+        check("decision_interval", interval, *field_limits(cls.Parameters)["decision_interval"])
+        longest, shortest = int(self.lengths.max()), int(self.lengths.min())
+        if shortest < interval:
+            raise ValueError(
+                f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
+                f"{self.name!r}, got {interval}"
+            )
+        held = {"horizon": longest - longest % interval, "decision_interval": interval}
+        parameters = {**held, **self.typical, **self.parameters}
+        made = cls.Parameters(**{**parameters, **keywords})
+        if made.horizon > longest:
+            raise ValueError(
+                f"horizon must be at most {longest}, the measurements of recording {self.name!r}, got {made.horizon}"
+            )
+        self.check_fits(cls(made))
+        return Scenario(
+            self.name,
+            "Recorded measurements.",
+            parameters,
+            flights=self.names,
+            notes=self.notes,
+            recording=self,
+        )
+
+    def check_fits(self, task: Task) -> None:
+        """Raise ValueError if a task of NumPy measures other arrays than there are, or a closed loop."""
+        initial, measurement = measure_once(task, self.measurements)
+        for kind, prefix, example, found, leading in (
+            ("measures", "", measurement, self.measurements, 2),
+            ("is told at the start", "initial_", initial, self.initial, 1),
+        ):
+            expected = {name: tuple(values.shape[:-1]) for name, values in named_arrays(example)}
+            missing = [f"{prefix}{name}" for name in expected if name not in found]
+            if missing:
+                raise ValueError(
+                    f"recording {self.name!r} lacks {', '.join(missing)}; {task.id} {kind} "
+                    f"{', '.join(prefix + name for name in expected)}"
+                )
+            for name in found:
+                if name not in expected:
+                    raise ValueError(
+                        f"recording {self.name!r} has {prefix}{name}, which is nothing that {task.id} {kind}: "
+                        f"{', '.join(prefix + name for name in expected)}"
+                    )
+                shape = found[name].shape[leading:]
+                if shape != expected[name]:
+                    raise ValueError(
+                        f"recording {self.name!r}: {prefix}{name} has the shape {shape} and {task.id} with these "
+                        f"parameters {kind} {expected[name]}"
+                    )
+        if self.truth is not None and task.World.error_cost is World.error_cost:
+            raise ValueError(
+                f"recording {self.name!r} has truth, and {task.id} does not say what an error costs: give its World "
+                "the method error_cost, or leave the truth out"
+            )
+        if self.truth is not None and self.truth.shape[2] != len(task.components):
+            raise ValueError(
+                f"recording {self.name!r}: truth has {self.truth.shape[2]} components and {task.id} has "
+                f"{len(task.components)}: {', '.join(c.name for c in task.components)}"
+            )
+        if self.truth is not None and not self.has_whole_truth:
+            self._check_cost_known(task)
+
+    def _check_cost_known(self, task: Task) -> None:
+        """Raise ValueError if what is known of the truth of some episode does not say what an error costs."""
+        world, rows = task.World(task), self.rows
+        for episode, name in enumerate(self.names):
+            nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
+            if not numpy.isfinite(world.error_cost(nothing)).any():
+                raise ValueError(
+                    f"recording {name!r}: what its truth holds does not say what an error costs in {task.id}: add "
+                    "more of its components, or leave the truth out"
+                )
+
+    # --- as a file
+
+    @property
+    def dataset(self) -> Any:
+        """As it stands in a file, an :class:`xarray.Dataset`."""
+        from .recording_files import dataset_of
+
+        return dataset_of(self)
+
+    def write(self, path: Any) -> None:
+        """Write a NetCDF file, which ``read_recording`` reads and ``scenario`` names."""
+        from .recording_files import write_recording
+
+        write_recording(self, path)
+
+    # --- as a world
+
+    def world(self, task: Task) -> "RecordedWorld":
+        """Return the world that replays this."""
+        return RecordedWorld(task, self)
+
+    @functools.cached_property
+    def tables(self) -> "Tables":
+        """All episodes one after another, as floats."""
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        ends = numpy.cumsum(self.rows)
+
+        def columns(values: numpy.ndarray) -> numpy.ndarray:
+            return numpy.ascontiguousarray(numpy.moveaxis(values[there].astype(float), 0, -1))
+
+        def starts(values: numpy.ndarray) -> numpy.ndarray:
+            return numpy.ascontiguousarray(numpy.moveaxis(values.astype(float), 0, -1))
+
+        return Tables(
+            {name: columns(values) for name, values in self.measurements.items()},
+            {name: starts(values) for name, values in self.initial.items()},
+            None if self.truth is None else columns(self.truth),
+            columns(self.seconds),
+            (ends - self.rows).astype(float),
+            (ends - 1).astype(float),
+        )
+
+
+def recording_from(fields: Mapping[str, Any]) -> Recording:
+    """Return the recording whose fields a dictionary holds, as they come out of JSON.
+
+    Raises:
+        ValueError: if a field is missing or unknown.
+    """
+    arrays: dict[str, Any] = {
+        "seconds": None,
+        "lengths": None,
+        "truth": None,
+        "log_time": None,
+        "started": None,
+        "measurements": {},
+        "initial": {},
+    }
+    known = {f.name for f in dataclasses.fields(Recording)}
+    if not {"environment", "measurements", "initial", "seconds", "lengths"} <= set(fields) <= known:
+        raise ValueError(
+            f"a recording as a dictionary has {', '.join(sorted(known))}, got {', '.join(map(repr, fields))}"
+        )
+    for name in arrays:
+        value = fields.get(name)
+        if isinstance(value, Mapping):
+            arrays[name] = {key: numpy.asarray(item) for key, item in value.items()}
+        else:
+            arrays[name] = None if value is None else numpy.asarray(value)
+    arrays["seconds"] = arrays["seconds"].astype(float)
+    others = {name: value for name, value in fields.items() if name not in arrays}
+    for name in ("names", "notes"):
+        others[name] = tuple(others.get(name, ()))
+    return Recording(**arrays, **others)
+
+
+def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
+    """Put recordings of one environment side by side; those with other parameters than the first are left out.
+
+    Args:
+        recordings: at least one.
+        name: of the whole.
+        notes: what is to be told of the reading, a line each; what is left out is added.
+    """
+    first, lines = recordings[0], list(notes)
+    kept: list[Recording] = []
+    for one in recordings:
+        differing = sorted(
+            parameter
+            for parameter in {*one.parameters, *first.parameters}
+            if one.parameters.get(parameter) != first.parameters.get(parameter)
+        )
+        if differing:
+            lines.append(
+                f"{one.name}: left out: {differing[0]} is {one.parameters.get(differing[0], 'the default')}, and of "
+                f"{first.name} {first.parameters.get(differing[0], 'the default')}"
+            )
+        else:
+            kept.append(one)
+            lines += [f"{one.name}: {note}" for note in one.notes]
+    untrue = [one.name for one in kept if one.truth is None]
+    if untrue and len(untrue) < len(kept):
+        lines.append(f"{untrue[0]}: has no truth, so nobody is judged")
+    for key in sorted({key for one in kept for key in one.measurements}):
+        lacking = [one.name for one in kept if key not in one.measurements]
+        if lacking:
+            lines.append(f"{lacking[0]}: has no {key}, which is left out of all")
+    names = []
+    for one in kept:
+        alone = len(one.names) == 1
+        names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
+    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
+
+
+def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
+    """Put the episodes of recordings of one environment side by side.
+
+    Args:
+        recordings: at least one; the truth is known if it is of all.
+        **fields: of the whole, where they are not those of the first.
+    """
+    first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
+
+    def padded(values: numpy.ndarray) -> numpy.ndarray:
+        fill: Any = numpy.nan if values.dtype.kind == "f" else "" if values.dtype.kind == "U" else 0
+        widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
+        return numpy.pad(values, widths, constant_values=fill)
+
+    # What only some hold, such as a second sensor, is of none.
+    names = [key for key in first.measurements if all(key in one.measurements for one in recordings)]
+    truths = [padded(one.truth) for one in recordings if one.truth is not None]
+    times = [padded(one.log_time) for one in recordings if one.log_time is not None]
+    return dataclasses.replace(
+        first,
+        measurements={
+            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings]) for key in names
+        },
+        initial={key: numpy.concatenate([one.initial[key] for one in recordings]) for key in first.initial},
+        seconds=numpy.concatenate([padded(one.seconds) for one in recordings]),
+        lengths=numpy.concatenate([one.lengths for one in recordings]),
+        truth=numpy.concatenate(truths) if len(truths) == len(recordings) else None,
+        log_time=numpy.concatenate(times) if len(times) == len(recordings) else None,
+        started=numpy.concatenate([one.started for one in recordings]),
+        typical={
+            key: float(numpy.median([one.typical.get(key, value) for one in recordings]))
+            for key, value in first.typical.items()
+        },
+        **{"names": tuple(name for one in recordings for name in one.names), **fields},
+    )
+
+
+class Tables(NamedTuple):
+    """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    initial: Mapping[str, numpy.ndarray]
+    truth: numpy.ndarray | None
+    seconds: numpy.ndarray
+    first: numpy.ndarray
+    """Column of the first measurement of each recording, ``(E,)``; likewise of the last."""
+    last: numpy.ndarray
+
+
+def _first(values: numpy.ndarray) -> int:
+    """Place of the first row that is not finite."""
+    return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
+
+
+def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, Any]:
+    """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
+    episodes side by side.
+
+    Args:
+        task: on NumPy arrays.
+        names: of the arrays of a recording; where one is of a field that only recordings hold, the measurement has
+            these fields, too.
+    """
+    world = task.World(task)
+    draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
+    truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
+    bank = Model(task, task.controls[0]).filter
+    feedback = bank.feedback(bank.start(initial), initial)
+    row = numpy.zeros((world.normals + world.row_uniforms, 8))
+    row[world.normals :] = 0.5
+    measurement = world.advance(truth, row, feedback)[1]
+    whole = world.add_recorded_fields(measurement)
+    further = {name for name, _ in named_arrays(whole)} - {name for name, _ in named_arrays(measurement)}
+    return initial, whole if further & {*names} else measurement, feedback
+
+
+def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
+    """What a task of NumPy says of a start of the track, and one measurement; arguments as of :func:`measure_examples`.
+
+    Raises:
+        ValueError: if what is measured depends on what is estimated.
+    """
+    initial, measurement, feedback = measure_examples(task, names)
+    if feedback is not None:
+        raise ValueError(
+            f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
+            "what the sensors said to one estimate is not what they would have said to another, and can be neither "
+            "recorded nor replayed"
+        )
+    return initial, measurement
+
+
+def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
+    """Put other arrays into nested NamedTuples, in the types of their own.
+
+    Args:
+        like: a measurement, or an initial estimate.
+        values: array of a name, as of :func:`~.task.named_arrays`.
+        xp: array namespace.
+    """
+    names = iter([name for name, _ in named_arrays(like)])
+
+    def fill(part: Any) -> Any:
+        array = values(next(names))
+        if part.dtype.kind == "b":
+            return array > 0.5
+        return xp.astype(array, xp.int64) if part.dtype.kind in "iu" else array
+
+    return map_arrays(fill, like)
+
+
+class RecordedWorld(World[Task, Replayed, Any]):
+    """What the sensors said, in place of a task's own world."""
+
+    initial_normals = 1
+    normals = 1
+
+    def __init__(self, task: Task, recording: Recording) -> None:
+        super().__init__(task)
+        self.recording = recording
+        self.simulated = task.World(task)
+        """The task's own world, which knows what an error costs."""
+        plain = type(task)(task.parameters)
+        self._initial, self._measurement = measure_once(plain, recording.measurements)
+        tables = recording.tables
+        # Tables of NumPy are read by compiled code as they are.
+        kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
+        self.tables = Tables(
+            {name: kept(values) for name, values in tables.measurements.items()},
+            {name: kept(values) for name, values in tables.initial.items()},
+            None if tables.truth is None else kept(tables.truth),
+            kept(tables.seconds),
+            kept(tables.first),
+            kept(tables.last),
+        )
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
+        """Draw a recording, and tell of its start."""
+        number = draws.integer("recording", (0, len(self.recording.names) - 1))
+        first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
+        initial = self._fill(self._initial, self.tables.initial, number)
+        return Replayed(number, 0.0 * number, first, last), initial
+
+    def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
+        """Go on to the next measurement; at the end the last one is said again."""
+        truth = truth._replace(count=truth.count + 1.0)
+        return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
+
+    def mask_missing(self, measurement: Any) -> Any:
+        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
+        return self.simulated.mask_missing(measurement)
+
+    def component_readings(self, measurement: Any) -> Array | None:
+        """What it says of the components, as in the task's own world."""
+        return self.simulated.component_readings(measurement)
+
+    def component_deviations(self, measurement: Any) -> Array | None:
+        """What is stated of the errors of that, likewise."""
+        return self.simulated.component_deviations(measurement)
+
+    def all_observations(self) -> tuple[Array | None, Array | None]:
+        """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
+        ``(C, measurements)``; None where it is no component.
+        """
+        columns = self.xp.arange(self.tables.seconds.shape[-1])
+        measurement = self._fill(self._measurement, self.tables.measurements, columns)
+        return self.simulated.component_readings(measurement), self.simulated.component_deviations(
+            measurement
+        )
+
+    def _column(self, truth: Replayed) -> Array:
+        """Of the measurement at hand."""
+        xp = self.xp
+        return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
+
+    def _at(self, table: Array, column: Array) -> Array:
+        """Entries of a table, ``(..., N)``."""
+        return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
+
+    def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
+        """A NamedTuple of arrays as one that was measured, from the tables."""
+        return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
+
+    def state(self, truth: Replayed) -> Array:
+        """True values of the task's components, ``(C, N)``.
+
+        Raises:
+            ValueError: if the recording has none.
+        """
+        if self.tables.truth is None:
+            raise ValueError(
+                f"recording {self.recording.name!r} has no truth, so there is no error and no cost"
+            )
+        return self._at(self.tables.truth, self._column(truth))
+
+    def error_cost(self, error: Array) -> Array:
+        """What it costs in the task's own world."""
+        return self.simulated.error_cost(error)
+
+    def records(self, truth: Replayed) -> dict[str, Array]:
+        """Time since the start of the track, s."""
+        return {"seconds": self._at(self.tables.seconds, self._column(truth))}
+
+    def context(self, truth: Replayed) -> dict[str, Array]:
+        """Which recording it is."""
+        return {"recording": truth.number}

@@ -1,0 +1,222 @@
+"""Files of recordings: NetCDF with the names of the environment's own measurements.
+
+Dimensions ``episode``, ``time``, ``component``, ``other_component`` and what further axes a measurement has. Variables:
+every array of the environment's ``Measurement`` by its name, ``(episode, time, ...)``; ``seconds`` ``(episode, time)``,
+NaN where an episode has no measurement; ``length`` ``(episode)``; optionally ``truth`` ``(episode, time, component)``;
+and what everyone is told of the start of the track, ``initial_mean``, ``initial_covariance`` and so on. Attributes:
+``environment``, ``parameters`` (JSON), ``source``, ``licence``.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+from ..contract.task import Task
+from .flight_tables import MOST_BYTES, open_netcdf
+from .recording import MOST_NUMBERS, Recording
+
+if TYPE_CHECKING:
+    import xarray
+
+OWN = ("seconds", "length", "truth", "started")
+"""Variables that are no measurements."""
+
+
+def dataset_of(recording: Recording) -> "xarray.Dataset":
+    """Return a recording as it stands in a file."""
+    import xarray
+
+    there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
+    variables: dict[str, Any] = {
+        "seconds": (("episode", "time"), recording.seconds, {"units": "s"}),
+        "length": ("episode", numpy.asarray(recording.lengths)),
+    }
+    for name, values in recording.measurements.items():
+        axes = [f"{name}_axis{i}" for i in range(values.ndim - 2)]
+        nothing = numpy.nan if values.dtype.kind == "f" else values.dtype.type(0)
+        shaped = there.reshape(*there.shape, *[1] * (values.ndim - 2))
+        variables[name] = (("episode", "time", *axes), numpy.where(shaped, values, nothing))
+    for name, values in recording.initial.items():
+        axes = {"mean": ["component"], "covariance": ["component", "other_component"]}.get(
+            name, [f"initial_{name}_axis{i}" for i in range(values.ndim - 1)]
+        )
+        variables[f"initial_{name}"] = (("episode", *axes), values)
+    if recording.started is not None and recording.started.any():
+        variables["started"] = ("episode", numpy.asarray(recording.started, dtype=float), {"units": "s"})
+    if recording.truth is not None:
+        variables["truth"] = (
+            ("episode", "time", "component"),
+            numpy.where(there[..., None], recording.truth, numpy.nan),
+        )
+    told = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
+    coords: dict[str, Any] = {"recording": ("episode", numpy.array(recording.names, dtype=str))}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time)
+    return xarray.Dataset(
+        variables,
+        coords=coords,
+        attrs={
+            "environment": recording.environment,
+            "parameters": json.dumps({**recording.typical, **recording.parameters}),
+            **told,
+        },
+    )
+
+
+def write_recording(recording: Recording, path: Path) -> None:
+    """Write a NetCDF file that every reader of NetCDF takes."""
+    dataset_of(recording).to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+
+
+def is_recording(path: Any) -> bool:
+    """Whether this is the path of a NetCDF file that says of which environment it holds measurements."""
+    try:
+        return (
+            Path(path).is_file() and Path(path).stat().st_size <= MOST_BYTES and names_environment(Path(path))
+        )
+    except Exception:  # whatever it is, it is for somebody else to say what is wrong with it
+        return False
+
+
+def names_environment(path: Path) -> bool:
+    """Whether a file is NetCDF that says of which environment it holds measurements.
+
+    Raises:
+        Exception: whatever, for a file whose name says that it is NetCDF and that is none.
+    """
+    if path.suffix != ".nc":
+        return False
+    with open_netcdf(path, decode_times=False) as data:
+        return "environment" in data.attrs
+
+
+def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
+    """Return the fields of a :class:`Recording` that a dataset holds; ``initial`` may lack.
+
+    Raises:
+        ValueError: for what is no recording.
+    """
+    total = sum(variable.size for variable in data.variables.values())
+    if total > MOST_NUMBERS:
+        raise ValueError(
+            f"it holds {total:,} numbers, more than the {MOST_NUMBERS:,} that a recording may have: split it"
+        )
+    if "seconds" not in data:
+        raise ValueError(
+            f"it lacks the variable seconds; it has {', '.join(map(str, data.variables)) or 'none'}"
+        )
+    if "episode" not in data.dims:
+        data = data.expand_dims("episode")
+    if data["seconds"].dims != ("episode", "time"):
+        raise ValueError(f"seconds must have the dimensions episode and time, got {data['seconds'].dims}")
+    seconds = data["seconds"].values.astype(float)
+    if not seconds.size or not numpy.isfinite(seconds).any():
+        raise ValueError("it holds no measurements")
+    fields: dict[str, Any] = {"measurements": {}, "initial": {}, "truth": None, "seconds": seconds}
+    for key, variable in data.data_vars.items():
+        variable_name = str(key)
+        if variable.dtype.kind not in "fiub":
+            raise ValueError(f"{variable_name} must be numbers, got {variable.dtype}")
+        values = variable.values.astype(variable.dtype.newbyteorder("="))
+        of_episode = variable_name.startswith("initial_") or variable_name == "started"
+        leading = ("episode",) if of_episode else ("episode", "time")
+        if variable_name == "length":
+            continue
+        if variable.dims[: len(leading)] != leading:
+            raise ValueError(
+                f"{variable_name} must have the dimensions {', '.join(leading)} first, got {variable.dims}"
+            )
+        if variable_name.startswith("initial_"):
+            fields["initial"][variable_name.removeprefix("initial_")] = values
+        elif variable_name in ("truth", "started"):
+            fields[variable_name] = values.astype(float)
+        elif variable_name not in OWN:
+            fields["measurements"][variable_name] = values
+    rows = seconds.shape[1] - numpy.argmax(numpy.isfinite(seconds[:, ::-1]), axis=1)
+    lengths = data["length"].values if "length" in data else rows
+    fields["lengths"] = _whole("length", lengths)
+    if "recording" in data.coords:
+        fields["names"] = tuple(map(str, data["recording"].values.ravel().tolist()))
+    elif len(seconds) == 1:
+        fields["names"] = (name,)
+    if "log_time" in data.coords and data["log_time"].dims == ("episode", "time"):
+        times = data["log_time"].values
+        fields["log_time"] = times.astype(float) if times.dtype.kind in "fiu" else times.astype(str)
+    return fields
+
+
+def _whole(name: str, values: numpy.ndarray) -> numpy.ndarray:
+    if not (numpy.isfinite(values) & (values == numpy.round(values))).all():
+        raise ValueError(f"{name} must be whole numbers")
+    return values.astype(numpy.int64)
+
+
+def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
+    """Read a recording from a NetCDF file.
+
+    Args:
+        path: of the file.
+        cls_of: returns the task of an environment id.
+        environment: that it must be of; None: what the file says.
+        keywords: parameters that win over those of the file.
+
+    Raises:
+        ValueError: if it cannot be read, or is of another environment.
+    """
+    with open_netcdf(path, decode_times=False) as data:
+        attrs = data.attrs
+        cls: type[Task] = cls_of(str(attrs.get("environment", environment)))
+        if environment is not None and cls is not cls_of(environment):
+            raise ValueError(f"it is of {cls.id}, not of {cls_of(environment).id}")
+        try:
+            parameters = json.loads(attrs.get("parameters", "{}"))
+            if not isinstance(parameters, dict):
+                raise TypeError
+        except (ValueError, TypeError):
+            raise ValueError("its attribute parameters must be a JSON object") from None
+        fields = read_dataset(data, path.stem)
+    if not fields["initial"]:
+        _start(cls, fields, {**parameters, **keywords})
+    return Recording(
+        environment=cls.id,
+        parameters={**parameters, **keywords},
+        name=path.stem,
+        source=str(attrs.get("source", "")),
+        licence=str(attrs.get("licence", "")),
+        **fields,
+    )
+
+
+def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
+    """Let the tracks start from their first measurements."""
+    if cls.log_format is None:
+        raise ValueError(
+            f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
+        )
+    try:
+        start = cls.log_format.start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
+    except KeyError as error:
+        raise ValueError(f"it lacks {error.args[0]}") from error
+    if start.used:
+        fields["started"] = fields["seconds"][:, start.used - 1] - fields["seconds"][:, 0]
+        if "log_time" in fields:
+            fields["log_time"] = fields["log_time"][:, start.used :]
+        fields["seconds"] = fields["seconds"][:, start.used :] - fields["seconds"][:, start.used - 1, None]
+        fields["lengths"] = fields["lengths"] - start.used
+        if fields["truth"] is not None:
+            fields["truth"] = fields["truth"][:, start.used :]
+    fields["measurements"], fields["initial"] = dict(start.measurements), dict(start.initial)
+
+
+def differing(parameters: Any) -> dict[str, Any]:
+    """Parameters of a task that differ from the defaults, without the horizon."""
+    found = {}
+    for field in dataclasses.fields(parameters):
+        value = getattr(parameters, field.name)
+        if field.name != "horizon" and value != field.default:
+            found[field.name] = value
+    return found

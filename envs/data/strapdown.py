@@ -1,0 +1,340 @@
+"""Inertial navigation from rates and accelerations: alignment, aiding by fixes, and free running.
+
+The strapdown algorithm and the error-state Kalman filter are those of pyins (``pip install 'filtergym[ins]'``). Tables
+are of pandas, by time in s: inertial measurements with the columns ``gyro_x`` to ``gyro_z`` (rad/s) and ``accel_x`` to
+``accel_z`` (specific force, m/s^2) forward, right and down in the vehicle; fixes with ``lat``, ``lon`` (degrees),
+``alt`` (m) and ``VN``, ``VE``, ``VD`` (m/s north, east, down).
+
+1. **Alignment.** While the vehicle stands, the mean specific force gives roll and pitch, and the mean rates less the
+   rotation of the Earth are the bias of the gyroscopes. The heading is the course of the first motion less the angle
+   turned until then.
+2. **Aiding.** From there fixes correct position, velocity, attitude and the biases of gyroscopes and accelerometers.
+3. **Free running.** From a state of that filter, which knows nothing later, the INS runs without fixes.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy
+
+from ...filters.geodesy import east_north
+
+LEAST_STANDSTILL = 5.0
+"""For the alignment, s: the bias of the gyroscopes is the mean over it."""
+BEFORE_MOTION = 1.0
+"""The standstill ends this long before the first speed above the limit, s."""
+GRAVITY = 9.80665
+"""Standard gravity, m/s^2."""
+GRAVITY_TOLERANCE = 0.05
+"""Relative; gravity varies by 0.6 % over the Earth's surface, and cheap accelerometers are off by 0.2 m/s^2."""
+LARGEST_TILT = 45.0
+"""Of the vehicle at rest, degrees: beyond it the axes are other ones than forward, right and down."""
+LARGEST_RATE = 0.1
+"""Mean rate at rest, rad/s; cheap gyroscopes have a bias of 0.02 rad/s."""
+SLOPES = (0.3, 3.0)
+"""Of turns and changes of speed by the fixes over those by the IMU, within which these go together; hills and a
+tilted IMU make 0.6 of 1."""
+LEVEL_SIGMA, HEADING_SIGMA = 2.0, 10.0
+"""Of the attitude after the alignment, degrees."""
+STANDING_SIGMA = 0.05
+"""Of velocity, m/s, and least of position, m, at the standstill."""
+AIDING_STEP = 0.25
+"""Over which the covariance is predicted at most, s."""
+DEVIATION_STEP = 0.1
+"""Fixes whose deviations differ by less than this, relatively, count as equally good."""
+
+
+@dataclass(frozen=True)
+class InertialErrors:
+    """Assumed errors of an IMU; the defaults are those of a consumer IMU in a car with its engine running."""
+
+    gyroscope_noise: float = 0.05
+    """Root density of white noise, degrees/s^0.5."""
+    accelerometer_noise: float = 0.015
+    """Likewise, m/s^1.5."""
+    gyroscope_bias: float = 0.1
+    """Standard deviation of the bias left after the standstill, degrees/s."""
+    accelerometer_bias: float = 0.2
+    """Likewise, m/s^2."""
+    gyroscope_walk: float = 0.0001
+    """Root density of its random walk, degrees/s^1.5."""
+    accelerometer_walk: float = 0.001
+    """Likewise, m/s^2.5."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """State of the INS at the end of the standstill."""
+
+    start: Any
+    """Position, velocity and attitude, a series of pyins named by its time."""
+    increments: Any
+    """Rotation vectors (rad) and velocity increments (m/s) since then, less the gyroscopes' bias of the standstill."""
+
+
+@dataclass(frozen=True)
+class AidedInertial:
+    """The INS aided by fixes, at every sample of the IMU."""
+
+    trajectory: Any
+    """Latitude, longitude (degrees), altitude, velocity and attitude; a table of pyins by time."""
+    biases: Any
+    """Of gyroscopes (rad/s) and accelerometers (m/s^2), columns as those of the increments; a table by time."""
+    increments: Any
+    """Rotation vectors (rad) and velocity increments (m/s), less the gyroscopes' bias of the standstill."""
+    innovations: Any
+    """By kind of measurement, tables of innovations over their standard deviations."""
+
+
+def check_pyins() -> None:
+    """Raise ValueError where pyins is not installed."""
+    try:
+        import pyins  # noqa: F401
+    except ImportError as error:
+        raise ValueError("inertial navigation needs pyins: pip install 'filtergym[ins]'") from error
+
+
+def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0) -> Alignment:
+    """Align the INS at the standstill at the beginning.
+
+    Args:
+        inertial: measurements of the IMU.
+        fixes: positions and velocities.
+        standing: speed up to which the vehicle stands, m/s.
+        moving: speed from which the course is the heading, m/s.
+
+    Raises:
+        ValueError: if the log does not begin with a standstill, nothing moves after it, or the specific force at rest
+            is not that of gravity on forward, right and down.
+    """
+    import pandas
+    from pyins import earth, strapdown, transform, util
+
+    speed = numpy.hypot(fixes.VN, fixes.VE).to_numpy()
+    if not (speed > moving).any():
+        raise ValueError(
+            f"the heading is the course of the first motion, but no speed is above {moving:.3g} m/s"
+        )
+    begin = fixes.index[int(numpy.argmax(speed > standing))] - BEFORE_MOTION
+    rest = inertial[inertial.index < begin]
+    if not len(rest) or rest.index[-1] - rest.index[0] < LEAST_STANDSTILL:
+        raise ValueError(
+            f"the alignment needs a standstill of {LEAST_STANDSTILL:g} s at the beginning, but the first speed above "
+            f"{standing:.3g} m/s comes {begin + BEFORE_MOTION - inertial.index[0]:.1f} s after the IMU's first "
+            "measurement"
+        )
+    bias = rest[util.GYRO_COLS].mean()
+    forward, right, down = rest[util.ACCEL_COLS].mean()
+    check_rest(bias.to_numpy(), numpy.array([forward, right, down]))
+    inertial = inertial[(inertial.index >= begin) & (inertial.index <= fixes.index[-1])].copy()
+
+    first = fixes.iloc[int(numpy.argmax(speed > moving))]
+    before = inertial.index < first.name
+    turned = numpy.trapezoid(inertial.gyro_z[before] - bias.gyro_z, inertial.index[before])
+    position = [numpy.interp(inertial.index[0], fixes.index, fixes[name]) for name in util.LLA_COLS]
+    attitude = numpy.degrees(
+        [
+            numpy.arctan2(-right, -down),
+            numpy.arctan2(forward, numpy.hypot(right, down)),
+            numpy.arctan2(first.VE, first.VN) - turned,
+        ]
+    )
+    start = pandas.Series([*position, 0.0, 0.0, 0.0, *attitude], util.TRAJECTORY_COLS, name=inertial.index[0])
+    # What a standing gyroscope measures is its bias and the rotation of the Earth.
+    bias -= transform.mat_from_rph(attitude).T @ earth.rate_n(position[0])
+    inertial[util.GYRO_COLS] -= bias
+    return Alignment(start, strapdown.compute_increments_from_imu(inertial, "rate"))
+
+
+def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
+    """Raise ValueError unless means at rest are those of an IMU whose axes are forward, right and down.
+
+    Args:
+        rates: mean rates, rad/s, ``(3,)``.
+        force: mean specific force, m/s^2, ``(3,)``.
+    """
+    size = float(numpy.linalg.norm(force))
+    if abs(size - GRAVITY) > GRAVITY_TOLERANCE * GRAVITY:
+        likely = "it looks like units of g: " if abs(size - 1.0) < 2.0 * GRAVITY_TOLERANCE else ""
+        likely = likely or ("gravity was taken out of it: " if size < 1.0 else "")
+        raise ValueError(
+            f"the acceleration at rest is {size:.3g} m/s^2 and must be near {GRAVITY:.3g}, the reaction to gravity: "
+            f"{likely}check the unit"
+        )
+    tilt = float(numpy.degrees(numpy.arccos(-force[2] / size)))
+    if tilt > LARGEST_TILT:
+        raise ValueError(
+            f"the acceleration at rest is {force[0]:.1f}, {force[1]:.1f}, {force[2]:.1f} m/s^2 forward, right, down, "
+            f"where a level vehicle has 0, 0, -9.8: give the mounting, (180, 0, 0) for an IMU with x forward, y left, "
+            "z up"
+        )
+    largest = float(abs(rates).max())
+    if largest > LARGEST_RATE:
+        raise ValueError(
+            f"a mean rate at rest is {numpy.degrees(largest):.3g} degrees/s, more than any bias of a gyroscope: check "
+            "the unit, and that the vehicle stands"
+        )
+
+
+def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: float) -> None:
+    """Raise ValueError unless the IMU turns and speeds up as the fixes do.
+
+    Turns of the course and changes of speed from fix to fix are regressed on the integrals of the down rate and of the
+    forward acceleration; both slopes should be one.
+
+    Args:
+        alignment: of :func:`align`.
+        fixes: with velocities.
+        moving: speed from which the course is the heading, m/s.
+        interval: between the fixes that are compared, s.
+    """
+    increments = alignment.increments
+    fixes = fixes[fixes.VN.notna() & fixes.VE.notna() & (fixes.index >= increments.index[0])]
+    step = max(1, round(interval / float(numpy.median(numpy.diff(fixes.index)))))
+    fixes = fixes.iloc[::step]
+    speed = numpy.hypot(fixes.VN, fixes.VE).to_numpy()
+    course = numpy.unwrap(numpy.arctan2(fixes.VE, fixes.VN))
+    integrals = {
+        name: numpy.diff(numpy.interp(fixes.index, increments.index, increments[name].cumsum()))
+        for name in ("theta_z", "dv_x")
+    }
+    both = (speed[1:] > moving) & (speed[:-1] > moving)
+    compared = (
+        (integrals["theta_z"][both], numpy.diff(course)[both], "turn", "the unit of the rates"),
+        (integrals["dv_x"], numpy.diff(speed), "change of speed", "the unit of the accelerations"),
+    )
+    for integral, change, what, unit in compared:
+        slope, sigma = slope_of(integral, change)
+        if slope + 3.0 * sigma < SLOPES[0] or slope - 3.0 * sigma > SLOPES[1]:
+            raise ValueError(
+                f"where the IMU measures a {what} of 1 the fixes have one of {slope:.2g}: check {unit}, the mounting "
+                "(axes forward, right, down) and that both have one clock"
+            )
+
+
+def slope_of(x: numpy.ndarray, y: numpy.ndarray) -> tuple[float, float]:
+    """Slope of the straight line through points ``(n,)`` by least squares, and its standard deviation; infinite where
+    they have none.
+    """
+    if len(x) < 3 or numpy.ptp(x) == 0.0:
+        return 1.0, numpy.inf
+    x, y = x - x.mean(), y - y.mean()
+    slope = float(x @ y / (x @ x))
+    return slope, float(numpy.sqrt(((y - slope * x) ** 2).sum() / (len(x) - 2) / (x @ x)))
+
+
+def aid(
+    alignment: Alignment,
+    fixes: Any,
+    position_sigma: numpy.ndarray,
+    velocity_sigma: float | None,
+    lever: Sequence[float] = (0.0, 0.0, 0.0),
+    errors: InertialErrors | None = None,
+) -> AidedInertial:
+    """Aid the INS by fixes from the end of the standstill on.
+
+    Args:
+        alignment: of :func:`align`.
+        fixes: positions, and velocities.
+        position_sigma: standard deviation of each fix, of every axis, m, ``(n,)``.
+        velocity_sigma: of velocities, m/s; None: they are not used.
+        lever: from the IMU to the antenna, forward, right, down, m.
+        errors: of the IMU; default: those of a consumer IMU.
+    """
+    import pandas
+    from pyins import filters, inertial_sensor, measurements, util
+
+    errors = errors or InertialErrors()
+    later = fixes.index > alignment.increments.index[0]
+    aiding, sigma = fixes[later], position_sigma[later]
+    aids = []
+    classes = numpy.round(numpy.log(sigma) / DEVIATION_STEP)
+    for number in numpy.unique(classes):
+        alike = classes == number
+        aids.append(measurements.Position(aiding[alike], numpy.median(sigma[alike]), numpy.array(lever)))
+    if velocity_sigma is not None:
+        moving = aiding[aiding[util.VEL_COLS].notna().all(axis=1)]
+        aids.append(measurements.NedVelocity(moving, velocity_sigma, numpy.array(lever)))
+    rates = numpy.radians([errors.gyroscope_bias, errors.gyroscope_noise, errors.gyroscope_walk])
+    forces = errors.accelerometer_bias, errors.accelerometer_noise, errors.accelerometer_walk
+    with _no_deprecations():
+        found = filters.run_feedback_filter(
+            alignment.start,
+            position_sd=max(STANDING_SIGMA, float(position_sigma[0])),
+            velocity_sd=STANDING_SIGMA,
+            level_sd=LEVEL_SIGMA,
+            azimuth_sd=HEADING_SIGMA,
+            increments=alignment.increments,
+            gyro_model=inertial_sensor.EstimationModel(*rates),
+            accel_model=inertial_sensor.EstimationModel(*forces),
+            measurements=aids,
+            time_step=AIDING_STEP,
+        )
+    biases = pandas.DataFrame(
+        numpy.hstack([found.gyro, found.accel]), found.gyro.index, [*util.THETA_COLS, *util.DV_COLS]
+    )
+    return AidedInertial(found.trajectory, biases, alignment.increments, found.innovations)
+
+
+@contextmanager
+def _no_deprecations() -> Iterator[None]:
+    """Keep quiet of a keyword that pyins 1.0.1 uses and pandas 4 will not have."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The copy keyword is deprecated")
+        yield
+
+
+def free_inertial(
+    navigation: AidedInertial, times: numpy.ndarray, lever: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Any:
+    """Return latitude, longitude (degrees) and altitude (m) of the antenna at times, s, where the INS comes from the
+    first of them on without fixes; columns of a table.
+    """
+    import pandas
+    from pyins import strapdown, transform, util
+
+    # From the last sample before the start, with the biases as the fix at the start leaves them.
+    number = int(numpy.searchsorted(navigation.trajectory.index, times[0], side="right")) - 1
+    start = navigation.trajectory.iloc[number]
+    bias = navigation.biases[navigation.biases.index <= start.name].iloc[-1]
+    increments = navigation.increments
+    increments = increments[(increments.index > start.name) & (increments.index < times[-1] + 0.1)].copy()
+    increments[bias.index] -= numpy.outer(increments.dt, bias)
+    with _no_deprecations():
+        track = strapdown.Integrator(start).integrate(increments)
+    antenna = transform.translate_trajectory(track, lever)[util.LLA_COLS]
+    columns = {name: numpy.interp(times, track.index, antenna[name]) for name in util.LLA_COLS}
+    return pandas.DataFrame(columns, times)
+
+
+def free_windows(
+    navigation: AidedInertial,
+    windows: Sequence[numpy.ndarray],
+    beginnings: numpy.ndarray,
+    site: tuple[float, float],
+    lever: Sequence[float] = (0.0, 0.0, 0.0),
+) -> numpy.ndarray:
+    """Positions of the INS that runs free in windows of K times, ``(E, K, 2)``, m east and north of a site.
+
+    Args:
+        navigation: the aided INS.
+        windows: E times ``(K,)``, s.
+        beginnings: where each window begins, m, ``(E, 2)``; NaN: where the aided INS is.
+        site: latitude and longitude, rad.
+        lever: from the IMU to the antenna, forward, right, down, m.
+    """
+    tracks = []
+    for times, beginning in zip(windows, beginnings, strict=True):
+        track = tangent_plane(free_inertial(navigation, times, lever), site).T
+        known = numpy.isfinite(beginning).all()
+        tracks.append(track + (beginning - track[0]) if known else track)
+    return numpy.array(tracks)
+
+
+def tangent_plane(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
+    """Coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes, ``(2, n)``, m."""
+    latitude, longitude = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
+    return east_north(latitude, longitude, positions["alt"].to_numpy(), site)

@@ -1,0 +1,182 @@
+"""The truth of a log in a file of its own, matched by time.
+
+Times of both files are what they say: nothing is shifted but by the offset that a user names. Between two true
+positions that are close in time the truth is interpolated; elsewhere it is not known.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy
+
+from ..contract.log_format import LogFormat
+from .flight_tables import COLUMNS, clock_seconds, numbers, read_table
+
+if TYPE_CHECKING:
+    import pandas
+
+LONGEST_GAP = 1.5
+"""s between two rows of the truth, up to which it is interpolated: one a second, with some jitter."""
+SAME_TIME = 1e-3
+"""s, within which times are the same."""
+OFFSETS = numpy.arange(-30.0, 30.01, 0.1)
+"""s, among which an offset between the clocks is looked for, to be told."""
+BETTER = 0.7
+"""Part of the distance between positions and truth that an offset must leave, to be told."""
+AGREE = 0.3
+"""s, within which both halves of a log must have the same offset."""
+
+
+class TruthTable(NamedTuple):
+    """True values by time."""
+
+    clock: str
+    """What the times are: dates, times of day, or seconds."""
+    time: numpy.ndarray
+    """s by that clock, ``(n,)``, increasing."""
+    columns: Mapping[str, numpy.ndarray]
+    """By the names that they have beside measurements, ``truth_...``, ``(n,)``; NaN where a cell is empty."""
+    notes: tuple[str, ...]
+    """What is to be told of the reading, a line each."""
+
+
+def read_truth(
+    path: Path, log_format: LogFormat, components: Sequence[str], prefix: str, times: Sequence[str]
+) -> TruthTable:
+    """Read a file of true positions: a table, or a log of a receiver.
+
+    Args:
+        path: of the file, with a time and x and y (m), latitude and longitude (degrees), or components by their names.
+        log_format: of the environment.
+        components: names of what is estimated.
+        prefix: before the names of true columns.
+        times: names that the column of times may have.
+
+    Raises:
+        ValueError: if it cannot be read.
+    """
+    geodetic = {alias: name for name in ("latitude", "longitude", "altitude") for alias in COLUMNS[name]}
+    meant = {name: prefix + name for name in components}
+    if log_format.plane:
+        meant |= dict(zip(("x", "y"), log_format.plane[2:], strict=True))
+        meant |= {alias: prefix + name for alias, name in geodetic.items()}
+    meant |= {true: true for true in list(meant.values())}
+    if not path.is_file():
+        raise ValueError("there is no such file")
+    table, names, notes = read_table(path, {*times, *meant})
+    time_name = next((name for name in times if name in table), None)
+    found: dict[str, numpy.ndarray] = {}
+    for name in table:
+        if name in meant and meant[name] not in found:
+            found[meant[name]] = numbers(name, table[name]).to_numpy()
+    if time_name is None or not found:
+        raise ValueError(
+            f"it has the columns {', '.join(names) or 'none'}, and needs time and {_wanted(log_format)}"
+        )
+    clock, time = clock_seconds(table[time_name])
+    first = numpy.append(True, numpy.diff(time) != 0.0)
+    if (numpy.diff(time) < 0.0).any():
+        row = int(numpy.argmax(numpy.diff(time) < 0.0))
+        raise ValueError(f"time decreases between rows {row} and {row + 1}")
+    return TruthTable(clock, time[first], {name: values[first] for name, values in found.items()}, notes)
+
+
+def _wanted(log_format: LogFormat) -> str:
+    if log_format.plane:
+        return "x and y (m), or latitude and longitude (degrees)"
+    return "components of the environment by their names"
+
+
+def match_truth(
+    truth: TruthTable, times: "pandas.Series", offset: float
+) -> tuple[dict[str, numpy.ndarray], str]:
+    """Return the truth at the times of a log, NaN where it is not known, and a sentence on how many have one.
+
+    Args:
+        truth: of :func:`read_truth`.
+        times: of the log, as they are written.
+        offset: added to the times of the truth, s.
+
+    Raises:
+        ValueError: if both clocks differ, or no time has a truth.
+    """
+    clock, now = clock_seconds(times)
+    if clock != truth.clock:
+        raise ValueError(
+            f"the times of the log are {clock} and those of the truth {truth.clock}: write both alike"
+        )
+    then = truth.time + offset
+    after = numpy.clip(numpy.searchsorted(then, now), 1, max(len(then) - 1, 1))
+    if len(then) < 2:
+        raise ValueError("it has one row, and a truth needs several")
+    before = after - 1
+    gap = then[after] - then[before]
+    share = (now - then[before]) / gap
+    between = (share >= 0.0) & (share <= 1.0) & (gap <= LONGEST_GAP)
+    near = numpy.where(numpy.abs(now - then[before]) < numpy.abs(now - then[after]), before, after)
+    same = numpy.abs(now - then[near]) <= SAME_TIME
+    columns = {}
+    for name, values in truth.columns.items():
+        inside = values[before] + share * (values[after] - values[before])
+        columns[name] = numpy.where(same, values[near], numpy.where(between, inside, numpy.nan))
+    known = numpy.logical_and.reduce([numpy.isfinite(values) for values in columns.values()])
+    if not known.any():
+        raise ValueError(
+            f"no measurement has a truth: the log's times are from {_when(clock, now[0])} to {_when(clock, now[-1])}, "
+            f"those of the truth from {_when(clock, then[0])} to {_when(clock, then[-1])}"
+        )
+    exact = int((same & known).sum())
+    note = (
+        f"{int(known.sum()):,} of {len(now):,} rows have a truth: {exact:,} at the same time, "
+        f"{int(known.sum()) - exact:,} between two that are at most {LONGEST_GAP:g} s apart"
+    )
+    return columns, note + (f"; {offset:+g} s were added to its times" if offset else "")
+
+
+def _when(clock: str, time: float) -> str:
+    """Write a time for people."""
+    if clock != "dates":
+        return f"{time:g} s"
+    return str(numpy.datetime64(round(time), "s"))
+
+
+def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarray) -> str:
+    """Say which constant offset of the clocks would bring positions nearer to the truth; empty if none does.
+
+    Args:
+        time: of the log, s, ``(n,)``.
+        position: measured, m, ``(n, k)``; NaN where there is none.
+        truth: likewise, at these times.
+    """
+    known = numpy.isfinite(truth).all(axis=1)
+    if known.sum() < 2:
+        return ""
+
+    def distances(rows: slice) -> numpy.ndarray:
+        """Median distance at each offset, m; infinite where few times are common."""
+        found = []
+        for offset in OFFSETS:
+            at = [
+                numpy.interp(time[rows] - offset, time[known], axis, left=numpy.nan, right=numpy.nan)
+                for axis in truth[known].T
+            ]
+            apart = numpy.hypot.reduce(position[rows] - numpy.stack(at, axis=1), axis=1)
+            there = numpy.isfinite(apart)
+            found.append(numpy.median(apart[there]) if there.mean() > 0.3 else numpy.inf)
+        return numpy.array(found)
+
+    half = len(time) // 2
+    parts = [distances(rows) for rows in (slice(0, half), slice(half, None))]
+    if not all(numpy.isfinite(part).any() for part in parts):
+        return ""
+    one, other = (OFFSETS[part.argmin()] for part in parts)
+    whole = distances(slice(None))
+    best, now = whole.argmin(), whole[len(OFFSETS) // 2]
+    if abs(one - other) > AGREE or whole[best] > BETTER * now:
+        return ""
+    return (
+        f"positions are {now:.3g} m from the truth in the median, and would be {whole[best]:.3g} m if "
+        f"{OFFSETS[best]:+.1f} s were added to its times, in both halves alike: are its clock and the log's the same "
+        "(GPS time is 18 s ahead of UTC)? Nothing was shifted"
+    )

@@ -1,0 +1,104 @@
+"""What computes the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
+
+from types import ModuleType
+from typing import Any
+
+import numpy
+
+from ...compiler.namespace import NotTraceable
+from ..contract.model import Model
+from ..contract.parameters import Limits, check
+from ..contract.task import Task
+from .catalogue import nearest
+from .compiled import AVAILABLE, CompiledModel, warn_of
+from .scenario_choice import make_task
+
+BACKENDS = ("auto", "compiled", "numpy", "torch")
+
+
+def make_model(
+    cls: type[Task],
+    control: str | None = None,
+    scenario: Any = None,
+    *,
+    backend: str = "numpy",
+    device: Any = None,
+    threads: int = 1,
+    **keywords: Any,
+) -> Model:
+    """Make a task with the bank of a control in the loop; ``model.backend`` says what computes its steps.
+
+    Args:
+        cls: the task.
+        control: what the action steers; default: the first of the task's controls.
+        scenario: as :func:`~.scenario_choice.find_scenario` takes it.
+        backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
+            traced, else NumPy.
+        device: of torch, such as "cuda:1".
+        threads: how many share the lanes of the compiled backend.
+        **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
+
+    Raises:
+        ValueError: for an unknown name or backend, a parameter out of its limits, a device that is not there, less
+            than one thread, or a task that cannot be compiled and was asked to be.
+        ImportError: if the backend needs a library that is not installed.
+    """
+    check("threads", threads, int, Limits(at_least=1))
+    xp, device = array_backend(backend, device)
+    control = cls.controls[0] if control is None else control
+    if control not in (*cls.controls, *cls.trained_banks):
+        raise nearest("control", control, cls.controls)
+    task = make_task(cls, scenario, xp, device, **keywords)
+    if backend == "compiled" or (backend == "auto" and AVAILABLE):
+        try:
+            return CompiledModel(task, control, threads)
+        except NotTraceable as error:
+            if backend == "compiled":
+                raise ValueError(f"{task.id} cannot be compiled: {error}") from error
+            warn_of(task.id, error)
+    return Model(task, control)
+
+
+def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
+    """Return the array namespace of a backend, and its device.
+
+    torch is imported here and only when asked for.
+
+    Args:
+        backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
+        device: None for the backend's default (the CPU), or what ``torch.device`` takes, such as "cuda:1".
+
+    Returns:
+        Namespace and device; the device is None for NumPy.
+
+    Raises:
+        ValueError: for an unknown backend, a device that NumPy does not have, or a device that is not there.
+        ImportError: if torch is asked for and not installed.
+    """
+    if backend not in BACKENDS:
+        raise nearest("backend", backend, BACKENDS)
+    if backend != "torch":
+        if device not in (None, "cpu"):
+            raise ValueError(
+                f"backend {backend!r} works on the CPU only, got device {device!r}; use backend='torch'"
+            )
+        return numpy, None
+    try:
+        import torch
+    except ImportError as error:
+        raise ImportError(
+            "backend 'torch' needs torch, which is not installed: pip install 'filtergym[agents]'"
+        ) from error
+    import array_api_compat.torch as xp
+
+    try:
+        chosen = torch.device("cpu" if device is None else device)
+        # An allocation is the only question that every kind of device answers, also whether it has float64.
+        torch.zeros(1, dtype=torch.float64, device=chosen)
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
+        there = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+        reason = str(error).strip().splitlines()[0].rstrip(".")
+        raise ValueError(
+            f"device {device!r} cannot be used ({reason}): choose from {', '.join(there)}"
+        ) from error
+    return xp, chosen

@@ -1,0 +1,245 @@
+"""Which environments there are, and the modules that users name.
+
+Every folder in ``envs/`` that says an ``ID`` is an environment; its ``task.py`` says the class, ``TASK``, which is
+imported when somebody asks for it. Nothing else needs to know about it. A user's own are added by
+:mod:`.registration`; :mod:`.scenario_choice` makes a task from names and keywords.
+"""
+
+import dataclasses
+import difflib
+import functools
+import importlib
+import pkgutil
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from ..contract.failures import own_line
+
+if TYPE_CHECKING:
+    from ..contract.task import Task
+
+ENVS = __package__.rpartition(".")[0]
+"""The package whose folders are the environments, and the rooms that they stand on."""
+USER_TASKS: dict[str, "type[Task]"] = {}
+"""Environments of users, as they were registered: Gymnasium id -> task class."""
+
+
+class Catalogue(Mapping[str, "type[Task]"]):
+    """Every environment: Gymnasium id -> task class, which is imported when it is read."""
+
+    def __getitem__(self, id: str) -> "type[Task]":
+        folder = folders().get(id)
+        if folder is None:
+            return USER_TASKS[id]
+        task: type[Task] = importlib.import_module(f"{ENVS}.{folder}.task").TASK
+        return task
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*folders(), *USER_TASKS))
+
+    def __len__(self) -> int:
+        return len(folders()) + len(USER_TASKS)
+
+    def __contains__(self, id: object) -> bool:
+        return id in folders() or id in USER_TASKS
+
+
+def catalogue() -> Mapping[str, "type[Task]"]:
+    """Return every environment: Gymnasium id -> task class, which is imported when it is read."""
+    return Catalogue()
+
+
+@functools.cache
+def folders() -> dict[str, str]:
+    """Return the folders of the environments, those of ``envs/`` that say an ``ID``: Gymnasium id -> name."""
+    names = [m.name for m in pkgutil.iter_modules(importlib.import_module(ENVS).__path__) if m.ispkg]
+    packages = {name: importlib.import_module(f"{ENVS}.{name}") for name in names}
+    return {package.ID: name for name, package in packages.items() if hasattr(package, "ID")}
+
+
+class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (a name says what it is)
+    """A keyword that an environment does not take: a TypeError as of any function, which clients look for who try
+    whether an environment takes one, and a ValueError as for every other wrong name.
+    """
+
+
+def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
+    """Say which name is unknown and what was probably meant."""
+    return ValueError(f"unknown {kind} {name!r}: {_meant(name, valid)}")
+
+
+def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None) -> str:
+    valid = list(valid)
+    close = difflib.get_close_matches(str(name), valid, n=3, cutoff=0.5)
+    if close:
+        return f"did you mean {' or '.join(map(repr, close))}?"
+    return f"choose from {', '.join(valid if choices is None else choices)}" if valid else "there are none"
+
+
+_SEARCH_FOLDERS: list[str] = []
+"""Folders in which modules that a user names are looked for, after ``sys.path``."""
+FOUND_IN: list[str] = []
+"""Those of them in which one was found; other processes are told, see :mod:`..evaluation.parallel`."""
+
+
+@contextmanager
+def modules_from(folder: str) -> Iterator[None]:
+    """Let modules that a user names be found in a folder, too, and nothing else: a file there is no library."""
+    _SEARCH_FOLDERS.append(folder)
+    try:
+        yield
+    finally:
+        _SEARCH_FOLDERS.remove(folder)
+        FOUND_IN.clear()
+
+
+@contextmanager
+def on_path(folders: Iterable[str]) -> Iterator[None]:
+    """Let folders stand at the end of ``sys.path`` for a while, where none of them hides a library."""
+    further = [folder for folder in folders if folder not in sys.path]
+    sys.path.extend(further)
+    try:
+        yield
+    finally:
+        sys.path[:] = [path for path in sys.path if path not in further]
+
+
+def import_user_module(module: str, refusal: str) -> ModuleType:
+    """Import a module that a user has named: the one function that imports by a name, and doors alone call it.
+
+    A door is an argument of the command line or of a function that the user calls. What was read from a file goes
+    through :func:`task_class`, which imports nothing.
+
+    Args:
+        module: its name, with dots.
+        refusal: beginning of the error.
+
+    Raises:
+        ValueError: if that is no name of a module, or the import fails, for whatever reason.
+    """
+    try:
+        if not all(part.isidentifier() for part in module.split(".")):
+            raise ImportError("a module is named by words with dots between them")
+        with on_path(_SEARCH_FOLDERS):
+            found = importlib.import_module(module)
+    except Exception as error:  # a module is a program: it can raise anything
+        # A ValueError says all that there is to say.
+        line = "" if isinstance(error, ValueError) else own_line(error)
+        raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
+    places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
+    FOUND_IN.extend(
+        folder
+        for folder in _SEARCH_FOLDERS
+        if folder not in FOUND_IN and any(Path(place).is_relative_to(folder) for place in places)
+    )
+    return found
+
+
+def import_task(id: str) -> "type[Task]":
+    """Return the task of an id that a user has given, as :func:`task_class`; ``module:id`` imports the module first.
+
+    The module registers the environment, as for ``gymnasium.make``.
+
+    Raises:
+        ValueError: if there is none, or its module cannot be imported.
+    """
+    if not isinstance(id, str) or ":" not in id:
+        return task_class(id)
+    module, _, own = id.partition(":")
+    import_user_module(module, f"cannot import {module!r}, which registers environment {own!r}")
+    try:
+        return task_class(own)
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; {module!r} was imported, and does not register it with filtergym.register_task"
+        ) from error
+
+
+def task_class(id: str) -> "type[Task]":
+    """Return the task of an environment id, and import nothing; ``filtergym/`` may be left out.
+
+    Raises:
+        ValueError: if there is none; of ``module:id``, if the module has not been imported.
+    """
+    if not isinstance(id, str):
+        raise ValueError(
+            f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {id!r}"
+        )
+    module, colon, own = id.rpartition(":")
+    known = catalogue()
+    for candidate in (own, f"filtergym/{own}", f"filtergym/{own}-v0"):
+        if candidate in known:
+            return known[candidate]
+    if colon and module not in sys.modules:
+        raise ValueError(
+            f"unknown environment {own!r}: import {module!r} yourself, or name the environment on the command line, as "
+            f"{id!r}; a name that was read from a file imports nothing"
+        )
+    raise nearest("environment", own, known)
+
+
+class ImportableName(str):
+    """Id of an environment with the module that registers it, ``module:id``, as this process knows it.
+
+    Sent to another process of ours, where it is unpickled, it imports the module. Written to a file and read again it
+    is an ordinary string, which imports nothing.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _import_name, (str(self),)
+
+    def __deepcopy__(self, memo: Any) -> "ImportableName":
+        return self
+
+
+def _import_name(name: str) -> ImportableName:
+    return ImportableName(importable_name(import_task(name)))
+
+
+def importable_name(cls: "type[Task]") -> str:
+    """Id by which another process finds an environment: of a user's with the module that registers it."""
+    return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
+
+
+def short_name(id: str) -> str:
+    """Name of a Gymnasium id for files, and where the id is too long."""
+    return id.removeprefix("filtergym/").replace("/", "-")
+
+
+def parameter_names(cls: "type[Task]") -> list[str]:
+    """Names of the keywords that an environment takes besides control, scenario and reward."""
+    return [f.name for f in dataclasses.fields(cls.Parameters)]
+
+
+def check_names(cls: "type[Task]", keywords: Iterable[str], others: Iterable[str] = ()) -> None:
+    """Raise :class:`UnknownKeyword` if a keyword is no parameter of an environment.
+
+    Args:
+        cls: the environment.
+        keywords: that were given as parameters.
+        others: what could have been meant beside parameters.
+    """
+    known = parameter_names(cls)
+    for name in keywords:
+        if name not in known:
+            hint = _meant(name, [*others, *known], choices=known)
+            raise UnknownKeyword(f"unexpected keyword argument {name!r}, no parameter of {cls.id}: {hint}")
+
+
+def register() -> None:
+    """Register every environment with Gymnasium; calling it again changes nothing."""
+    for id in catalogue():
+        if id not in gymnasium.registry:
+            gymnasium.register(
+                id,
+                entry_point="filtergym.envs.engine.environment:TaskEnv",
+                vector_entry_point="filtergym.envs.engine.environment:TaskVectorEnv",
+                # A spawned process gets no more than this, and must find the environment by it.
+                kwargs={"task": importable_name(USER_TASKS[id]) if id in USER_TASKS else id},
+            )

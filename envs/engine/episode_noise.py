@@ -1,0 +1,257 @@
+"""Random numbers of episodes side by side, made from the episodes' identities.
+
+**What an episode is.** When an episode starts, its lane's generator gives its *identity*, two whole numbers of 64 bits.
+Every random number of the episode is a function of its identity, the measurement ``t`` and the number's place in the
+measurement (:mod:`..compiler.counter_numbers`): at ``t = 0`` those of its start, from ``t = 1`` on those of measurement
+``t``. So what came before, actions, the control, other lanes, copies and threads change nothing: policies of different
+controls that start from the same seed face the same noise.
+
+With llvmlite compiled code makes the numbers, otherwise NumPy, for many measurements at once; the bits are the same.
+"""
+
+import copy
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy
+
+from ...compiler.counter_numbers import numbers
+from ...compiler.functions import Call, address_of, empty_lanes, round_up_lanes
+from ...compiler.native import AVAILABLE
+from ..contract.observation import Array
+from ..contract.task import NoiseLayout, Task
+
+AHEAD = 1 << 13
+"""Lanes times measurements that NumPy makes at once: a call takes longer than the numbers of a few lanes."""
+BLOCKS_OF_SEEDS = 64
+"""Blocks of seeds whose identities a process keeps."""
+
+
+def draw_identity(generator: numpy.random.Generator) -> numpy.ndarray:
+    """Draw the identity of an episode, ``(2,)`` uint64."""
+    # The generator's own words: its methods take ten times longer to say the same.
+    found: numpy.ndarray = generator.bit_generator.random_raw(2)
+    return found
+
+
+@functools.lru_cache(BLOCKS_OF_SEEDS)
+def _identities_of_seeds(seeds: tuple[int, ...]) -> numpy.ndarray:
+    found = numpy.empty((2, len(seeds)), dtype=numpy.uint64)
+    for lane, seed in enumerate(seeds):
+        found[:, lane] = draw_identity(numpy.random.default_rng(seed))
+    found.flags.writeable = False
+    return found
+
+
+def identities_of_seeds(seeds: Sequence[int]) -> numpy.ndarray:
+    """Identities of the first episodes of environments that are reset with these seeds, ``(2, N)`` uint64.
+
+    To seed a generator takes long, and competitors are compared on the same seeds, so the identities
+    of the last blocks of seeds are kept.
+    """
+    return _identities_of_seeds(tuple(seeds))
+
+
+def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Uniforms ``(layout.uniforms, N)`` and normals ``(layout.initial_normals, N)`` of the start of episodes.
+
+    Args:
+        identities: ``(2, N)`` uint64.
+        layout: of the task.
+    """
+    t = numpy.zeros(identities.shape[1], dtype=numpy.int64)
+    found = numbers(identities, t, layout.initial_normals, layout.uniforms)
+    return found[layout.initial_normals :], found[: layout.initial_normals]
+
+
+def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
+    """Uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
+
+    Args:
+        seeds: as in :func:`identities_of_seeds`.
+        layout: of the task.
+    """
+    return start_numbers(identities_of_seeds(seeds), layout)[0]
+
+
+class EpisodeNoise:
+    """Noise of ``count`` lanes.
+
+    Args:
+        task: whose layout and namespace it has.
+        count: number of lanes; they are padded to a multiple of eight by episodes of identity zero.
+
+    Attributes:
+        identities: of the lanes' episodes, ``(2, width)`` uint64.
+        measurement: whose numbers each lane has got last, ``(width,)`` int64; -1 before those of its start.
+        generators: from which each lane draws the identities of its coming episodes.
+    """
+
+    def __init__(self, task: Task, count: int) -> None:
+        self.task, self._layout = task, task.noise
+        self._rows = task.noise.normals + task.noise.row_uniforms
+        self.generators: list[numpy.random.Generator] = []
+        self._set_width(round_up_lanes(count))
+
+    def _set_width(self, width: int) -> None:
+        self.width = width
+        self.identities = numpy.zeros((2, width), dtype=numpy.uint64)
+        self.measurement = numpy.full(width, -1, dtype=numpy.int64)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what follows from identities and measurements."""
+        self._start: Call | None = None
+        self._next: Call | None = None
+        self._address = 0
+        self._due = False
+        """Whether the numbers of the measurement that is gone on to are still to be made."""
+        self._row: Array = None
+        self._ahead: numpy.ndarray | None = None
+        """Rows of the coming measurements, ``(measurements, rows, width)``, where NumPy makes them."""
+        self._slot = 0
+
+    # --- which episodes
+
+    def seed(self, lane: int, generator: numpy.random.Generator) -> None:
+        """Give a lane the generator that draws the identities of its coming episodes."""
+        while len(self.generators) <= lane:
+            self.generators.append(generator)
+        self.generators[lane] = generator
+
+    def draw_identities(self, lanes: Sequence[int]) -> numpy.ndarray:
+        """Draw the identities of new episodes of some lanes, ``(2, lanes)``."""
+        generators = self.generators
+        return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
+
+    def begin(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Begin episodes in the first lanes, and go on to their first measurement.
+
+        Args:
+            identities: ``(2, lanes)``; the other lanes are padding.
+
+        Returns:
+            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, in new memory.
+        """
+        self.identities[:, : identities.shape[1]] = identities
+        self.identities[:, identities.shape[1] :] = 0
+        self.measurement[:] = -1
+        self._ahead, self._row, self._due = None, None, True
+        if not AVAILABLE:
+            self.measurement[:] = 0
+            return start_numbers(self.identities, self._layout)
+        normals = self._layout.initial_normals
+        memory = empty_lanes((normals + self._layout.uniforms,), self.width)
+        if self._start is None:
+            self._start = self._bind(memory, normals)
+        self._start.replace(2, memory)
+        self._start(0, self.width)
+        return memory[normals:], memory[:normals]
+
+    def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:
+        """Go on in some lanes with the first episodes of others."""
+        self.identities[:, lanes] = other.identities[:, : len(lanes)]
+        self.measurement[lanes] = other.measurement[: len(lanes)]
+        if self._ahead is not None:
+            self._ahead[self._slot :, :, lanes] = self._numbers_ahead(lanes, len(self._ahead) - self._slot)
+
+    # --- their numbers
+
+    def advance(self) -> None:
+        """Go on to the next measurement."""
+        if self._due:
+            _ = self.row
+        self._due, self._row = True, None
+
+    @property
+    def row(self) -> Array:
+        """Numbers of this measurement, ``(row width, width)``, in memory that stays as it is."""
+        if self._row is None:
+            task, row = self.task, self._copied_from_code() if AVAILABLE else self._next_of_block()
+            self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
+        return self._row
+
+    def calls(self) -> tuple[Call, ...]:
+        """Return what makes the numbers of this measurement at :attr:`address`; nothing the second time."""
+        if not self._due:
+            return ()
+        self._due = False
+        return (self._next or self._next_call(),)
+
+    def call_of_each(self) -> Call:
+        """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
+
+        It is for whoever goes on over several in native code, and is run at least once.
+        """
+        self.advance()
+        self._due = False
+        return self._next_call()
+
+    @property
+    def address(self) -> int:
+        """Address of the memory that :meth:`calls` write, rows apart as those of :func:`empty_lanes`."""
+        return self._address or address_of(self._next_call().arrays[2])
+
+    def _copied_from_code(self) -> numpy.ndarray:
+        for call in self.calls():
+            call(0, self.width)
+        return self._next_call().arrays[2].copy()
+
+    def _next_call(self) -> Call:
+        if self._next is None:
+            memory = empty_lanes((self._rows,), self.width)
+            self._next, self._address = self._bind(memory, self._layout.normals), address_of(memory)
+        return self._next
+
+    def _bind(self, rows: numpy.ndarray, normals: int) -> Call:
+        from ...compiler.counter_code import bind_numbers
+
+        return bind_numbers(self.identities, self.measurement, rows, normals)
+
+    def _next_of_block(self) -> numpy.ndarray:
+        if self._ahead is None or self._slot == len(self._ahead):
+            lanes = numpy.arange(self.width)
+            self._ahead, self._slot = self._numbers_ahead(lanes, max(AHEAD // self.width, 1)), 0
+        self._slot += 1
+        self.measurement += 1
+        self._due = False
+        return self._ahead[self._slot - 1]
+
+    def _numbers_ahead(self, lanes: numpy.ndarray, measurements: int) -> numpy.ndarray:
+        """Rows of the coming measurements of some lanes, ``(measurements, rows, lanes)``."""
+        t = self.measurement[lanes] + numpy.arange(1, measurements + 1)[:, None]
+        return numbers(self.identities[:, lanes], t, self._layout.normals, self._layout.row_uniforms)
+
+    # --- copies and growth
+
+    def grow(self, count: int, index: numpy.ndarray) -> None:
+        """Make room for more lanes.
+
+        Args:
+            count: of all of them, a multiple of eight.
+            index: for each the lane whose numbers it gets until it begins an episode.
+        """
+        identities, measurement = self.identities[:, index], self.measurement[index]
+        self._set_width(count)
+        self.identities[...], self.measurement[...] = identities, measurement
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the coming numbers depend on; :meth:`restore` goes back to it, as often as one likes."""
+        return copy.deepcopy({name: getattr(self, name) for name in _STATE_ATTRIBUTES})
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go on from a snapshot of the same task and as many lanes."""
+        self.__dict__.update(copy.deepcopy(snapshot))
+        self._forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"task": self.task, "_layout": self._layout, "_rows": self._rows, **self.snapshot()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+
+_STATE_ATTRIBUTES = ("width", "identities", "measurement", "generators")
+"""Attributes that numbers depend on."""

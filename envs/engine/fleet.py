@@ -1,0 +1,339 @@
+"""The fleet of an environment: its lanes, of one task or of several side by side.
+
+A task has one set of parameters. As long as all episodes are of one, the fleet is that task's
+:class:`~.lanes.Lanes`, and every call goes straight to them. Where scenarios are mixed, or a reset names another
+scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
+place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody
+has is stepped all the same and never looked at: a step costs what as many environments of each task cost as ever flew
+it at once.
+
+What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the identity
+of the episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed,
+here too.
+"""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..contract.model import Model
+from ..contract.observation import Array
+from ..data.recording import Recording
+from .lanes import Lanes
+from .reward import reference
+from .specification import plain
+
+ROOM = 8
+"""Places by which lanes grow: a multiple of the width that arrays are padded to."""
+
+
+class Course(NamedTuple):
+    """What the coming episodes of a lane are drawn from."""
+
+    scenario: Any
+    """As it was asked for."""
+    parameters: Mapping[str, Any]
+    """Beside those that the environment was made with."""
+    models: tuple[Model, ...]
+    names: tuple[str, ...]
+    """Of their scenarios."""
+    weights: tuple[float, ...]
+    """Which sum to one."""
+
+    def is_of(self, scenario: Any, parameters: Mapping[str, Any]) -> bool:
+        """Whether it was made of these."""
+        if isinstance(scenario, Recording) or isinstance(self.scenario, Recording):  # too long to be told
+            alike = scenario is self.scenario
+        else:
+            alike = repr(plain(self.scenario)) == repr(plain(scenario))
+        return alike and repr(plain(self.parameters)) == repr(plain(parameters))
+
+    def draw_task(self, generator: numpy.random.Generator) -> int:
+        """Number of the task of the next episode; one task takes no random number."""
+        if len(self.models) == 1:
+            return 0
+        chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
+        return min(chosen, len(self.models) - 1)
+
+
+def check_alike(model: Model, other: Model, name: str) -> None:
+    """Raise ValueError if episodes of another task would not fit the spaces of a task.
+
+    Args:
+        model: whose spaces there are.
+        other: that is to be flown too.
+        name: of its scenario, in errors.
+    """
+    properties: dict[str, Callable[[Model], Any]] = {
+        "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
+        "the action space": lambda t: t.action_space,
+        "decision_interval": lambda t: t.task.decision_interval,
+        "what is estimated": lambda t: t.task.components,
+    }
+    for what, of in properties.items():
+        if of(model) != of(other):
+            raise ValueError(
+                f"scenario {name!r} with these parameters would change {what} of this environment, which stays as it "
+                "is made: make another environment"
+            )
+
+
+class Fleet:
+    """``count`` lanes, each with a :class:`Course` of its own.
+
+    Args:
+        count: number of lanes.
+        course: of all of them, until :meth:`send` names others.
+        kind: of reward, which may need a reference that runs beside every episode.
+        longest: decisions after which an episode ends at the latest; default: its task's horizon.
+    """
+
+    def __init__(self, count: int, course: Course, kind: str, longest: int | None = None) -> None:
+        self.count = count
+        self.generators: list[numpy.random.Generator] = []
+        self._courses = [course] * count
+        self._kind, self._longest = kind, longest
+        self._part = numpy.full(count, -1)
+        """Which of ``_parts`` each lane flies in; -1 before its first episode."""
+        self._place = numpy.arange(count)
+        """Where in it."""
+        self._names = [course.names[0]] * count
+        self._parts: list[Lanes] = []
+        self._whole: Lanes | None = None
+        """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
+        self._sent = False
+        """Whether lanes have courses that their episodes were not drawn from."""
+        if len(course.models) == 1:
+            self._parts, self._part[:] = [self._make_lanes(course.models[0], count)], 0
+        self._arrange()
+
+    # --- who flies where
+
+    @property
+    def only(self) -> Lanes:
+        """The lanes, where all episodes are of one task.
+
+        Raises:
+            ValueError: where they are of several.
+        """
+        if self._whole is not None:
+            return self._whole
+        if self.count > 1:
+            raise ValueError("episodes of several tasks have no common state: use parts()")
+        return self._parts[self._part[0]]
+
+    @property
+    def mixes_scenarios(self) -> bool:
+        """Whether the coming episodes may be of several tasks."""
+        return len({id(model) for course in self._courses for model in course.models}) > 1
+
+    def courses(self) -> list[Course]:
+        """Return the different courses that lanes have."""
+        return list({id(course): course for course in self._courses}.values())
+
+    def course_of(self, lane: int) -> Course:
+        """Return what the coming episodes of a lane are drawn from."""
+        return self._courses[lane]
+
+    def send(self, lane: int, course: Course) -> None:
+        """Draw the coming episodes of a lane from a course, from its next restart on."""
+        self._sent = self._sent or course is not self._courses[lane]
+        self._courses[lane] = course
+
+    def model_of(self, lane: int) -> Model:
+        """Return the task of a lane's episode."""
+        return self._parts[self._part[lane]].model
+
+    def identity_of(self, lane: int) -> numpy.ndarray:
+        """Identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
+        place = self._place[lane]
+        return self._parts[self._part[lane]].noise.identities[:, place : place + 1].copy()
+
+    def scenario_of(self, lane: int) -> str:
+        """Name of the scenario of a lane's episode."""
+        return self._names[lane]
+
+    @property
+    def decisions_per_episode(self) -> int:
+        """Decisions of the longest episode that there may be."""
+        models = {id(model): model for course in self.courses() for model in course.models}.values()
+        most = max(model.task.horizon // model.task.decision_interval for model in models)
+        return most if self._longest is None else min(most, self._longest)
+
+    def _make_lanes(self, model: Model, count: int) -> Lanes:
+        return Lanes(model, count, reference(self._kind, model), longest=self._longest)
+
+    def _part_of(self, model: Model) -> Lanes:
+        """Lanes of a task, made when they are first asked for."""
+        for part in self._parts:
+            if part.model is model or part.model.task.parameters == model.task.parameters:
+                return part
+        part = self._make_lanes(model, ROOM)
+        for place in range(ROOM):
+            part.seed(place, numpy.random.default_rng(0))
+        part.restart()
+        self._parts.append(part)
+        return part
+
+    def _arrange(self) -> None:
+        """Forget lanes that nobody needs, and note where everybody is."""
+        needed = [model.task.parameters for course in self._courses for model in course.models]
+        kept = [
+            i
+            for i, part in enumerate(self._parts)
+            if (self._part == i).any() or part.model.task.parameters in needed
+        ]
+        renumbered = {-1: -1, **{old: new for new, old in enumerate(kept)}}
+        self._part = numpy.array([renumbered[int(part)] for part in self._part])
+        self._parts = [self._parts[i] for i in kept]
+        self._flying = [i for i in range(len(self._parts)) if (self._part == i).any()]
+        # Arrays of all places of those that fly are put side by side: there each lane finds its own.
+        self._where, self._sources, first = self._place.copy(), [], 0
+        for i in self._flying:
+            own = numpy.flatnonzero(self._part == i)
+            self._where[own] += first
+            # A place that nobody has takes the action of whoever comes first.
+            source = numpy.full(self._parts[i].count, own[0])
+            source[self._place[own]] = own
+            self._sources.append(source)
+            first += self._parts[i].count
+        own_places = self._flying == [0] and numpy.array_equal(self._place, numpy.arange(self.count))
+        alone = len(self._parts) == 1 and self._parts[0].count == self.count and not self.mixes_scenarios
+        self._whole = self._parts[0] if own_places and alone else None
+
+    def seed(self, lane: int, generator: numpy.random.Generator) -> None:
+        """Give a lane the generator that its coming episodes are drawn from."""
+        while len(self.generators) <= lane:
+            self.generators.append(generator)
+        self.generators[lane] = generator
+        if self._whole is not None:
+            self._whole.seed(lane, generator)
+
+    def restart(self, lanes: Sequence[int] | None = None) -> None:
+        """Start new episodes in some lanes (default: all), each of a task that is drawn for it."""
+        if self._whole is not None and not self._sent:
+            self._whole.restart(lanes)
+            return
+        if self._whole is not None:
+            self._leave(self._whole)
+        self._sent = False
+        chosen = list(range(self.count) if lanes is None else lanes)
+        self._part[chosen] = -1
+        fresh: dict[int, list[int]] = {}
+        for lane in chosen:
+            course = self._courses[lane]
+            which = course.draw_task(self.generators[lane])
+            part = self._part_of(course.models[which])
+            number = next(i for i, other in enumerate(self._parts) if other is part)
+            fresh.setdefault(number, []).append(lane)
+            self._names[lane] = course.names[which]
+        for number, arrived in fresh.items():
+            part = self._parts[number]
+            taken = set(self._place[self._part == number].tolist())
+            missing = len(taken) + len(arrived) - part.count
+            if missing > 0:
+                part.grow(part.count + -(-missing // ROOM) * ROOM)
+            free = [place for place in range(part.count) if place not in taken][: len(arrived)]
+            for lane, place in zip(arrived, free, strict=True):
+                self._part[lane], self._place[lane] = number, place
+                part.seed(place, self.generators[lane])
+            part.restart(free)
+        self._arrange()
+
+    def _leave(self, whole: Lanes) -> None:
+        """Make room for lanes of other tasks."""
+        self._whole = None
+        if whole.has_episodes:
+            whole.grow(whole.width)
+        else:
+            self._parts, self._part[:] = [], -1
+
+    # --- what lanes do
+
+    def parts(self, *values: Array) -> list[tuple[Any, ...]]:
+        """Lanes of every task that is flown, each with what is meant for it of arrays ``(count, ...)``."""
+        return [
+            (self._parts[i], *(v[source] for v in values))
+            for i, source in zip(self._flying, self._sources, strict=True)
+        ]
+
+    def gather(self, values: Sequence[Array]) -> Array:
+        """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``, in a new array."""
+        if isinstance(values[0], numpy.ndarray):
+            return (
+                numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
+            )
+        if self._whole is not None:
+            return self._whole.model.task.xp.asarray(values[0], copy=True)
+        return self._parts[0].model.task.xp.concat(list(values))[self._where]
+
+    def pay(self, action: Array, kind: str) -> Array:
+        """Apply one decision and return its reward, see :meth:`.lanes.Lanes.pay`."""
+        if self._whole is not None:
+            return self._whole.pay(action, kind)
+        return self.gather([part.pay(own, kind) for part, own in self.parts(action)])
+
+    def observe(self) -> Array:
+        """Observation of every lane, batch first."""
+        if self._whole is not None:
+            return self._whole.observe()
+        return self.gather([part.observe() for (part,) in self.parts()])
+
+    @property
+    def decisions(self) -> numpy.ndarray:
+        """Actions taken in each lane's current episode, ``(count,)``."""
+        return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
+
+    @property
+    def done(self) -> numpy.ndarray:
+        """Lanes whose episode is over, ``(count,)`` booleans; episodes of different tasks may differ in length."""
+        if self._whole is not None:
+            return self._whole.done
+        return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
+
+    def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
+        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        for lane, by in zip(lanes, decisions, strict=True):
+            self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
+
+    @property
+    def has_episodes(self) -> bool:
+        """Whether every lane has an episode."""
+        return self._whole.has_episodes if self._whole is not None else bool((self._part >= 0).all())
+
+    def detach(self) -> None:
+        """Cut the gradient (torch only)."""
+        for (part,) in self.parts():
+            part.detach()
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
+        kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
+        return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go on from a snapshot of lanes of the same tasks.
+
+        Raises:
+            ValueError: if their number differs.
+        """
+        if snapshot["count"] != self.count:
+            raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
+        for name in _STATE_ATTRIBUTES:
+            setattr(self, name, copy.deepcopy(snapshot[name]))
+        there = {(part.model, part.count): part for part in self._parts}
+        self._parts = [
+            there.get((model, count)) or self._make_lanes(model, count)
+            for model, count, _ in snapshot["parts"]
+        ]
+        for part, (_, _, kept) in zip(self._parts, snapshot["parts"], strict=True):
+            part.restore(kept)
+        for lane in numpy.flatnonzero(self._part >= 0):
+            self._parts[self._part[lane]].seed(int(self._place[lane]), self.generators[lane])
+        self._arrange()
+
+
+_STATE_ATTRIBUTES = ("generators", "_courses", "_part", "_place", "_names", "_sent")
+"""Attributes of a fleet that change."""

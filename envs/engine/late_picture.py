@@ -1,0 +1,70 @@
+"""The picture of an episode that is flown again when somebody looks at it.
+
+This module imports matplotlib; the environment imports it only when a render mode is asked for.
+"""
+
+import numpy
+
+from ...filters.array_namespace import host_array
+from ..contract.observation import Array
+from ..drawing.rendering import EpisodePicture
+from .lanes import Lanes
+
+
+class LatePicture:
+    """The picture of one episode, which is flown again when somebody looks.
+
+    Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
+    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its identity fix an
+    episode.
+
+    Args:
+        picture: that is brought up to date.
+    """
+
+    def __init__(self, picture: EpisodePicture) -> None:
+        self.model = picture.model
+        self._picture = picture
+        self._lanes = Lanes(picture.model, 1)
+        self._identity: numpy.ndarray | None = None
+        """Of an episode that has not begun here."""
+        self._actions: list[numpy.ndarray] = []
+        """Those not applied here."""
+
+    def begin(self, identity: numpy.ndarray) -> None:
+        """Note a new episode by its identity, ``(2, 1)``."""
+        self._identity, self._actions = identity, []
+
+    def keep(self, action: Array) -> None:
+        """Note an action, ``(A,)`` or a scalar."""
+        self._actions.append(numpy.array(host_array(action)))
+
+    @property
+    def picture(self) -> EpisodePicture:
+        """The picture with all that has happened."""
+        lanes, picture = self._lanes, self._picture
+        if self._identity is not None:
+            lanes.begin(self._identity)
+            picture.begin(lanes.state)
+            self._identity = None
+        for action in self._actions:
+            self._apply(action)
+        self._actions = []
+        return picture
+
+    def _apply(self, action: numpy.ndarray) -> None:
+        lanes, shown = self._lanes, self._lanes.observe()[0]
+        for state, _ in lanes.decide(action[None]):
+            self._picture.keep(state, action, shown)
+
+    def frame(self) -> numpy.ndarray:
+        """Draw and return the picture, ``(height, width, 3)`` bytes."""
+        return self.picture.frame(self._lanes.state)
+
+    def show(self) -> None:
+        """Draw into the window."""
+        self.picture.show(self._lanes.state)
+
+    def close(self) -> None:
+        """Close the window and forget the figure."""
+        self._picture.close()

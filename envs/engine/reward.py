@@ -1,0 +1,105 @@
+"""The reward of an agent for one measurement.
+
+* ``cost``: minus the charge of the estimate, in units of its average for the paper's algorithm, and compressed: of a
+  charge ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and
+  falls by 30 log(2) with every doubling once the track is lost. So it is always better to find the track again, and
+  one lost track does not drown all that can be learned elsewhere.
+* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It rewards an honest covariance,
+  too.
+* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must
+  be both accurate and consistent.
+* ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
+  positive where the agent does better than the paper.
+* ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
+  action of the same control is charged on the same noise, both in units of the paper's average, or where few lost
+  tracks rule that, of an ordinary episode (``Task.log_reward_unit``). It is zero where the agent does nothing, the
+  difference of small charges, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
+  of the charge, do not hide what an action changes in all others.
+
+:attr:`.Task.reward` says which is the default.
+
+What an evaluation compares is the cost, neither compressed nor in another unit.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ...filters.gaussian import log_density
+from ..contract.model import Model
+from ..contract.observation import Array
+
+COMPRESSED_BEYOND = 30.0
+"""Charge, in units of the paper's average one, from which on the reward falls slowly."""
+
+
+def charge(model: Model, state: Any) -> Array:
+    """What the estimate is charged in the reward, in units of the paper's average charge, compressed, ``(N,)``."""
+    return COMPRESSED_BEYOND * model.task.xp.log1p(
+        model.charge(state) * (1.0 / (COMPRESSED_BEYOND * model.task.reward_unit))
+    )
+
+
+def cost_reward(model: Model, state: Any) -> Array:
+    """Minus the compressed charge of the estimate, ``(N,)``."""
+    return -charge(model, state)
+
+
+def log_cost_reward(model: Model, state: Any) -> Array:
+    """Minus ``log(1 + x)`` of the charge x in units of an ordinary one, ``(N,)``."""
+    unit = model.task.log_reward_unit or model.task.reward_unit
+    return -model.task.xp.log1p(model.charge(state) * (1.0 / unit))
+
+
+def log_likelihood_reward(model: Model, state: Any) -> Array:
+    """Log-density of the truth under what is reported, ``(N,)``."""
+    return log_density(model.error(state), model.covariance(state))[0]
+
+
+def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
+    """Both: minus the compressed charge, plus the log-density of a component, ``(N,)``."""
+    return cost_reward(model, state) + log_likelihood_reward(model, state) * (
+        1.0 / len(model.task.components)
+    )
+
+
+def no_reward(model: Model, state: Any) -> Array:
+    """Zero, ``(N,)``, where the truth is not known."""
+    return 0.0 * model.mean(state)[0]
+
+
+OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
+    "cost": cost_reward,
+    "log-likelihood": log_likelihood_reward,
+    "cost-and-likelihood": cost_and_likelihood_reward,
+    "relative": cost_reward,
+    "log-relative": log_cost_reward,
+    "none": no_reward,
+}
+"""Functions of a model and its episodes. Where there is a :func:`reference`, the same of it is subtracted later. "none"
+is that of recordings without truth."""
+REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
+"""Those that can be asked for."""
+
+
+class RewardBaseline(NamedTuple):
+    """What runs beside every episode on the same noise, for rewards that are relative."""
+
+    model: Model
+    """The same task, under a control."""
+    action: tuple[float, ...] | int
+    """That holds in every decision, as the control's space has it."""
+
+
+def reference(kind: str, model: Model) -> RewardBaseline | None:
+    """Return what the reward of an agent is relative to; None where it is the agent's own.
+
+    Args:
+        kind: of reward.
+        model: in which the agent acts.
+    """
+    if kind == "relative":
+        paper = model.task.paper_policy
+        return RewardBaseline(model.under(paper.control), paper.action)
+    if kind == "log-relative":
+        return RewardBaseline(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
+    return None

@@ -1,0 +1,46 @@
+"""What Gymnasium is told of an environment that was made: its :class:`~gymnasium.envs.registration.EnvSpec`."""
+
+import dataclasses
+import enum
+import os
+from typing import Any
+
+import numpy
+from gymnasium.envs.registration import EnvSpec
+
+from ..data.flights import Flights
+from ..data.recording import Recording
+from ..data.trajectory import Trajectory
+
+
+def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
+    """Return a spec that knows how long an episode is, and whose keywords go through JSON.
+
+    Gymnasium registers one length for an id; here it follows from scenario and parameters. Only who asks is told:
+    no ``TimeLimit`` is put around the environment, which truncates by itself.
+
+    Args:
+        spec: as Gymnasium made it.
+        decisions: in an episode.
+    """
+    kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+    return dataclasses.replace(spec, max_episode_steps=decisions, kwargs=kwargs)
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold in place of a keyword's value; it makes the same environment."""
+    if isinstance(value, Trajectory | Recording):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {name: plain(item) for name, item in fields.items()}
+    if isinstance(value, Flights):
+        flown = [plain(trajectory) for trajectory in value.trajectories]
+        return {"trajectories": flown, "name": value.name, "fewest_scans": value.fewest_scans}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, numpy.ndarray | numpy.generic):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value

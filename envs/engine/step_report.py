@@ -1,0 +1,48 @@
+"""What an environment asks about every measurement, after the action."""
+
+import functools
+from typing import Any, NamedTuple
+
+from ..contract.model import Episode, Model
+from ..contract.observation import Array
+from .compiled import Report
+from .reward import OWN_PAY
+
+
+class StepReport(NamedTuple):
+    """What is asked about, lanes last; the rest is None."""
+
+    reward: Array
+    """``(N,)``; of a relative reward before the reference's is taken away."""
+    error: Array = None
+    """Estimate minus truth, ``(C, N)``."""
+    covariance: Array = None
+    """Reported for it, ``(C, C, N)``."""
+    details: dict[str, Array] | None = None
+    """What ``info`` holds with ``detailed_info``."""
+    episode: Any = None
+    """The state itself."""
+
+
+@functools.cache
+def step_report(kind: str, errors: bool = False, details: bool = False, episode: bool = False) -> Report:
+    """Return the function that makes a :class:`StepReport`, always the same one.
+
+    Args:
+        kind: of reward, one of :data:`.reward.OWN_PAY`.
+        errors: whether error and covariance are asked about.
+        details: likewise.
+        episode: likewise.
+    """
+    pay = OWN_PAY[kind]
+
+    def report(model: Model, state: Episode) -> StepReport:
+        found = StepReport(pay(model, state))
+        if errors:
+            found = found._replace(error=model.error(state), covariance=model.covariance(state))
+        if details:
+            judged = {"error": model.error(state), "cost": model.cost(state)} if model.task.has_truth else {}
+            found = found._replace(details={**judged, **model.track(state), **model.records(state)})
+        return found._replace(episode=state) if episode else found
+
+    return report

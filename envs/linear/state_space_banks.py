@@ -1,0 +1,486 @@
+r"""The banks of a task of state-space models: one extended Kalman filter, or an interacting multiple model (IMM).
+
+With a the action in [-1, 1], and the model's Q, R, its Jacobians F, H and the predicted mean x' = f(x):
+
+    noise     P' = F P F^T + 10^(d a1) Q,  R' = 10^(d a2) R,  d = noise_decades
+    gain      K = diag(c^a) P' H^T (H P' H^T + R)^-1,  c = gain_factor, in Joseph's form
+    evidence  nats added to the log-posterior of each hypothesis of the IMM
+
+Zero is the filter as written.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import imm
+from ...filters.innovation_update import Received, kalman_gain, keep_received, update_with_gain
+from ...filters.ordered_sums import ordered_sum
+from ...filters.small_matrices import outer, product, transpose
+from ..contract.controls import bank_action_space, bank_probabilities
+from ..contract.filter import Bank, Initial
+from ..contract.observation import (
+    ACTION,
+    AVERAGE_OF_LOG1P,
+    KEPT_AS_LOG,
+    LOG1P,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+)
+from .state_space import Equations, Measurement, StateSpace, StateSpaceParameters
+
+AVERAGED = 0.1
+"""Weight of the newest measurement in the averages that are shown."""
+NOISE_RANGE = 20.0
+"""``kalman-net``: largest factor and divisor of each deviation of the process noise, and of a measurement."""
+AGILITY = 5.0
+"""Likewise of the deviations in the gain alone."""
+OFFSET = 5.0
+"""Largest correction that it adds to the predicted state, in deviations of the process noise."""
+
+
+class Track(NamedTuple):
+    """An extended Kalman filter at one moment."""
+
+    mean: Array
+    """``(n, N)``; predicted between ``predict`` and the action."""
+    covariance: Array
+    """``(n, n, N)``; likewise, and then without process noise."""
+    innovation: Array
+    """Over its predicted sigma, ``(m, N)``."""
+    nis: Array
+    """Normalised innovation squared over the values received, ``(N,)``."""
+    log_likelihood: Array
+    """Log-density of the last measurement as it was predicted, ``(N,)``."""
+    average: Array
+    """Exponential average of log(1 + nis / degrees), ``(N,)``."""
+    action: Array
+    """Applied to the last measurement, ``(A, N)``."""
+
+
+class KalmanBank(Bank[StateSpace, Measurement, Any]):
+    """What the banks with one filter share."""
+
+    parameters: StateSpaceParameters
+
+    def __init__(self, task: StateSpace, control: str) -> None:
+        super().__init__(task, control)
+        self.equations: Equations = task.believed[0]
+        own = self.equations.model
+        self.states, self.sensors = len(own.Q), len(own.R)
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number from -1 to 1 for each entry of the action."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
+
+    @property
+    def answers(self) -> Sequence[str]:
+        """What the entries of the action are."""
+        raise NotImplementedError
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What every filter of one model shows."""
+        parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
+        return (
+            Block("innovation", lambda f, _: f.innovation, "innovations over their sigma", parts, SIGNED_LOG),
+            Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
+            Block(
+                "average_nis",
+                lambda f, _: f.average,
+                "average of log(1 + nis) of a number of the measurement",
+                shown=AVERAGE_OF_LOG1P,
+            ),
+            Block("available", lambda _, m: m.available, "1 where a value was received", parts, SHARE),
+            Block("last_action", lambda f, _: f.action, "action applied before", self.answers, ACTION),
+        )
+
+    def start(self, initial: Initial) -> Any:
+        """Start where everyone starts."""
+        zero = 0.0 * initial.mean[0]
+        return Track(
+            initial.mean,
+            initial.covariance,
+            self.xp.stack([zero] * self.sensors),
+            zero,
+            zero,
+            zero + math.log(2.0),
+            self.xp.stack([zero] * len(self.answers)),
+        )
+
+    def process_noise(self, action: Array) -> Array:
+        """Covariance of the process noise under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        return self.equations.Q[:, :, None]
+
+    def sensor_noise(self, action: Array) -> Array:
+        """Likewise of the measurement."""
+        return self.equations.R[:, :, None]
+
+    def predict(self, state: Any, measurement: Measurement) -> Any:
+        """Predict, and compare under the noises of the last action."""
+        mean, carried = self.equations.carry(state.mean, state.covariance)
+        return self.compare(state._replace(mean=mean, covariance=carried), measurement)
+
+    def compare(self, state: Any, measurement: Measurement) -> Any:
+        """What is known of the measurement as it was predicted."""
+        xp = self.xp
+        received = self.received(state, measurement, state.action)
+        P = state.covariance + self.process_noise(state.action)
+        S = product(product(received.H, P), transpose(received.H)) + received.R
+        sigma = xp.sqrt(xp.stack([S[j, j] for j in range(self.sensors)]))
+        result = update_with_gain(state.mean, P, received, 0.0 * transpose(received.H))
+        degrees = ordered_sum(measurement.available)
+        share = result.squared_distance / xp.maximum(degrees, 1.0 + 0.0 * degrees)
+        weight = AVERAGED * xp.minimum(degrees, 1.0 + 0.0 * degrees)
+        return state._replace(
+            innovation=received.innovation / sigma,
+            nis=result.squared_distance,
+            log_likelihood=result.log_likelihood,
+            average=state.average + weight * (xp.log1p(share) - state.average),
+        )
+
+    def received(self, state: Any, measurement: Measurement, action: Array) -> Received:
+        """What was received, under the noises of an action."""
+        nu = measurement.values - self.equations.measure(state.mean)
+        H = self.equations.measurement_matrix(state.mean)
+        return keep_received(nu, H, self.sensor_noise(action), measurement.available)
+
+    def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
+        """How likely the measurement was; NaN where nothing was received."""
+        degrees = ordered_sum(measurement.available)
+        there = degrees > 0.0
+        return {
+            "log_likelihood": self.xp.where(there, state.log_likelihood, math.nan),
+            "nis": self.xp.where(there, state.nis, math.nan),
+            "nis_degrees": degrees,
+        }
+
+
+class NoiseBank(KalmanBank):
+    """Control ``noise``: the action scales Q and R."""
+
+    answers = ("process", "measurement")
+
+    def _scale(self, action: Array, entry: int) -> Array:
+        return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
+
+    def process_noise(self, action: Array) -> Array:
+        """Scaled Q."""
+        return self._scale(action, 0) * self.equations.Q[:, :, None]
+
+    def sensor_noise(self, action: Array) -> Array:
+        """Scaled R."""
+        return self._scale(action, 1) * self.equations.R[:, :, None]
+
+    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+        """Update with the noises that the action asks for."""
+        action = self.xp.clip(action, -1.0, 1.0)
+        received = self.received(state, measurement, action)
+        P = state.covariance + self.process_noise(action)
+        result = update_with_gain(state.mean, P, received, kalman_gain(P, received))
+        return state._replace(mean=result.mean, covariance=result.covariance, action=action)
+
+
+class GainBank(KalmanBank):
+    """Control ``gain``: the action multiplies the gain of each component."""
+
+    @property
+    def answers(self) -> Sequence[str]:
+        """The components."""
+        return tuple(component.name for component in self.task.components)
+
+    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+        """Update with the gain that the action asks for."""
+        action = self.xp.clip(action, -1.0, 1.0)
+        received = self.received(state, measurement, action)
+        P = state.covariance + self.process_noise(action)
+        factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
+        result = update_with_gain(state.mean, P, received, factor[:, None] * kalman_gain(P, received))
+        return state._replace(mean=result.mean, covariance=result.covariance, action=action)
+
+
+class KalmanNetTrack(NamedTuple):
+    """As :class:`Track`, with what a network sees of the state."""
+
+    mean: Array
+    covariance: Array
+    innovation: Array
+    nis: Array
+    log_likelihood: Array
+    average: Array
+    action: Array
+    correction: Array
+    """Of the state by the last update, in deviations of the process noise, ``(n, N)``."""
+
+
+class KalmanNetBank(KalmanBank):
+    r"""The filter inside the learned estimator ``kalman-net``: a network sets noises, gain and motion.
+
+    With D = diag(20^a) of n entries of the action, W = diag(20^a) of m, A = diag(5^a) of n, C = diag(5^a) of m, and
+    b of n:
+
+        x' = f(x) + 5 b sqrt(diag Q)                          b of the measurement before
+        P' = F P F^T + D Q D,  R' = W R W
+        K = M H^T (H M H^T + C R' C)^-1,  M = F P F^T + A D Q D A,  in Joseph's form with P' and R'
+
+    The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering
+    for Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547. Reading: their network answers
+    with the gain itself; here with the noises of a Kalman gain, so that a network that knows nothing is the filter as
+    written.
+    """
+
+    def __init__(self, task: StateSpace, control: str) -> None:
+        super().__init__(task, control)
+        sigma = numpy.sqrt(numpy.diag(self.equations.model.Q))
+        self.deviations = task.constant(sigma)[:, None]
+        self.scales = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
+        self.sensor_scale = task.constant(1.0 / numpy.sqrt(numpy.diag(self.equations.model.R)))[:, None]
+
+    @property
+    def answers(self) -> Sequence[str]:
+        """Noises, what the gain alone takes for them, and the offset."""
+        counts = {"process": self.states, "sensor": self.sensors, "agility": self.states}
+        counts |= {"caution": self.sensors, "offset": self.states}
+        return tuple(f"{name}_{i + 1}" for name, count in counts.items() for i in range(count))
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """Also the state, the last correction and how sure the filter is."""
+        names = tuple(component.name for component in self.task.components)
+        names = names if len(names) > 1 else ()
+        xp = self.xp
+
+        def spread(f: KalmanNetTrack, _: Measurement) -> Array:
+            variances = xp.stack([f.covariance[i, i] for i in range(self.states)])
+            return 0.5 * xp.log(1e-12 + variances * self.scales**2)
+
+        return (
+            *super().blocks,
+            Block(
+                "state",
+                lambda f, _: f.mean * self.scales,
+                "predicted state over the deviation of the process noise",
+                names,
+                SIGNED_LOG,
+            ),
+            Block(
+                "correction", lambda f, _: f.correction, "the last correction, likewise", names, SIGNED_LOG
+            ),
+            Block("spread", spread, "deviation of the state, likewise", names, KEPT_AS_LOG),
+        )
+
+    def start(self, initial: Initial) -> KalmanNetTrack:
+        """Start where everyone starts."""
+        return KalmanNetTrack(**super().start(initial)._asdict(), correction=0.0 * initial.mean)
+
+    def _part(self, action: Array, place: int) -> Array:
+        """Entries of an action: process, sensor, agility, caution, offset."""
+        n, m = self.states, self.sensors
+        ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
+        return action[ends[place] : ends[place + 1]]
+
+    def process_noise(self, action: Array) -> Array:
+        """Q under the action."""
+        return self._scaled(self.equations.Q, NOISE_RANGE, self._part(action, 0))
+
+    def sensor_noise(self, action: Array) -> Array:
+        """R under the action."""
+        return self._scaled(self.equations.R, NOISE_RANGE, self._part(action, 1))
+
+    def _scaled(self, matrix: Array, factor: float, exponents: Array) -> Array:
+        scale = self.xp.exp(math.log(factor) * exponents)
+        matrix = matrix[:, :, None] if matrix.ndim == 2 else matrix
+        return outer(scale, scale) * matrix
+
+    def predict(self, state: KalmanNetTrack, measurement: Measurement) -> KalmanNetTrack:
+        """Predict with the offset that was answered, and compare."""
+        mean, carried = self.equations.carry(state.mean, state.covariance)
+        mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
+        return self.compare(state._replace(mean=mean, covariance=carried), measurement)
+
+    def act(self, state: KalmanNetTrack, measurement: Measurement, action: Array) -> KalmanNetTrack:
+        """Update as the network answers."""
+        action = self.xp.clip(action, -1.0, 1.0)
+        Q = self.process_noise(action)
+        received = self.received(state, measurement, action)
+        agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
+        cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
+        K = kalman_gain(agile, received._replace(R=cautious))
+        result = update_with_gain(state.mean, state.covariance + Q, received, K)
+        return state._replace(
+            mean=result.mean,
+            covariance=result.covariance,
+            action=action,
+            correction=(result.mean - state.mean) * self.scales,
+        )
+
+
+class Mixture(NamedTuple):
+    """An interacting multiple model at one moment."""
+
+    mean: Array
+    """``(n, N)``; after an action."""
+    covariance: Array
+    """``(n, n, N)``; likewise."""
+    means: Array
+    """Of the hypotheses, ``(n, M, N)``."""
+    covariances: Array
+    """``(n, n, M, N)``."""
+    log_predicted: Array
+    """Logarithm of the predicted probabilities, ``(M, N)``."""
+    probabilities: Array
+    """In force after the last action, ``(M, N)``."""
+    log_likelihood: Array
+    """Of the last measurement under each hypothesis, ``(M, N)``."""
+    nis: Array
+    """``(M, N)``."""
+    action: Array
+    """``(M, N)``."""
+
+
+class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
+    """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
+
+    Args:
+        task: the problem.
+        control: its name.
+        process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
+        measurement_noise: likewise on R.
+    """
+
+    parameters: StateSpaceParameters
+
+    def __init__(
+        self, task: StateSpace, control: str, process_noise: Any = 1.0, measurement_noise: Any = 1.0
+    ) -> None:
+        super().__init__(task, control)
+        self.count = len(task.believed)
+        self.factors = process_noise, measurement_noise
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number of evidence for each hypothesis."""
+        return bank_action_space(self.control, self.count)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """Probabilities and likelihoods of the hypotheses, what was received, and the last action."""
+        xp, modes = self.xp, self.task.modes
+        parts = tuple(map(str, range(1, len(self.task.definition.filters[0].R) + 1)))
+        return (
+            Block("nis", lambda f, _: f.nis, "normalised innovation squared", modes, LOG1P),
+            Block(
+                "log_likelihood",
+                lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
+                "log-likelihoods relative to the largest",
+                modes,
+                SIGNED_LOG,
+            ),
+            Block(
+                "predicted_probability",
+                lambda f, _: f.log_predicted,
+                "predicted probabilities",
+                modes,
+                KEPT_AS_LOG,
+            ),
+            Block(
+                "probability",
+                lambda f, _: f.probabilities,
+                "probabilities after the last action",
+                modes,
+                SHARE,
+            ),
+            Block(
+                "available",
+                lambda _, m: m.available,
+                "1 where a value was received",
+                parts if len(parts) > 1 else (),
+                SHARE,
+            ),
+            Block("last_action", lambda f, _: f.action, "action applied before", modes, ACTION),
+        )
+
+    def start(self, initial: Initial) -> Mixture:
+        """Start every hypothesis where everyone starts, all equally probable."""
+        xp, zero = self.xp, 0.0 * initial.mean[0]
+        one = xp.stack([zero] * self.count)
+        return Mixture(
+            initial.mean,
+            initial.covariance,
+            xp.stack([initial.mean] * self.count, axis=1),
+            xp.stack([initial.covariance] * self.count, axis=2),
+            one - math.log(self.count),
+            one + 1.0 / self.count,
+            one,
+            one,
+            one,
+        )
+
+    def predict(self, state: Mixture, measurement: Measurement) -> Mixture:
+        """Mix, and let every hypothesis predict and take the measurement in, as none of that depends on the action."""
+        xp = self.xp
+        chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
+        means, covariances = imm.mix(state.means, state.covariances, chain.mixing)
+        updates = []
+        for j, equations in enumerate(self.task.believed):
+            mean, carried = equations.carry(means[:, j], covariances[:, :, j])
+            P = carried + self.factors[0] * equations.Q[:, :, None]
+            received = keep_received(
+                measurement.values - equations.measure(mean),
+                equations.measurement_matrix(mean),
+                self.factors[1] * equations.R[:, :, None],
+                measurement.available,
+            )
+            updates.append(update_with_gain(mean, P, received, kalman_gain(P, received)))
+        return state._replace(
+            means=xp.stack([u.mean for u in updates], axis=1),
+            covariances=xp.stack([u.covariance for u in updates], axis=2),
+            log_predicted=imm.log_probabilities(chain.probabilities),
+            log_likelihood=xp.stack([u.log_likelihood for u in updates]),
+            nis=xp.stack([u.squared_distance for u in updates]),
+        )
+
+    def act(self, state: Mixture, measurement: Measurement, action: Array) -> Mixture:
+        """Weigh the hypotheses."""
+        probabilities = bank_probabilities(
+            self.control,
+            action,
+            state.log_predicted,
+            state.log_likelihood,
+            self.parameters.evidence_scale,
+            self.xp,
+        )
+        mean, covariance = imm.combine(state.means, state.covariances, probabilities)
+        action = self.xp.clip(action, -1.0, 1.0)
+        return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
+
+    def records(self, state: Mixture, measurement: Measurement) -> dict[str, Array]:
+        """How likely the measurement was, and the probabilities."""
+        there = ordered_sum(measurement.available) > 0.0
+        density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
+        return {
+            "log_likelihood": self.xp.where(there, density, math.nan),
+            "mode_probability": state.probabilities,
+        }
+
+
+def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
+    """Banks of a task with so many hypotheses by their controls, the default first, and what their actions mean."""
+    banks: dict[str, Any] = {"noise": NoiseBank, "gain": GainBank}
+    actions = {
+        "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",
+        "gain": "`gain_factor` to its power: factors on the Kalman gain of each component; "
+        "**0 is the filter as written**",
+    }
+    if count > 1:
+        banks = {"evidence": HypothesisBank, **banks}
+        actions["evidence"] = (
+            "times `evidence_scale` nats, added to the log-posterior of each hypothesis; **0 is the IMM**"
+        )
+    return banks, actions
