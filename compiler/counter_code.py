@@ -14,7 +14,7 @@ import numpy
 from .block import Block, block_for
 from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
 from .functions import Call, address_of
-from .native import Native, native_text, processor
+from .native import Code, Native, native_text, processor
 
 _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", "<<": "shl", ">>": "lshr"}
 
@@ -323,4 +323,4 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     for array in arrays:
         table += [address_of(array), array.strides[0] // array.itemsize]
     table += [normals, len(rows) - normals]
-    return Call(numbers_code(), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
+    return Call(Code(numbers_code()), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))

@@ -14,8 +14,6 @@ from .library import BINARY, Library
 from .parts import cut_parts, product_places, scratch_slots
 from .program import BAND, FUNCTIONS, OPERATIONS, Program
 
-PART = 100
-"""Operations and stores of a part."""
 _INFIX = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
 _COMPARE = {"less": "olt", "less_equal": "ole", "greater": "ogt", "greater_equal": "oge"}
 _COMPARE |= {"equal": "oeq", "not_equal": "une"}
@@ -255,7 +253,7 @@ class _Part:
         self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align {self.block.alignment}")
 
 
-def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block) -> str:
+def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block, part: int) -> str:
     """Text of a program.
 
     Args:
@@ -263,26 +261,27 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library, block: 
         lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
         library: where functions come from; none takes more lanes than the block has.
         block: lanes that are computed at a time.
+        part: statements of a part: steps that are computed, results that are written.
 
     Raises:
         KeyError: for a function that the library lacks.
     """
-    parts, _ = cut_parts(program, PART)
+    parts, _ = cut_parts(program, part)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
     vectors = [len(step.parts) for step in program.steps if step.operation == "product"]
     text = list(_declarations(program, library, block))
     for number, statements in enumerate(parts):
-        part = _Part(program, lane_first, places, block)
+        own = _Part(program, lane_first, places, block)
         for statement in statements:
             if not isinstance(statement, int):
-                part.store(*statement)
+                own.store(*statement)
                 continue
-            part.step(statement)
+            own.step(statement)
             if statement in slots:
-                part.hand_on(statement)
+                own.hand_on(statement)
         header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
-        text += [f"define internal void @part{number}({header}) {{", *part.lines, "ret void", "}"]
+        text += [f"define internal void @part{number}({header}) {{", *own.lines, "ret void", "}"]
     if vectors:
         text += _product_function(block)
     text += _entry(block, len(parts), max(1, places.vector + max(vectors, default=0)))
