@@ -159,28 +159,6 @@ class Verification(_Stored, frozen=True):
     format: Literal["filtergym verification 1"] = "filtergym verification 1"
 
 
-SCENARIOS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "filtergym/ManeuveringTarget-v0": (
-            "random", "paper", "atc", "cruise", "descent", "missed-detections", "irregular-scans", "glint", "biased",
-            "clutter",
-        ),
-        "filtergym/UavAutopilot-v0": (
-            "random", "paper-noise", "paper-step", "gust-front", "sensor-degradation", "actuator-lag", "gyro-bias",
-        ),
-        "filtergym/RadarEsmTracking-v0": (
-            "random", "paper", "fixed-type", "crowded", "silent", "class-change", "glint", "correlated-errors",
-        ),
-        "filtergym/LooselyCoupledNavigation-v0": (
-            "random", "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver",
-        ),
-        "filtergym/TightlyCoupledNavigation-v0": (
-            "random", "paper", "kinematic", "matched", "rates-lost", "two-satellites", "accelerometer-failure",
-            "urban", "satellite-ramp", "satellite-bias", "coloured-ranges",
-        ),
-    }
-)  # fmt: skip
-"""Of the protocol ``board``; another environment's are all that it has."""
 EPISODES: Mapping[str, int] = MappingProxyType({"filtergym/TightlyCoupledNavigation-v0": 100})
 """Of the protocol ``board``, where they are not 500."""
 PROTOCOLS = ("board", "trial")
@@ -192,7 +170,7 @@ def protocol_of(problem: Problem, name: str) -> Protocol:
 
     Args:
         problem: whose scenarios it has.
-        name: ``"board"``, or ``"trial"``: 32 episodes of the training distribution.
+        name: ``"board"``: every scenario, the training distribution first; or ``"trial"``: 32 episodes of that.
 
     Raises:
         ValueError: for another name.
@@ -202,8 +180,7 @@ def protocol_of(problem: Problem, name: str) -> Protocol:
     default = problem.task.default_scenario
     if name == "trial":
         return Protocol(name, 1, (default,), 32, 0)
-    others = (own for own in problem.task.scenarios if own != default)
-    scenarios = SCENARIOS.get(problem.id, (default, *others))
+    scenarios = (default, *(own for own in problem.task.scenarios if own != default))
     return Protocol(name, 1, scenarios, EPISODES.get(problem.id, 500), 0)
 
 
@@ -495,7 +472,8 @@ def run_protocol(
         experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
         horizon = experiment.make_task().horizon
         requests += [
-            EvaluationRequest(experiment, name, own, known.metrics, horizon) for name, own in makers.items()
+            EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
+            for name, own in makers.items()
         ]
     found = dict(summaries(requests, workers, progress))
     figures: list[Figure] = []
