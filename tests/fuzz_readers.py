@@ -3,8 +3,8 @@
 ``python tests/fuzz_readers.py READER SECONDS`` runs one, ``make fuzz`` all of them; without arguments it lists them. An
 input that ends in anything but a result or a ``ValueError`` of one sentence, takes longer than 20 s or more than 1 GB
 stops the run, and is left in ``build/fuzz/READER/`` beside the corpus. A run begins with what the ones before have
-found and ends by reducing it to the inputs that reach something of their own. Needs ``pip install atheris``; parsers of other
-libraries run in processes of their own, of which what is guided is what is done with their answers.
+found and ends by reducing it to the inputs that reach something of their own. Needs ``pip install atheris``. Parsers of
+other libraries run in processes of their own: what is guided there is what is done with their answers.
 """
 
 import contextlib
