@@ -1,8 +1,8 @@
 """Commands that are killed at random moments and begun again end with the same bytes as undisturbed ones.
 
 ``python tests/kill_and_resume.py SECONDS [SEED] [COMMAND ...]`` takes each command in turn: once undisturbed, then
-interrupted by SIGINT, SIGTERM and SIGKILL until it comes to its end by itself. What it writes must be equal, and nothing
-unfinished be left. It says how often each was killed, and how many kept parts the last attempt found.
+interrupted by SIGINT, SIGTERM and SIGKILL until it comes to its end by itself. What it writes must be equal, and
+nothing unfinished be left. It says how often each was killed, and how many kept parts the last attempt found.
 """
 
 import random
@@ -68,7 +68,7 @@ def main(seconds: float, rng: random.Random, names: list[str]) -> int:
             torn.mkdir()
             began = time.monotonic()
             assert run(words, whole) == 0, f"{name} does not run"
-            usual, kills, kept = time.monotonic() - began, {number: 0 for number in SIGNALS}, 0
+            usual, kills, kept = time.monotonic() - began, dict.fromkeys(SIGNALS, 0), 0
             until = time.monotonic() + seconds
             while True:
                 kept = len(list(torn.rglob("*.msgpack")))
