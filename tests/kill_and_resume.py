@@ -18,7 +18,7 @@ ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 COMMANDS = {
     "tune": (
-        ("tune", ENVIRONMENT, "--policy", "imm", "--budget", "1000000"),
+        ("tune", ENVIRONMENT, "--policy", "imm", "--budget", "1024000"),
         "tuned/ManeuveringTarget-v0.json",
     ),
     "benchmark": (
