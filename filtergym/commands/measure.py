@@ -60,6 +60,7 @@ from .terminal import (
     import_environments,
     one_of,
     parse_settings,
+    print_table,
     progress_bar,
 )
 
@@ -274,7 +275,7 @@ def write_offline(
     with progress_bar() as bar:
         line = bar.add_task("recording", total=plan.decisions)
         written = plan.write(out, namespace, lambda done: bar.update(line, advance=done))
-    console.print(datasets_table(written))
+    print_table(datasets_table(written))
     place = f", with MINARI_DATASETS_PATH={out}" if out is not None else ""
     console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
 
