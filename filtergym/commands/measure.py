@@ -324,9 +324,10 @@ def benchmark(
 
         def tell_result(result: Result) -> None:
             first = result.records[0]
-            names = {record.policy for record in result.records}
+            count = len({record.policy for record in result.records})
             bar.say(
-                f"{result.short}, {result.scenario}: {len(names)} competitors over {first.episodes:,} episodes"
+                f"{result.short}, {result.scenario}: {count} competitor{'s' * (count > 1)} over "
+                f"{first.episodes:,} episodes"
             )
             if details:
                 print_results(result.records, result.knows)
