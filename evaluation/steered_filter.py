@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler import namespace
-from ..compiler.emission import LANES
+from ..compiler.block import LANES
 from ..compiler.functions import Function, Specialised, leaves, map_arrays
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
@@ -234,7 +234,7 @@ def trace_decision(model: CompiledModel, policy: Policy) -> tuple[Function, Deci
 
 
 def _trace_decider(model: CompiledModel, policy: Policy, interval: int | None) -> tuple[Decider, Graph, Any]:
-    graph = Graph()
+    graph = Graph(loops=True)
     with namespace.tracing(graph):
         decider = decider_of(model.programs.traced, policy, interval)
         nothing = decider_of(model, policy, interval).start(numpy.zeros(LANES))

@@ -29,6 +29,7 @@ from .agents.named_policies import pretrained_agents
 from .agents.training_run import best_agent, training_scenarios
 from .baselines.problem import Problem, problem_of
 from .envs.contract.failures import own_line
+from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import import_user_module, nearest
 from .envs.engine.scenario_choice import find_mixture
 from .evaluation.competitors import RANKED, check_competitor, kind_of
@@ -228,16 +229,12 @@ def write_stored(path: Path, stored: Submission | Verification) -> str:
 
 
 def _read(path: Path) -> bytes:
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}")
     try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    if len(content) > MOST_BYTES:
-        raise ValueError(f"{path} is larger than {MOST_BYTES / 1e6:g} MB, which no submission is")
-    return content
+        return read_content(path, MOST_BYTES)
+    except FileNotFoundError:
+        raise ValueError(f"there is no file {path}") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is no submission: {error}") from error
 
 
 def _decode(path: Path, content: bytes, kind: Any) -> Any:
@@ -475,7 +472,8 @@ def run_protocol(
         experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
         horizon = experiment.make_task().horizon
         requests += [
-            EvaluationRequest(experiment, name, own, known.metrics, horizon) for name, own in makers.items()
+            EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
+            for name, own in makers.items()
         ]
     found = dict(summaries(requests, workers, progress))
     figures: list[Figure] = []

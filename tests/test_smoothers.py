@@ -119,6 +119,7 @@ def test_smoothers_are_marked_and_never_ranked():
     ]
 
 
+@pytest.mark.claims
 def test_a_longer_lag_is_better_and_all_later_scans_are_best():
     lags = {f"{lag}": Variant(KalmanIMMSmoother, lag=lag) for lag in (0, 1, 2, 5, None)}
     found = evaluate(TARGET, lags, scenario="random", episodes=40)

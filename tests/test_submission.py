@@ -260,8 +260,8 @@ def test_arrays_that_are_none_are_refused(content, edited, command):
         ("glint", "held out"),
         ("random:0.5,glint:0.5", "held out"),
         ("flights.csv", "unknown scenario 'flights.csv'"),
-        ({"x": [1]}, "unknown scenario"),
-        (["random"], "unknown scenario"),
+        ({"x": [1]}, "scenario of its run must be str"),
+        (["random"], "scenario of its run must be str"),
     ],
 )
 def test_training_on_what_is_tested_is_refused(scenario, sentence, edited, command, tmp_path, monkeypatch):
@@ -416,7 +416,7 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
     assert "there is no file" in refused(command, tmp_path / "none.json")
-    assert "there is no file" in refused(command, "/dev/zero")
+    assert "it is no file but a folder, a device or a pipe" in refused(command, "/dev/zero")
 
 
 def test_damaged_files_end_in_a_sentence(honest, tmp_path):

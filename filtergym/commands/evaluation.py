@@ -300,7 +300,7 @@ def run(
                 dataset = dataset.drop_vars(tracks)
             curves = None if outputs.folder is None else curves_of(dataset)
             return Outcome(dataset, records, curves, refusal, store, _episode_costs(dataset))
-        requests = evaluation_requests(problem, experiment, names, trust)
+        requests = evaluation_requests(problem, experiment, names, trust, curves=outputs.folder is not None)
         work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))
     records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
