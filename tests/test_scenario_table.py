@@ -31,7 +31,7 @@ def table(cls):
         own = dataclasses.asdict(cls.Parameters(**scenario.parameters))
         scenarios[name] = {
             "training": scenario.training,
-            "windows": scenario.windows,
+            "windows": dict(scenario.windows),
             "parameters": {key: value for key, value in own.items() if value != defaults[key]},
         }
     known = baselines_of(cls.id)
