@@ -11,14 +11,14 @@ import math
 import re
 import textwrap
 import unicodedata
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy
 
 from .interpretation import first_steps
-from .parts import FREE, cut_parts, scratch_slots
+from .parts import FREE, Statement, cut_parts, scratch_slots
 from .program import Program
 
 PART = 200
@@ -306,19 +306,13 @@ def write_program(
     starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
     text = _Text(program, read, scalar, tables)
-    stores: dict[int, list[str]] = {}
-    for argument, row, step in program.results:
-        if place := write(argument, row):
-            stores.setdefault(step, []).append(place)
     pause = first_steps(program, results) if between else 0
     parts, before = cut_parts(program, PART, pause)
     count_operations = sum(step.operation not in FREE for step in program.steps)
     together = count_operations <= PART
     slots = {} if together else scratch_slots(program, parts)
-    everything = set(range(len(program.steps)))
-    blocks = [
-        _statements(text, steps, everything if together else set(steps), stores, slots) for steps in parts
-    ]
+    everything: set[Statement] = set(range(len(program.steps)))
+    blocks = [_statements(text, part, everything if together else set(part), write, slots) for part in parts]
     defined = [
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
@@ -344,23 +338,30 @@ def write_program(
 
 
 def _statements(
-    text: _Text, steps: list[int], own: set[int], stores: Mapping[int, list[str]], slots: Mapping[int, int]
+    text: _Text,
+    part: Sequence[Statement],
+    own: Set[Statement],
+    write: Callable[[int, int], str],
+    slots: Mapping[int, int],
 ) -> list[str]:
     """Statements of a part."""
     lines: list[str] = []
     fetched: set[int] = set()
-    for step in steps:
-        if text.program.steps[step].operation not in FREE:
-            for argument in text.program.steps[step].parts:
-                crosses = argument not in own and text.program.steps[argument].operation not in FREE
-                if crosses and argument not in fetched:
-                    fetched.add(argument)
-                    truth = f" != {text.literal(0.0)}" if text.program.steps[argument].logical else ""
-                    lines.append(text.declaration(argument, f"w[{slots[argument]}]{truth}"))
-            lines.append(text.declaration(step, text.expression(step)))
-        lines += [f"{place} = {text.as_number(step)};" for place in stores.get(step, ())]
-        if step in slots:
-            lines.append(f"w[{slots[step]}] = {text.as_number(step)};")
+    steps = text.program.steps
+    for statement in part:
+        used = steps[statement].parts if isinstance(statement, int) else (statement.node,)
+        for step in used:
+            if step not in own and steps[step].operation not in FREE and step not in fetched:
+                fetched.add(step)
+                truth = f" != {text.literal(0.0)}" if steps[step].logical else ""
+                lines.append(text.declaration(step, f"w[{slots[step]}]{truth}"))
+        if not isinstance(statement, int):
+            if place := write(statement.argument, statement.row):
+                lines.append(f"{place} = {text.as_number(statement.node)};")
+            continue
+        lines.append(text.declaration(statement, text.expression(statement)))
+        if statement in slots:
+            lines.append(f"w[{slots[statement]}] = {text.as_number(statement)};")
     return lines
 
 

@@ -62,6 +62,12 @@ def load(name: str) -> bytes | None:
     return code if hashlib.sha256(code).digest() == checksum else None
 
 
+def holds(name: str) -> bool:
+    """Whether there is an entry, good or not."""
+    place = folder()
+    return place is not None and (place / f"{name}{SUFFIX}").exists()
+
+
 def keep(name: str, code: bytes) -> None:
     """Write an entry, if that is possible."""
     place = folder()

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy
 
+from .block import Block, block_for
 from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
-from .emission import LANES, TRUTH, VECTOR
 from .functions import Call, address_of
-from .native import Native, native_text
+from .native import Code, Native, native_text, processor
 
-WORDS = f"<{LANES} x i64>"
 _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", "<<": "shl", ">>": "lshr"}
 
 
@@ -94,7 +93,16 @@ class _Text:
 
 
 class _LlvmText(_Text):
-    """Vector code for eight lanes."""
+    """Vector code for a block of lanes.
+
+    Args:
+        prefix: of names.
+        block: the lanes.
+    """
+
+    def __init__(self, prefix: str, block: Block) -> None:
+        super().__init__(prefix)
+        self.block = block
 
     def new(self, expression: str) -> str:
         name = self.name()
@@ -102,27 +110,40 @@ class _LlvmText(_Text):
         return name
 
     def constant(self, value: int | float) -> str:
-        one = f"i64 {value}" if isinstance(value, int) else f"double 0x{numpy.float64(value).view('u8'):016X}"
-        return "<" + ", ".join([one] * LANES) + ">"
+        if isinstance(value, int):
+            return self.block.constant(str(value), "i64")
+        return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
 
     def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
         if whole:
-            return self.new(f"{_LLVM[operator]} {WORDS} {one}, {other}")
-        return self.new(f"f{_LLVM.get(operator, 'div')} {VECTOR} {one}, {other}")
+            return self.new(f"{_LLVM[operator]} {self.block.words} {one}, {other}")
+        return self.new(f"f{_LLVM.get(operator, 'div')} {self.block.numbers} {one}, {other}")
 
     def bits(self, number: Value) -> Value:
-        return Value(self, self.new(f"bitcast {VECTOR} {number.name} to {WORDS}"), True)
+        return Value(
+            self, self.new(f"bitcast {self.block.numbers} {number.name} to {self.block.words}"), True
+        )
 
     def number(self, bits: Value) -> Value:
-        return Value(self, self.new(f"bitcast {WORDS} {bits.name} to {VECTOR}"), False)
+        return Value(self, self.new(f"bitcast {self.block.words} {bits.name} to {self.block.numbers}"), False)
 
     def sqrt(self, number: Value) -> Value:
-        return Value(self, self.new(f"call {VECTOR} @llvm.sqrt.v{LANES}f64({VECTOR} {number.name})"), False)
+        return Value(
+            self,
+            self.new(
+                f"call {self.block.numbers} {self.block.intrinsic('sqrt')}({self.block.numbers} {number.name})"
+            ),
+            False,
+        )
 
     def choose(self, condition: Value, one: Value, other: Value) -> Value:
-        true = self.new(f"icmp ne {WORDS} {condition.name}, zeroinitializer")
+        true = self.new(f"icmp ne {self.block.words} {condition.name}, zeroinitializer")
         return Value(
-            self, self.new(f"select {TRUTH} {true}, {VECTOR} {one.name}, {VECTOR} {other.name}"), False
+            self,
+            self.new(
+                f"select {self.block.truths} {true}, {self.block.numbers} {one.name}, {self.block.numbers} {other.name}"
+            ),
+            False,
         )
 
 
@@ -185,14 +206,11 @@ def c_text(qualifiers: str = "static inline") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _vector_of(value: str) -> str:
-    """Vector of a scalar, as one expression after the line ``%one.X``."""
-    return f"shufflevector {WORDS} {value}, {WORDS} poison, <{LANES} x i32> zeroinitializer"
-
-
-def _loop(kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str) -> list[str]:
+def _loop(
+    block: Block, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
+) -> list[str]:
     """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
-    text = _LlvmText(f"%{kind}")
+    text = _LlvmText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
         f"%some_{kind} = icmp sgt i64 {count}, 0",
@@ -201,20 +219,20 @@ def _loop(kind: str, make: Make, first_row: str, count: str, first_pair: int, be
         f"%place_{kind} = phi i64 [0, %{before}], [%next_{kind}, %pairs_{kind}]",
         f"%half_{kind} = lshr i64 %place_{kind}, 1",
         f"%number_{kind} = add i64 %half_{kind}, {first_pair}",
-        f"%one_{kind} = insertelement {WORDS} poison, i64 %number_{kind}, i32 0",
-        f"%pair_{kind} = {_vector_of(f'%one_{kind}')}",
+        f"%one_{kind} = insertelement {block.words} poison, i64 %number_{kind}, i32 0",
+        f"%pair_{kind} = {block.repeat(f'%one_{kind}', block.words)}",
         *text.lines,
         f"%row_{kind} = add i64 {first_row}, %place_{kind}",
         f"%start_{kind} = mul i64 %row_{kind}, %stride",
         f"%at_{kind} = add i64 %start_{kind}, %lane",
         f"%to_{kind} = getelementptr double, ptr %rows, i64 %at_{kind}",
-        f"store {VECTOR} {one}, ptr %to_{kind}, align 8",
+        f"store {block.numbers} {one}, ptr %to_{kind}, align 8",
         # The second number of the last pair may be one too many.
         f"%beyond_{kind} = getelementptr double, ptr %to_{kind}, i64 %stride",
         f"%second_{kind} = add i64 %place_{kind}, 1",
         f"%both_{kind} = icmp slt i64 %second_{kind}, {count}",
         f"%other_{kind} = select i1 %both_{kind}, ptr %beyond_{kind}, ptr %nowhere",
-        f"store {VECTOR} {other}, ptr %other_{kind}, align 8",
+        f"store {block.numbers} {other}, ptr %other_{kind}, align 8",
         f"%next_{kind} = add i64 %place_{kind}, 2",
         f"%more_{kind} = icmp slt i64 %next_{kind}, {count}",
         f"br i1 %more_{kind}, label %pairs_{kind}, label %done_{kind}",
@@ -223,21 +241,24 @@ def _loop(kind: str, make: Make, first_row: str, count: str, first_pair: int, be
 
 
 @functools.cache
-def llvm_text() -> str:
+def llvm_text(block: Block) -> str:
     """Text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes its numbers.
 
     The table holds nothing, then address and stride of identities, of measurements and of the rows, then how many of
     these are normal and how many uniform.
+
+    Args:
+        block: lanes that are computed at a time.
     """
     entries = (
         *(("identities", "ptr", 1), ("apart", "i64", 2), ("measurements", "ptr", 3)),
         *(("rows", "ptr", 5), ("stride", "i64", 6), ("normals", "i64", 7), ("uniforms", "i64", 8)),
     )
     lines = [
-        f"declare {VECTOR} @llvm.sqrt.v{LANES}f64({VECTOR})",
+        f"declare {block.numbers} {block.intrinsic('sqrt')}({block.numbers})",
         "define void @program(ptr %table, i64 %first, i64 %last) {",
         "entry:",
-        f"%nowhere = alloca {VECTOR}, align 64",
+        f"%nowhere = alloca {block.numbers}, align {block.alignment}",
     ]
     for name, kind, place in entries:
         lines += [
@@ -254,16 +275,16 @@ def llvm_text() -> str:
         "%at_key = getelementptr i64, ptr %identities, i64 %lane",
         "%at_episode = getelementptr i64, ptr %at_key, i64 %apart",
         "%at_t = getelementptr i64, ptr %measurements, i64 %lane",
-        f"%key = load {WORDS}, ptr %at_key, align 8",
-        f"%episode = load {WORDS}, ptr %at_episode, align 8",
-        f"%before = load {WORDS}, ptr %at_t, align 8",
-        f"%following = add {WORDS} %before, {_LlvmText('').constant(1)}",
-        f"store {WORDS} %following, ptr %at_t, align 8",
+        f"%key = load {block.words}, ptr %at_key, align 8",
+        f"%episode = load {block.words}, ptr %at_episode, align 8",
+        f"%before = load {block.words}, ptr %at_t, align 8",
+        f"%following = add {block.words} %before, {block.constant('1', 'i64')}",
+        f"store {block.words} %following, ptr %at_t, align 8",
         # The counter's word: code for products of 32 bits may be used where it is known to be one.
-        f"%t = and {WORDS} %following, {_LlvmText('').constant(0xFFFFFFFF)}",
-        *_loop("normal", normal_pair, "0", "%normals", 0, "body"),
-        *_loop("uniform", uniform_pair, "%normals", "%uniforms", UNIFORM_PAIRS, "done_normal"),
-        f"%next = add i64 %lane, {LANES}",
+        f"%t = and {block.words} %following, {block.constant(str(0xFFFFFFFF), 'i64')}",
+        *_loop(block, "normal", normal_pair, "0", "%normals", 0, "body"),
+        *_loop(block, "uniform", uniform_pair, "%normals", "%uniforms", UNIFORM_PAIRS, "done_normal"),
+        f"%next = add i64 %lane, {block.lanes}",
         "br label %head",
         "exit:",
         "ret void",
@@ -278,7 +299,7 @@ def numbers_code() -> Native:
     Raises:
         ImportError: without llvmlite.
     """
-    return native_text(llvm_text())
+    return native_text(llvm_text(block_for(processor()[1])))
 
 
 def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
@@ -302,4 +323,4 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     for array in arrays:
         table += [address_of(array), array.strides[0] // array.itemsize]
     table += [normals, len(rows) - normals]
-    return Call(numbers_code(), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
+    return Call(Code(numbers_code()), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))

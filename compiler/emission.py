@@ -1,4 +1,4 @@
-"""A program as text of LLVM: vector code for blocks of eight lanes.
+"""A program as text of LLVM: vector code for blocks of lanes.
 
 The entry ``@program(table, first, last)`` goes through the blocks between two lanes and calls for each one
 ``@part0``, ``@part1``, ...: a long straight line is cut into parts, because the time that LLVM takes grows faster
@@ -9,26 +9,16 @@ of the constants, then two integers for each argument, address and stride.
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from .block import Block
 from .library import BINARY, Library
-from .parts import FREE, cut_parts, product_places, scratch_slots
+from .parts import cut_parts, product_places, scratch_slots
 from .program import BAND, FUNCTIONS, OPERATIONS, Program
 
-LANES = 8
-PART = 100
-"""Operations of a part."""
-VECTOR, TRUTH = f"<{LANES} x double>", f"<{LANES} x i1>"
 _INFIX = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
 _COMPARE = {"less": "olt", "less_equal": "ole", "greater": "ogt", "greater_equal": "oge"}
 _COMPARE |= {"equal": "oeq", "not_equal": "une"}
 _INTRINSIC = {name: name for name in ("sqrt", "floor", "ceil", "trunc", "rint", "maximum", "minimum")}
 _INTRINSIC["absolute"] = "fabs"
-
-
-def _splat(value: str, kind: str = "double") -> str:
-    return "<" + ", ".join([f"{kind} {value}"] * LANES) + ">"
-
-
-ONE, ZERO, MINUS_ONE = _splat("1.0"), _splat("0.0"), _splat("-1.0")
 
 
 class _Places(NamedTuple):
@@ -45,8 +35,9 @@ class _Places(NamedTuple):
 class _Part:
     """Text of one part; values are named by the steps that they come from."""
 
-    def __init__(self, program: Program, lane_first: Sequence[bool], places: "_Places") -> None:
+    def __init__(self, program: Program, lane_first: Sequence[bool], places: "_Places", block: Block) -> None:
         self.program, self.lane_first, self.places = program, lane_first, places
+        self.block, self.numbers, self.truths = block, block.numbers, block.truths
         self.lines: list[str] = []
         self.known: set[int] = set()
         self._arguments: dict[int, tuple[str, str]] = {}
@@ -62,7 +53,7 @@ class _Part:
         return name
 
     def place(self, argument: int, row: int) -> str:
-        """Address of the block's eight numbers in a row of an argument."""
+        """Address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
         start = self.new(f"mul i64 {stride}, {row}")
         start = self.new(f"add i64 {start}, %lane")
@@ -82,23 +73,27 @@ class _Part:
         return self.new(f"load {kind}, ptr {address}, !invariant.load !0")
 
     def constant(self, place: int, name: str | None = None) -> str:
-        """Constant, eight times."""
+        """Constant, in every lane."""
         address = self.new(f"getelementptr double, ptr {self.constants}, i64 {place}")
         value = self.new(f"load double, ptr {address}, !invariant.load !0")
-        one = self.new(f"insertelement {VECTOR} poison, double {value}, i32 0")
-        return self.new(
-            f"shufflevector {VECTOR} {one}, {VECTOR} poison, <{LANES} x i32> zeroinitializer", name
-        )
+        one = self.new(f"insertelement {self.numbers} poison, double {value}, i32 0")
+        return self.new(self.block.repeat(one, self.numbers), name)
 
     def choice(
-        self, condition: str, one: str, other: str, kind: str = VECTOR, name: str | None = None
+        self, condition: str, one: str, other: str, kind: str | None = None, name: str | None = None
     ) -> str:
         """One of two values in each lane."""
-        return self.new(f"select {TRUTH} {condition}, {kind} {one}, {kind} {other}", name)
+        kind = kind or self.numbers
+        return self.new(f"select {self.truths} {condition}, {kind} {one}, {kind} {other}", name)
 
     def compare(self, how: str, one: str, other: str, name: str | None = None) -> str:
         """Truth of a comparison in each lane."""
-        return self.new(f"fcmp {how} {VECTOR} {one}, {other}", name)
+        return self.new(f"fcmp {how} {self.numbers} {one}, {other}", name)
+
+    def call(self, function: str, *values: str, name: str | None = None) -> str:
+        """Answer of a function of numbers."""
+        listed = ", ".join(f"{self.numbers} {value}" for value in values)
+        return self.new(f"call {self.numbers} {function}({listed})", name)
 
     def value(self, step: int) -> str:
         """Name of a step's value; what is free, or lies in the scratch array, is fetched where it is first needed."""
@@ -108,27 +103,27 @@ class _Part:
             if operation == "input" and self.lane_first[arguments[0]]:
                 self._read_by_lanes(arguments[0], arguments[1], f"%v{step}")
             elif operation == "input":
-                self.new(f"load {VECTOR}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
+                self.new(f"load {self.numbers}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
             elif operation == "constant" and logical:
-                self.compare("une", self.constant(arguments[0]), ZERO, f"%v{step}")
+                self.compare("une", self.constant(arguments[0]), self.block.zero, f"%v{step}")
             elif operation == "constant":
                 self.constant(arguments[0], f"%v{step}")
             elif operation == "entry":
                 row, product = arguments
                 address = self.scratch(self.places.products[product] + row)
-                self.new(f"load {VECTOR}, ptr {address}, align 64", f"%v{step}")
+                self.new(f"load {self.numbers}, ptr {address}, align {self.block.alignment}", f"%v{step}")
             else:
-                kind = TRUTH if logical else VECTOR
-                self.new(f"load {kind}, ptr {self.scratch(self.places.slots[step])}, align 64", f"%v{step}")
+                kind = self.truths if logical else self.numbers
+                self.new(
+                    f"load {kind}, ptr {self.scratch(self.places.slots[step])}, align {self.block.alignment}",
+                    f"%v{step}",
+                )
         return f"%v{step}"
 
     def step(self, index: int) -> None:
         """Compute a step."""
         operation, arguments, logical = self.program.steps[index]
-        if operation in FREE:
-            self.value(index)
-            return
-        name, kind = f"%v{index}", TRUTH if logical else VECTOR
+        name, kind = f"%v{index}", self.truths if logical else self.numbers
         self.known.add(index)
         if operation == "take":
             self._take(arguments, name)
@@ -138,23 +133,23 @@ class _Part:
             return
         a, *rest = (self.value(argument) for argument in arguments)
         if operation in _INFIX:
-            self.new(f"{_INFIX[operation]} {VECTOR} {a}, {rest[0]}", name)
+            self.new(f"{_INFIX[operation]} {self.numbers} {a}, {rest[0]}", name)
         elif operation in _COMPARE:
             self.compare(_COMPARE[operation], a, rest[0], name)
         elif operation in ("logical_and", "logical_or"):
-            self.new(f"{operation.removeprefix('logical_')} {TRUTH} {a}, {rest[0]}", name)
+            self.new(f"{operation.removeprefix('logical_')} {self.truths} {a}, {rest[0]}", name)
         elif operation == "logical_not":
-            self.new(f"xor {TRUTH} {a}, {_splat('true', 'i1')}", name)
+            self.new(f"xor {self.truths} {a}, {self.block.true}", name)
         elif operation == "negative":
-            self.new(f"fneg {VECTOR} {a}", name)
+            self.new(f"fneg {self.numbers} {a}", name)
         elif operation == "where":
             self.choice(a, rest[0], rest[1], kind, name)
         elif operation == "number":
-            self.choice(a, ONE, ZERO, name=name)
+            self.choice(a, self.block.one, self.block.zero, name=name)
         elif operation == "sign":  # of what is no number: itself
-            low = self.choice(self.compare("olt", a, ZERO), MINUS_ONE, a)
-            sign = self.choice(self.compare("ogt", a, ZERO), ONE, low)
-            self.new(f"fadd {VECTOR} {sign}, {ZERO}", name)  # zero for minus zero
+            low = self.choice(self.compare("olt", a, self.block.zero), self.block.minus_one, a)
+            sign = self.choice(self.compare("ogt", a, self.block.zero), self.block.one, low)
+            self.new(f"fadd {self.numbers} {sign}, {self.block.zero}", name)  # zero for minus zero
         elif operation == "remainder":
             self._remainder(a, rest[0], name)
         elif operation in ("maximum", "minimum") and (limited := self._constant_first(arguments)):
@@ -163,20 +158,21 @@ class _Part:
             self.choice(self.compare(how, *limited), *limited, name=name)
         else:
             callee = (
-                f"@llvm.{_INTRINSIC[operation]}.v8f64" if operation in _INTRINSIC else f"@all_{operation}"
+                self.block.intrinsic(_INTRINSIC[operation])
+                if operation in _INTRINSIC
+                else f"@all_{operation}"
             )
-            listed = ", ".join(f"{VECTOR} {value}" for value in (a, *rest))
-            self.new(f"call {VECTOR} {callee}({listed})", name)
+            self.call(callee, a, *rest, name=name)
 
     def _remainder(self, a: str, b: str, name: str) -> None:
         """With the sign of the divisor, rounded once as long as the quotient is below ``2^53``."""
-        quotient = self.new(f"fdiv {VECTOR} {a}, {b}")
-        whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
-        minus = self.new(f"fneg {VECTOR} {whole}")
-        rest = self.new(f"call {VECTOR} @llvm.fma.v8f64({VECTOR} {b}, {VECTOR} {minus}, {VECTOR} {a})")
+        quotient = self.new(f"fdiv {self.numbers} {a}, {b}")
+        whole = self.call(self.block.intrinsic("floor"), quotient)
+        minus = self.new(f"fneg {self.numbers} {whole}")
+        rest = self.call(self.block.intrinsic("fma"), b, minus, a)
         # The quotient may have been rounded up to a whole number: then the rest is on the other side of zero.
-        above = self.new(f"fadd {VECTOR} {rest}, {b}")
-        opposite = self.compare("olt", self.new(f"fmul {VECTOR} {rest}, {b}"), ZERO)
+        above = self.new(f"fadd {self.numbers} {rest}, {b}")
+        opposite = self.compare("olt", self.new(f"fmul {self.numbers} {rest}, {b}"), self.block.zero)
         self.choice(opposite, above, rest, name=name)
 
     def _constant_first(self, arguments: tuple[int, ...]) -> tuple[str, str] | None:
@@ -188,19 +184,19 @@ class _Part:
     def _take(self, arguments: tuple[int, ...], name: str) -> None:
         start, length, index = arguments
         place = self.value(index)
-        size, last = _splat(f"{length}.0"), _splat(f"{length - 1}.0")
-        from_end = self.new(f"fadd {VECTOR} {place}, {size}")
-        place = self.choice(self.compare("olt", place, ZERO), from_end, place)
+        size, last = self.block.constant(f"{length}.0"), self.block.constant(f"{length - 1}.0")
+        from_end = self.new(f"fadd {self.numbers} {place}, {size}")
+        place = self.choice(self.compare("olt", place, self.block.zero), from_end, place)
         # An index outside, or one that is no number, reads within the table all the same.
-        place = self.choice(self.compare("ogt", place, ZERO), place, ZERO)
+        place = self.choice(self.compare("ogt", place, self.block.zero), place, self.block.zero)
         place = self.choice(self.compare("olt", place, last), place, last)
-        whole = self.new(f"fptosi {VECTOR} {place} to <{LANES} x i64>")
+        whole = self.new(f"fptosi {self.numbers} {place} to {self.block.words}")
         table = self.new(f"getelementptr double, ptr {self.constants}, i64 {start}")
-        places = self.new(f"getelementptr double, ptr {table}, <{LANES} x i64> {whole}")
-        everywhere = f"{TRUTH} {_splat('true', 'i1')}"
+        places = self.new(f"getelementptr double, ptr {table}, {self.block.words} {whole}")
+        everywhere = f"{self.truths} {self.block.true}"
         self.new(
-            f"call {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr> {places}, i32 8, {everywhere}, "
-            f"{VECTOR} poison)",
+            f"call {self.numbers} {self.block.gather}({self.block.addresses} {places}, i32 8, {everywhere}, "
+            f"{self.numbers} poison)",
             name,
         )
 
@@ -210,7 +206,7 @@ class _Part:
         for place, step in enumerate(vector):
             value = self.value(step)
             address = self.scratch(self.places.vector + place)
-            self.lines.append(f"store {VECTOR} {value}, ptr {address}, align 64")
+            self.lines.append(f"store {self.numbers} {value}, ptr {address}, align {self.block.alignment}")
         matrix = self.new(f"getelementptr double, ptr {self.constants}, i64 {table}")
         given, found = self.scratch(self.places.vector), self.scratch(self.places.products[index])
         sizes = f"i64 {len(vector)}, i64 {-(-rows // BAND)}"
@@ -220,12 +216,12 @@ class _Part:
         """Write a result."""
         value = self.value(step)
         if self.program.steps[step].logical:
-            value = self.choice(value, ONE, ZERO)
+            value = self.choice(value, self.block.one, self.block.zero)
         if not self.lane_first[argument]:
-            self.lines.append(f"store {VECTOR} {value}, ptr {self.place(argument, row)}, align 8")
+            self.lines.append(f"store {self.numbers} {value}, ptr {self.place(argument, row)}, align 8")
             return
         for lane, address in enumerate(self._lane_places(argument, row)):
-            number = self.new(f"extractelement {VECTOR} {value}, i32 {lane}")
+            number = self.new(f"extractelement {self.numbers} {value}, i32 {lane}")
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
     def _read_by_lanes(self, argument: int, row: int, name: str) -> None:
@@ -233,69 +229,69 @@ class _Part:
         value = "poison"
         for lane, address in enumerate(self._lane_places(argument, row)):
             number = self.new(f"load double, ptr {address}, align 8")
-            last = name if lane == LANES - 1 else None
-            value = self.new(f"insertelement {VECTOR} {value}, double {number}, i32 {lane}", last)
+            last = name if lane == self.block.lanes - 1 else None
+            value = self.new(f"insertelement {self.numbers} {value}, double {number}, i32 {lane}", last)
 
     def _lane_places(self, argument: int, row: int) -> Iterator[str]:
-        """Addresses of the block's eight numbers in an argument that is written lane by lane."""
+        """Addresses of the block's numbers in an argument that is written lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
-        for lane in range(LANES):
+        for lane in range(self.block.lanes):
             offset = self.new(f"mul i64 {stride}, {lane}")
             offset = self.new(f"add i64 {offset}, {first}")
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def scratch(self, place: int) -> str:
         """Address of a place in the scratch array."""
-        return self.new(f"getelementptr {VECTOR}, ptr %scratch, i64 {place}")
+        return self.new(f"getelementptr {self.numbers}, ptr %scratch, i64 {place}")
 
     def hand_on(self, step: int) -> None:
         """Put a value into the scratch array."""
-        kind = TRUTH if self.program.steps[step].logical else VECTOR
+        kind = self.truths if self.program.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
-        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align 64")
+        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align {self.block.alignment}")
 
 
-def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
+def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block, part: int) -> str:
     """Text of a program.
 
     Args:
         program: to emit.
         lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
-        library: where functions come from.
+        library: where functions come from; none takes more lanes than the block has.
+        block: lanes that are computed at a time.
+        part: statements of a part: steps that are computed, results that are written.
 
     Raises:
         KeyError: for a function that the library lacks.
     """
-    parts, _ = cut_parts(program, PART)
+    parts, _ = cut_parts(program, part)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
     vectors = [len(step.parts) for step in program.steps if step.operation == "product"]
-    results: dict[int, list[tuple[int, int]]] = {}
-    for argument, row, step in program.results:
-        results.setdefault(step, []).append((argument, row))
-    text = list(_declarations(program, library))
-    for number, steps in enumerate(parts):
-        part = _Part(program, lane_first, places)
-        for step in steps:
-            part.step(step)
-            for place in results.get(step, ()):
-                part.store(*place, step)
-            if step in slots:
-                part.hand_on(step)
+    text = list(_declarations(program, library, block))
+    for number, statements in enumerate(parts):
+        own = _Part(program, lane_first, places, block)
+        for statement in statements:
+            if not isinstance(statement, int):
+                own.store(*statement)
+                continue
+            own.step(statement)
+            if statement in slots:
+                own.hand_on(statement)
         header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
-        text += [f"define internal void @part{number}({header}) {{", *part.lines, "ret void", "}"]
+        text += [f"define internal void @part{number}({header}) {{", *own.lines, "ret void", "}"]
     if vectors:
-        text += _product_function()
-    text += _entry(len(parts), max(1, places.vector + max(vectors, default=0)))
+        text += _product_function(block)
+    text += _entry(block, len(parts), max(1, places.vector + max(vectors, default=0)))
     return "\n".join([*text, "!0 = !{}"])
 
 
-def _entry(parts: int, slots: int) -> Iterator[str]:
+def _entry(block: Block, parts: int, slots: int) -> Iterator[str]:
     yield "define void @program(ptr %table, i64 %first, i64 %last) {"
     yield "entry:"
-    yield f"%scratch = alloca {VECTOR}, i64 {slots}, align 64"
+    yield f"%scratch = alloca {block.numbers}, i64 {slots}, align {block.alignment}"
     yield "br label %head"
     yield "head:"
     yield "%lane = phi i64 [%first, %entry], [%next, %body]"
@@ -304,14 +300,14 @@ def _entry(parts: int, slots: int) -> Iterator[str]:
     yield "body:"
     for number in range(parts):
         yield f"call void @part{number}(ptr %table, ptr %scratch, i64 %lane)"
-    yield f"%next = add i64 %lane, {LANES}"
+    yield f"%next = add i64 %lane, {block.lanes}"
     yield "br label %head"
     yield "exit:"
     yield "ret void"
     yield "}"
 
 
-def _product_function() -> Iterator[str]:
+def _product_function(block: Block) -> Iterator[str]:
     """The product of a matrix of constants with a vector of lane values: bands of rows side by side, each row's terms
     added one after the other.
     """
@@ -328,16 +324,16 @@ def _product_function() -> Iterator[str]:
     yield "%column = phi i64 [0, %band], [%next, %term]"
     yield "%place = phi ptr [%start, %band], [%ahead, %term]"
     for i in sums:
-        yield f"%sum{i} = phi {VECTOR} [{ZERO}, %band], [%more{i}, %term]"
-    yield f"%address = getelementptr {VECTOR}, ptr %vector, i64 %column"
-    yield f"%factor = load {VECTOR}, ptr %address, align 64"
+        yield f"%sum{i} = phi {block.numbers} [{block.zero}, %band], [%more{i}, %term]"
+    yield f"%address = getelementptr {block.numbers}, ptr %vector, i64 %column"
+    yield f"%factor = load {block.numbers}, ptr %address, align {block.alignment}"
     for i in sums:
         yield f"%at{i} = getelementptr double, ptr %place, i64 {i}"
         yield f"%number{i} = load double, ptr %at{i}, align 8"
-        yield f"%one{i} = insertelement {VECTOR} poison, double %number{i}, i32 0"
-        yield f"%all{i} = shufflevector {VECTOR} %one{i}, {VECTOR} poison, <{LANES} x i32> zeroinitializer"
-        yield f"%term{i} = fmul {VECTOR} %all{i}, %factor"
-        yield f"%more{i} = fadd {VECTOR} %sum{i}, %term{i}"
+        yield f"%one{i} = insertelement {block.numbers} poison, double %number{i}, i32 0"
+        yield f"%all{i} = {block.repeat(f'%one{i}', block.numbers)}"
+        yield f"%term{i} = fmul {block.numbers} %all{i}, %factor"
+        yield f"%more{i} = fadd {block.numbers} %sum{i}, %term{i}"
     yield f"%ahead = getelementptr double, ptr %place, i64 {BAND}"
     yield "%next = add i64 %column, 1"
     yield "%left = icmp slt i64 %next, %columns"
@@ -346,8 +342,8 @@ def _product_function() -> Iterator[str]:
     yield f"%first = mul i64 %number, {BAND}"
     for i in sums:
         yield f"%row{i} = add i64 %first, {i}"
-        yield f"%to{i} = getelementptr {VECTOR}, ptr %result, i64 %row{i}"
-        yield f"store {VECTOR} %more{i}, ptr %to{i}, align 64"
+        yield f"%to{i} = getelementptr {block.numbers}, ptr %result, i64 %row{i}"
+        yield f"store {block.numbers} %more{i}, ptr %to{i}, align {block.alignment}"
     yield "%following = add i64 %number, 1"
     yield "%again = icmp slt i64 %following, %bands"
     yield "br i1 %again, label %band, label %exit"
@@ -356,51 +352,51 @@ def _product_function() -> Iterator[str]:
     yield "}"
 
 
-def _declarations(program: Program, library: Library) -> Iterator[str]:
-    """Intrinsics, and functions of eight lanes made of the library's."""
+def _declarations(program: Program, library: Library, block: Block) -> Iterator[str]:
+    """Intrinsics, and functions of a block made of the library's."""
     used = {step.operation for step in program.steps}
-    yield f"declare {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr>, i32, {TRUTH}, {VECTOR})"
-    yield f"declare {VECTOR} @llvm.fma.v8f64({', '.join([VECTOR] * 3)})"
+    yield f"declare {block.numbers} {block.gather}({block.addresses}, i32, {block.truths}, {block.numbers})"
+    yield f"declare {block.numbers} {block.intrinsic('fma')}({', '.join([block.numbers] * 3)})"
     for name in sorted(set(_INTRINSIC.values())):
-        operands = ", ".join([VECTOR] * (2 if name in ("maximum", "minimum") else 1))
-        yield f"declare {VECTOR} @llvm.{name}.v8f64({operands})"
+        operands = ", ".join([block.numbers] * (2 if name in ("maximum", "minimum") else 1))
+        yield f"declare {block.numbers} {block.intrinsic(name)}({operands})"
     for name in sorted(used & FUNCTIONS.keys() - OPERATIONS.keys()):
         if name not in library.functions:
             raise KeyError(f"{library.name} has no function {name}")
-        yield from _of_eight(name, *library.functions[name][:2])
+        yield from _of_block(block, name, *library.functions[name][:2])
 
 
-def _of_eight(name: str, symbol: str, lanes: int) -> Iterator[str]:
+def _of_block(block: Block, name: str, symbol: str, lanes: int) -> Iterator[str]:
+    """A function of a block, made of one of the library's that takes so many lanes."""
+    width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"
     operands = ("%a", "%b") if name in BINARY else ("%a",)
     yield f"declare {kind} @{symbol}({', '.join([kind] * len(operands))})"
-    header = ", ".join(f"{VECTOR} {operand}" for operand in operands)
-    yield f"define internal {VECTOR} @all_{name}({header}) {{"
-    if lanes == LANES:
-        yield f"%all = call {VECTOR} @{symbol}({header})"
+    header = ", ".join(f"{numbers} {operand}" for operand in operands)
+    yield f"define internal {numbers} @all_{name}({header}) {{"
+    if lanes == width:
+        yield f"%all = call {numbers} @{symbol}({header})"
     whole = "poison"
-    for first in range(0, LANES, lanes) if lanes < LANES else ():
+    for first in range(0, width, lanes) if lanes < width else ():
         parts = [f"{operand}{first}" for operand in operands]
         for operand, part in zip(operands, parts, strict=True):
             if lanes == 1:
-                yield f"{part} = extractelement {VECTOR} {operand}, i32 {first}"
+                yield f"{part} = extractelement {numbers} {operand}, i32 {first}"
             else:
                 chosen = ", ".join(f"i32 {first + i}" for i in range(lanes))
-                yield f"{part} = shufflevector {VECTOR} {operand}, {VECTOR} poison, <{lanes} x i32> <{chosen}>"
+                yield f"{part} = shufflevector {numbers} {operand}, {numbers} poison, <{lanes} x i32> <{chosen}>"
         listed = ", ".join(f"{kind} {part}" for part in parts)
         yield f"%result{first} = call {kind} @{symbol}({listed})"
-        target = "%all" if first + lanes == LANES else f"%whole{first}"
+        target = "%all" if first + lanes == width else f"%whole{first}"
         if lanes == 1:
-            yield f"{target} = insertelement {VECTOR} {whole}, double %result{first}, i32 {first}"
+            yield f"{target} = insertelement {numbers} {whole}, double %result{first}, i32 {first}"
         else:
-            spread = ", ".join(f"i32 {i}" if i < lanes else "i32 poison" for i in range(LANES))
-            yield f"%wide{first} = shufflevector {kind} %result{first}, {kind} poison, <{LANES} x i32> <{spread}>"
+            spread = ", ".join(f"i32 {i}" if i < lanes else "i32 poison" for i in range(width))
+            yield f"%wide{first} = shufflevector {kind} %result{first}, {kind} poison, <{width} x i32> <{spread}>"
             mixed = ", ".join(
-                f"i32 {LANES + i - first}" if first <= i < first + lanes else f"i32 {i}" for i in range(LANES)
+                f"i32 {width + i - first}" if first <= i < first + lanes else f"i32 {i}" for i in range(width)
             )
-            yield (
-                f"{target} = shufflevector {VECTOR} {whole}, {VECTOR} %wide{first}, <{LANES} x i32> <{mixed}>"
-            )
+            yield f"{target} = shufflevector {numbers} {whole}, {numbers} %wide{first}, <{width} x i32> <{mixed}>"
         whole = target
-    yield f"ret {VECTOR} %all"
+    yield f"ret {numbers} %all"
     yield "}"

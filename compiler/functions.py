@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 import numpy
 
 from . import namespace
-from .emission import LANES
+from .block import LANES
 from .library import Library
-from .native import Native, native
+from .native import Code, native
 from .program import Graph, Program, Result, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
+UNCOUNTED = 65_536
+"""Lanes that a call may run over before it asks for better code: each time would take a tenth of a short step."""
 FEWEST = 512
 """Lanes that are worth a thread."""
 
@@ -127,27 +129,28 @@ class Specialised:
         self.lane_first = [False] * (len(self.inputs) + len(self.outputs))
         self.lane_first[-1] = turned
         self.lane_first[0] |= given_turned
-        self.native: Native | None = None
+        self.code: Code | None = None
 
     def compile(self, library: Library | None = None) -> None:
         """Translate the program, or find it in the cache."""
-        if self.native is None:
-            self.native = native(self.program, self.lane_first, library)
+        if self.code is None:
+            self.code = native(self.program, self.lane_first, library)
 
     def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
         """Return what runs the function on arrays ``(rows, N)``, or ``(..., N)``, from now on always the same."""
         self.compile()
-        assert self.native is not None
+        assert self.code is not None
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
             table += [address_of(array), _lane_stride(array) if lane_first else _stride(array)]
-        return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
+        return Call(self.code, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
         """Run on inputs of some width; returns new outputs, None where an input stands for one."""
         self.compile()
-        assert self.native is not None
+        assert self.code is not None
+        self.code.expect(width)
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -166,7 +169,7 @@ class Specialised:
             table[-2:] = [address_of(last), rows[-1]]
             outputs[-1] = last.T.reshape(*self.outputs[-1].shape, width)
         call = Call(
-            self.native, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
+            self.code, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
         )
         run_over(call, width, threads)
         return outputs
@@ -184,16 +187,27 @@ class Specialised:
 class Call:
     """A function bound to its arrays.
 
-    Attributes:
-        arrays: inputs, then outputs.
+    Args:
+        code: of the function.
         table: addresses and strides; entry ``1 + 2 i`` is the address of array i.
+        arrays: inputs, then outputs.
+        constants: that the table begins with.
+
+    Attributes:
+        native: the code of now, see :meth:`expect`.
     """
 
     def __init__(
-        self, native: Native, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
+        self, code: Code, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
     ) -> None:
-        self.native, self.table, self.arrays, self._constants = native, table, arrays, constants
+        self.table, self.arrays, self._constants = table, arrays, constants
+        self._code, self.native, self._uncounted = code, code.run, 0
         self.address = address_of(table)
+
+    def expect(self, lanes: int) -> None:
+        """Prepare to run over so many lanes in all, with better code where that is worth its time."""
+        self._code.expect(lanes)
+        self.native = self._code.run
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
         """Read or write another array of the same shape from now on."""
@@ -202,15 +216,19 @@ class Call:
 
     def copy(self) -> "Call":
         """Return the same call with a table of its own."""
-        return Call(self.native, self.table.copy(), list(self.arrays), self._constants)
+        return Call(self._code, self.table.copy(), list(self.arrays), self._constants)
 
     @property
     def native_address(self) -> int:
-        """Address of the code."""
+        """Address of the code of now."""
         return ctypes.cast(self.native, ctypes.c_void_p).value or 0  # type: ignore[arg-type]
 
     def __call__(self, first: int, last: int) -> None:
         """Run from one lane to another."""
+        self._uncounted += last - first
+        if self._uncounted > UNCOUNTED:
+            self.expect(self._uncounted)
+            self._uncounted = 0
         self.native(self.address, first, last)
 
 

@@ -7,9 +7,10 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from . import cache
+from .block import LANES, block_for, block_of
 from .emission import emit
 from .library import Library, fastest
 from .program import LOCK, Program
@@ -65,9 +66,34 @@ def _host() -> tuple[str, str]:
     return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
 
 
-def _target() -> Any:
+def _target(level: int = 1) -> Any:
     name, features = processor()
-    return llvm().Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=1)
+    return llvm().Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=level)
+
+
+class Setting(NamedTuple):
+    """How a program becomes code; its results have the same bits in every setting."""
+
+    lanes: int
+    """Of a block."""
+    part: int
+    """Statements of a part."""
+    level: int
+    """Of LLVM's optimisation of code."""
+
+
+def quick_setting(features: str) -> Setting:
+    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register."""
+    return Setting(block_for(features).lanes, 100, 0)
+
+
+OPTIMISED = Setting(LANES, 200, 1)
+"""The setting with the fastest code; where a register holds four lanes, two of them make a block."""
+HOT = 2_000_000
+"""Lanes after which a program is worth the time that optimisation takes: three to five times that of the quick setting,
+for code that takes up to a third less. Both are in proportion to the program's length, so the lanes are not."""
+LONG = 20_000
+"""Steps of a program from which on optimisation saves nothing: its numbers do not fit into the nearest caches."""
 
 
 Native = Callable[[int, int, int], None]
@@ -76,8 +102,37 @@ NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 """The same for ctypes."""
 
 
-def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Native:
-    """Return code that runs a program.
+class Code:
+    """Code of a program, called as :data:`Native`.
+
+    A program is compiled quickly first, and with optimisation once it has run over two million lanes, unless it has
+    20,000 steps or more, which gain nothing.
+
+    Args:
+        run: the code.
+        optimise: makes better code; None: there is none.
+
+    Attributes:
+        run: the code of now.
+    """
+
+    def __init__(self, run: Native, optimise: Callable[[], Native] | None = None) -> None:
+        self.run, self._optimise, self._lanes = run, optimise, 0
+
+    def __call__(self, table: int, first: int, last: int) -> None:
+        """Run from one lane to another."""
+        self.run(table, first, last)
+
+    def expect(self, lanes: int) -> None:
+        """Prepare to run over so many lanes: make better code where it has become worth its time."""
+        self._lanes += lanes
+        if self._optimise is not None and self._lanes > HOT:
+            optimise, self._optimise = self._optimise, None
+            self.run = optimise()
+
+
+def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Code:
+    """Return code that runs a program; one for all programs that differ in nothing but constants.
 
     Args:
         program: what it computes.
@@ -90,13 +145,27 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
         steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
-        made_of = repr((steps, results, list(lane_first), symbols))
-        key = _key(made_of, _own_text())
-        if key not in _LIBRARIES:
+        quick = quick_setting(features)
+        made_of = repr((steps, results, list(lane_first), symbols)), _own_text()
+        key = _key(*made_of, repr(quick))
+        if key not in _CODES:
             for own in library.functions.values():
                 binding.add_symbol(own.symbol, own.address)
-            _LIBRARIES[key] = _load(key, lambda: emit(program, lane_first, library), NATIVE)
-        return _LIBRARIES[key]
+
+            def code(setting: Setting, key: str) -> Native:
+                with LOCK:
+                    block, part = block_of(setting.lanes), setting.part
+                    return _load(
+                        key, lambda: emit(program, lane_first, library, block, part), NATIVE, setting.level
+                    )
+
+            better = _key(*made_of, repr(OPTIMISED))
+            if cache.holds(better):
+                _CODES[key] = Code(code(OPTIMISED, better))
+            else:
+                optimise = functools.partial(code, OPTIMISED, better) if len(steps) < LONG else None
+                _CODES[key] = Code(code(quick, key), optimise)
+        return _CODES[key]
 
 
 def native_text(text: str, signature: Any = NATIVE) -> Any:
@@ -111,9 +180,9 @@ def native_text(text: str, signature: Any = NATIVE) -> Any:
     """
     with LOCK:
         key = _key(text)
-        if key not in _LIBRARIES:
-            _LIBRARIES[key] = _load(key, lambda: text, signature)
-        return _LIBRARIES[key]
+        if key not in _TEXTS:
+            _TEXTS[key] = _load(key, lambda: text, signature)
+        return _TEXTS[key]
 
 
 def _key(*texts: str) -> str:
@@ -127,14 +196,13 @@ def _own_text() -> str:
     return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
 
 
-def _load(key: str, write: Callable[[], str], signature: Any) -> Any:
+def _load(key: str, write: Callable[[], str], signature: Any, level: int = 1) -> Any:
     """Load the code of a text, translated or found in the cache."""
     binding = llvm()
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(write())
-        module.verify()
-        code = _target().emit_object(module)
+        code = _target(level).emit_object(module)
         cache.keep(key, code)
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
@@ -143,5 +211,7 @@ def _load(key: str, write: Callable[[], str], signature: Any) -> Any:
     return signature(engine.get_function_address("program"))
 
 
-_LIBRARIES: dict[str, Native] = {}
-"""By its key: code that this process has loaded."""
+_CODES: dict[str, Code] = {}
+"""Code of programs that this process has loaded, by the key of the quick one."""
+_TEXTS: dict[str, Any] = {}
+"""Code of texts, by its key."""

@@ -5,48 +5,53 @@ What crosses a cut lies in a scratch array; inputs and constants are read again 
 
 import heapq
 
-from .program import BAND, Program
+from .program import BAND, Program, Result
 
 FREE = ("input", "constant", "entry")
 """Steps that every part makes again instead of fetching them from a slot of the scratch array."""
+Statement = int | Result
+"""What takes a compiler time: a step that is computed, or a result that is written."""
 
 
-def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[int]], int]:
-    """Steps of each part; those that are free stand only where they are results themselves.
+def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
+    """Statements of each part: every step but those that are free, and every result right after its step.
 
     Args:
         program: to cut.
-        size: steps of a part.
+        size: statements of a part.
         pause: a step with which a part begins.
 
     Returns:
         Parts, at least one, and how many of them are before the pause.
     """
-    results = {result.node for result in program.results}
-    listed = [i for i, step in enumerate(program.steps) if step.operation not in FREE or i in results]
-    first, second = (
-        [half[i : i + size] for i in range(0, len(half), size)]
-        for half in ([i for i in listed if i < pause], [i for i in listed if i >= pause])
-    )
+    results: dict[int, list[Statement]] = {}
+    for result in program.results:
+        results.setdefault(result.node, []).append(result)
+    halves: tuple[list[Statement], list[Statement]] = ([], [])
+    for index, step in enumerate(program.steps):
+        half = halves[index >= pause]
+        if step.operation not in FREE:
+            half.append(index)
+        half += results.get(index, ())
+    first, second = ([half[i : i + size] for i in range(0, len(half), size)] for half in halves)
     return [*first, *second] or [[]], len(first)
 
 
-def scratch_slots(program: Program, parts: list[list[int]]) -> dict[int, int]:
+def scratch_slots(program: Program, parts: list[list[Statement]]) -> dict[int, int]:
     """Place in the scratch array of every step that crosses a cut; places are used again.
 
     Args:
         program: that was cut.
         parts: of :func:`cut_parts`.
     """
-    part_of = {step: i for i, part in enumerate(parts) for step in part}
+    part_of = {step: i for i, part in enumerate(parts) for step in part if isinstance(step, int)}
     last_user: dict[int, int] = {}
-    for index, part in part_of.items():
-        used = program.steps[index]
-        if used.operation in FREE:
-            continue
-        for argument in used.parts:
-            if part_of.get(argument, part) < part and program.steps[argument].operation not in FREE:
-                last_user[argument] = part
+    for number, part in enumerate(parts):
+        for statement in part:
+            used = program.steps[statement].parts if isinstance(statement, int) else (statement.node,)
+            for step in used:
+                if part_of.get(step, number) < number:
+                    last_user[step] = number
     free: list[int] = []
     busy: list[tuple[int, int]] = []
     found: dict[int, int] = {}

@@ -134,7 +134,6 @@ class CallSequence:
 
     def __init__(self, even: Sequence[Call], odd: Sequence[Call], moving: Sequence[Moving]) -> None:
         self._calls, self._count = [*even, *odd], len(even)
-        self._codes = numpy.array([call.native_address for call in self._calls], dtype=numpy.int64)
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
         numbers = {id(call): i for i, call in enumerate(self._calls)}
         starts = numpy.cumsum([0, *(len(call.table) for call in self._calls)])
@@ -152,6 +151,9 @@ class CallSequence:
             threads: how many share the lanes.
             tile: lanes that go through all steps together.
         """
+        for call in self._calls:
+            call.expect(steps * width // 2)
+        codes = numpy.array([call.native_address for call in self._calls], dtype=numpy.int64)
         tables = numpy.concatenate([call.table for call in self._calls])
 
         def lanes(first: int, last: int) -> None:
@@ -161,7 +163,7 @@ class CallSequence:
                 address_of(own) + own.itemsize * places for places in (self._starts, self._places)
             )
             _driver()(
-                address_of(self._codes),
+                address_of(codes),
                 address_of(addresses),
                 self._count,
                 address_of(entries),

@@ -272,7 +272,7 @@ def score(
     """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
-    # worse it would praise what is worse still: "no room".
+    # worse it would praise what is worse still.
     return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler import namespace
-from ..compiler.emission import LANES
+from ..compiler.block import LANES
 from ..compiler.functions import Function, Specialised, leaves, map_arrays
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph

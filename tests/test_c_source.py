@@ -203,6 +203,7 @@ def test_long_programs_are_written_in_parts():
     code = random_program(0, 700)
     count = sum(step.operation not in ("input", "constant") for step in code.steps)
     assert count > c_source.PART
+    count += len(code.results)
     text = write_lanes(code, "line", [False, False])
     assert len(re.findall(r"static void line_part_\d+\(", text)) == -(-count // c_source.PART)
 

@@ -40,7 +40,7 @@ def loaded(monkeypatch):
     )
 
     def load():
-        monkeypatch.setattr(native, "_LIBRARIES", {})
+        monkeypatch.setattr(native, "_CODES", {})
         compiled.clear()
         result = Function(lambda x: x * 2.5 + x, Graph())(NUMBERS)
         np.testing.assert_array_equal(result, NUMBERS * 2.5 + NUMBERS)
@@ -255,7 +255,9 @@ def test_code_is_that_of_one_processor(place, loaded, monkeypatch):
     assert loaded() == 1
     monkeypatch.setattr(native, "processor", lambda: (name, f"{features},+one-more"))
     kind = native.llvm().Target.from_default_triple()
-    monkeypatch.setattr(native, "_target", lambda: kind.create_target_machine(cpu=name, features=features))
+    monkeypatch.setattr(
+        native, "_target", lambda level=1: kind.create_target_machine(cpu=name, features=features)
+    )
     assert loaded() == 1
     monkeypatch.setattr(native, "processor", lambda: ("another", features))
     assert loaded() == 1

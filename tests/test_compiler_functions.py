@@ -258,7 +258,7 @@ def _threads_change_often():
 @pytest.mark.usefixtures("_threads_change_often")
 def test_threads_that_meet_a_function_at_once_all_get_it(monkeypatch):
     for attempt in range(5):
-        monkeypatch.setattr(native, "_LIBRARIES", {})
+        monkeypatch.setattr(native, "_CODES", {})
         x, start, graph = numbers(3, 24, seed=attempt), threading.Barrier(4), Graph()
         # Two functions, whose expressions meet in one graph.
         both = [Function(lambda x, k=k: ordinary(x) * (k + 1.5) + k, graph) for k in range(2)]
@@ -309,7 +309,7 @@ def test_a_forked_process_goes_on_and_compiles_what_is_new(compiled):
         signal.alarm(60)  # what hangs ends, and fails
         try:
             new = Function(lambda x: ordinary(x) / 7.0, Graph())
-            native._LIBRARIES.clear()
+            native._CODES.clear()
             os.write(write, compiled(x, threads=2).tobytes() + new(x, threads=2).tobytes())
         finally:
             os._exit(0)
@@ -341,7 +341,7 @@ def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
         return own(*given)
 
     monkeypatch.setattr(native, "_load", loaded)
-    monkeypatch.setattr(native, "_LIBRARIES", {})  # where it may be of an earlier test
+    monkeypatch.setattr(native, "_CODES", {})  # where it may be of an earlier test
     thread = threading.Thread(target=Function(function, graph), args=(x,))
     thread.start()
     begun.wait()

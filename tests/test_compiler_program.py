@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
-from filtergym.compiler import cache, emission, functions, namespace, native
+from filtergym.compiler import cache, functions, namespace, native
+from filtergym.compiler.block import block_for, block_of
 from filtergym.compiler.emission import emit
 from filtergym.compiler.functions import Function, Specialised
-from filtergym.compiler.library import portable
+from filtergym.compiler.library import VARIANTS, portable
+from filtergym.compiler.native import OPTIMISED, Setting, quick_setting
+from filtergym.compiler.parts import cut_parts
 from filtergym.compiler.program import Graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,6 +16,7 @@ from hypothesis import strategies as st
 pytest.importorskip("llvmlite")
 
 WIDTHS = (8, 16, 24, 520)
+SETTINGS = [Setting(8, 3, 1), Setting(4, 7, 0), Setting(8, 100, 0), Setting(4, 100, 1)]
 ONE = ("sqrt", "abs", "sign", "negative", "floor", "ceil", "trunc", "round")
 TWO = ("add", "multiply", "divide")
 COMPARED = ("less", "less_equal", "greater", "greater_equal", "equal", "not_equal")
@@ -75,7 +79,7 @@ def leaves(special):
     return floats, rng.integers(-3, 4, WIDTHS[-1]), rng.random(WIDTHS[-1]) < 0.5
 
 
-def computed(recipe, arrays, part, constants=()):
+def computed(recipe, arrays, setting, constants=()):
     """Yield what compiled code makes of a recipe: width, numbers and truth values, for all widths and threads."""
 
     def function(*arrays):
@@ -83,8 +87,8 @@ def computed(recipe, arrays, part, constants=()):
         return tuple(numbers), tuple(truths)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(emission, "PART", part)
-        patch.setattr(native, "_LIBRARIES", {})  # made of parts of another length
+        patch.setattr(native, "quick_setting", lambda _: setting)
+        patch.setattr(native, "_CODES", {})  # made in another setting
         patch.setattr(functions, "FEWEST", 8)
         compiled = Function(function, Graph())
         for width in WIDTHS:
@@ -92,14 +96,14 @@ def computed(recipe, arrays, part, constants=()):
                 yield width, *compiled(*(array[..., :width] for array in arrays), threads=threads)
 
 
-@pytest.mark.parametrize("part", [3, 7, 100])
+@pytest.mark.parametrize("setting", SETTINGS)
 @settings(max_examples=25)
 @given(recipe=recipes(WITHOUT_CONSTANTS))
-def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(part, recipe):
+def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(setting, recipe):
     arrays = leaves(special=True)
     with np.errstate(all="ignore"):
         numbers, truths = followed(recipe, np, *arrays)
-    for width, made, decided in computed(recipe, arrays, part):
+    for width, made, decided in computed(recipe, arrays, setting):
         for expected, result in zip(numbers, made, strict=True):
             np.testing.assert_array_equal(result, expected[:width])
             known = ~np.isnan(result)
@@ -109,16 +113,16 @@ def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(part, recip
             np.testing.assert_array_equal(result, expected[:width])
 
 
-@pytest.mark.parametrize("part", [3, 7, 100])
+@pytest.mark.parametrize("setting", SETTINGS)
 @settings(max_examples=25)
 @given(recipe=recipes(WITH_CONSTANTS))
-def test_random_programs_with_constants_are_numpys_where_all_is_finite(part, recipe):
+def test_random_programs_with_constants_are_numpys_where_all_is_finite(setting, recipe):
     arrays = leaves(special=False)
     with np.errstate(all="ignore"):
         numbers, truths = followed(recipe, np, *arrays, CONSTANTS)
     numbers, truths = ([np.broadcast_to(row, WIDTHS[-1]) for row in rows] for rows in (numbers, truths))
     finite = np.isfinite(numbers).all(axis=0)
-    for width, made, decided in computed(recipe, arrays, part, CONSTANTS):
+    for width, made, decided in computed(recipe, arrays, setting, CONSTANTS):
         for expected, result in zip([*numbers, *truths], [*made, *decided], strict=True):
             # Zeros may differ in their signs, which nothing but infinities would show.
             np.testing.assert_array_equal(result[finite[:width]], expected[:width][finite[:width]])
@@ -219,7 +223,9 @@ def test_functions_that_differ_only_in_numbers_have_the_same_text():
             return gain * x + namespace.asarray(table)[index]
 
         special = Specialised(function, Graph(), [np.zeros(8)])
-        return emit(special.program, special.lane_first, portable()), special.program.constants
+        return emit(
+            special.program, special.lane_first, portable(), block_of(8), 10
+        ), special.program.constants
 
     (one, values), (other, others) = text(0.3, [1.5, 2.5]), text(0.7, [3.5, np.nan])
     assert one == other
@@ -227,15 +233,108 @@ def test_functions_that_differ_only_in_numbers_have_the_same_text():
     assert one != text(1.0, [1.5, 2.5])[0]  # a product with one is less work
 
 
-def test_places_of_what_crosses_cuts_are_used_again(monkeypatch):
-    monkeypatch.setattr(emission, "PART", 10)
-
+def test_places_of_what_crosses_cuts_are_used_again():
     def function(x):
         for _ in range(100):
             x = namespace.sqrt(x * x + 1.0) / 3.0
         return x
 
     special = Specialised(function, Graph(), [np.zeros(8)])
-    text = emit(special.program, special.lane_first, portable())
+    text = emit(special.program, special.lane_first, portable(), block_of(8), 10)
     assert "@part39" in text
     assert "%scratch = alloca <8 x double>, i64 2," in text
+
+
+# --- settings
+
+
+def all_functions(x):
+    """Functions of the library, a table, a remainder, a product of matrices, and rows that are written lane by lane."""
+    index = namespace.astype(namespace.floor(x[0] * 3.0), namespace.int64)
+    table = np.random.default_rng(1).normal(size=12)
+    matrix = np.random.default_rng(2).normal(size=(24, 16))
+    waves = namespace.stack([namespace.sin(x[1] * k) for k in range(16)])
+    far = namespace.hypot(namespace.exp(x[0]), namespace.log(namespace.abs(x[1]) + 1.0))
+    return namespace.take(table, index), matrix @ waves, namespace.remainder(far, x[2]), waves
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_code_has_the_same_bits_in_every_setting(monkeypatch, setting):
+    x = np.random.default_rng(4).normal(scale=2.0, size=(3, 24))
+
+    def run(setting):
+        monkeypatch.setattr(native, "quick_setting", lambda _: setting)
+        monkeypatch.setattr(native, "_CODES", {})
+        special = Specialised(all_functions, Graph(loops=True), [x], turned=True)
+        assert "product" in [step.operation for step in special.program.steps]
+        special.compile(portable())
+        return [answer.tobytes() for answer in special.call([x], 24, 1)]
+
+    assert run(setting) == run(OPTIMISED)
+
+
+@pytest.mark.parametrize("features", ["", *(f"+{name}" for name in VARIANTS), "+avx2,+avx512f"])
+def test_no_function_of_the_library_takes_more_lanes_than_a_block_has(features):
+    listed = features.split(",")
+    lanes = [count for name, (_, count) in VARIANTS.items() if f"+{name}" in listed]
+    assert max(lanes, default=1) <= block_for(features).lanes
+    assert OPTIMISED.lanes % block_for(features).lanes == 0
+    assert quick_setting(features).lanes == block_for(features).lanes
+
+
+def chain(length):
+    def function(x):
+        for _ in range(length):
+            x = x * 1.25 + 0.5
+        return x
+
+    return function
+
+
+def settings_used(monkeypatch, function, runs):
+    """Settings in which the code of a function was made while it ran."""
+    used = []
+    monkeypatch.setattr(native, "_CODES", {})
+    monkeypatch.setattr(
+        native, "emit", lambda *given, emit=emit: (used.append((given[3].lanes, given[4])), emit(*given))[1]
+    )
+    compiled, x = Function(function, Graph()), np.ones((1, 8))
+    expected = compiled(x)
+    for _ in range(runs):
+        np.testing.assert_array_equal(compiled(x), expected)
+    return used
+
+
+def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
+    monkeypatch.setattr(native, "HOT", 40)
+    features = native.processor()[1]
+    first, better = quick_setting(features)[:2], OPTIMISED[:2]
+    assert settings_used(monkeypatch, chain(5), runs=3) == [first]
+    assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
+
+
+def test_long_programs_stay_as_they_are(monkeypatch):
+    monkeypatch.setattr(native, "HOT", 40)
+    monkeypatch.setattr(native, "LONG", 30)
+    assert len(settings_used(monkeypatch, chain(12), runs=12)) == 2
+    assert len(settings_used(monkeypatch, chain(13), runs=12)) == 2
+    assert len(settings_used(monkeypatch, chain(20), runs=12)) == 1
+
+
+def test_parts_are_cut_by_results_as_well_as_by_steps():
+    def function(x):
+        return x + 1.0, namespace.zeros((250, 1)) + 0.0, namespace.broadcast_to(x * 2.0, (30, *x.shape))
+
+    special = Specialised(function, Graph(), [np.zeros(8)])
+    parts, _ = cut_parts(special.program, 20)
+    statements = [statement for part in parts for statement in part]
+    assert max(map(len, parts)) == 20
+    assert sorted(s for s in statements if not isinstance(s, int)) == sorted(special.program.results)
+    computed = [i for i, step in enumerate(special.program.steps) if step.operation in ("add", "multiply")]
+    assert [s for s in statements if isinstance(s, int)] == computed
+    for found, expected in zip(
+        Function(function, Graph())(np.arange(8.0)),
+        (np.arange(8.0) + 1.0, 0.0, np.arange(8.0) * 2.0),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(found, np.broadcast_to(expected, found.shape))

@@ -19,6 +19,7 @@ import numpy
 from ...compiler import namespace
 from ...compiler.functions import (
     DTYPES,
+    UNCOUNTED,
     Call,
     Function,
     Leaf,
@@ -525,6 +526,8 @@ class Stepper:
             self._calls.append(step)
             self._begin.append(begin)
         self._now = 0
+        self._stepped = 0
+        """Lanes that steps went over and that no code was told of."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
@@ -552,6 +555,8 @@ class Stepper:
         """
         for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
             memory[...] = values
+        for call in self._begin[self._now]:
+            call.expect(self.width)
         self._run(self._begin[self._now], noise)
 
     def begin_some(
@@ -585,6 +590,11 @@ class Stepper:
 
     def step(self, noise: EpisodeNoise) -> None:
         """Apply the action and go on to the next measurement."""
+        self._stepped += self.width
+        if self._stepped > UNCOUNTED:
+            for call in itertools.chain(*self._calls):
+                call.expect(self._stepped // 2)
+            self._stepped = 0
         self._run(self._calls[self._now], noise)
 
     def _run(self, calls: Sequence[Call], noise: EpisodeNoise) -> None:

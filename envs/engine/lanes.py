@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ...compiler.emission import LANES
+from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode, Model

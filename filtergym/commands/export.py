@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..agents.export import export_run
-from ..baselines.problem import Problem, problem_of
+from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import check_names, nearest
 from ..envs.engine.scenario_choice import read_recording
 from ..evaluation.files import writable_file, writable_folder
@@ -27,7 +27,7 @@ from .terminal import (
 if TYPE_CHECKING:
     from ..exports.request import ExportRequest
 
-FORMS = ("safetensors", "c", "onnx", "hub")
+FORMS = ("safetensors", "c", "onnx")
 """What can be written."""
 
 
@@ -53,7 +53,7 @@ def export(
         str,
         typer.Option(
             help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
-            "network of an agent; hub, a folder with an agent and its card.",
+            "network of an agent.",
             autocompletion=one_of(*FORMS),
         ),
     ] = "safetensors",
@@ -98,11 +98,7 @@ def export(
         raise nearest("form of an export", to, FORMS)
     options: dict[str, Any] = {"a filter's name": name, "--float": single, "--scenario": scenario}
     options |= {"--recording": recording, "--set": settings}
-    allowed = {
-        "safetensors": (),
-        "onnx": ("a filter's name",),
-        "hub": ("a filter's name",),
-    }
+    allowed = {"safetensors": (), "onnx": ("a filter's name",)}
     for option, given in options.items():
         if given and option not in allowed.get(to, options):
             raise ValueError(
@@ -114,9 +110,6 @@ def export(
     if name is None:
         raise ValueError(f"name the filter: filtergym export {environment} NAME --to {to}")
     problem = problem_of(environment)
-    if to == "hub":
-        _export_hub(problem, name, out)
-        return
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
     data: Any = scenario
@@ -161,19 +154,3 @@ def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
     run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
 
-
-def _export_hub(problem: Problem, name: str, out: Path | None) -> None:
-    """Write a folder that a model hub takes: a shipped agent, or a file of one, with its card."""
-    from ..agents.hub_folder import write_hub_folder
-    from ..agents.learned_policy import pretrained_path
-    from ..agents.named_policies import pretrained_agents
-
-    file = Path(name)
-    if file.suffix != ".safetensors":
-        shipped = pretrained_agents(problem.id)
-        if name not in shipped:
-            raise nearest("agent, or file .safetensors of one", name, shipped)
-        file = pretrained_path(problem.id, name)
-    folder = writable_folder(out or Path(file.stem))
-    write_hub_folder(problem, file, folder)
-    console.print(f"saved in {folder}: README.md, config.json, model.safetensors", soft_wrap=True)
