@@ -10,6 +10,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import weakref
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from filtergym.baselines.tuned_values import TunedValues
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation import code, parallel, summary
+from filtergym.evaluation.evaluate import run_piece
+from filtergym.evaluation.metrics import record_statistics
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.store import Store
 from filtergym.evaluation.summary import Summary, combine_summaries, summaries
@@ -104,6 +107,58 @@ def test_summaries_tell_what_the_evaluation_does(env_id, short):
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
         np.testing.assert_array_equal(result.track[name].values, whole.track[name].values, err_msg=name)
+
+
+def test_without_figures_there_are_the_same_records_and_no_curves():
+    experiment = problem_of(ENV).experiment(episodes=8)
+    found = {}
+    for curves in (True, False):
+        asked = evaluation_requests(problem_of(ENV), experiment, NAMES, curves=curves)
+        found[curves] = combine_summaries([one for _, one in sorted(summaries(asked, Workers()))])
+    assert found[True][0] == found[False][0]
+    assert found[True][1] is not None
+    assert found[False][1] is None
+    assert found[True][2].identical(found[False][2])
+
+
+def numbers_in(part):
+    """How many numbers are kept of some episodes."""
+    sums, samples = part.reduction.sums.values(), part.reduction.samples.values()
+    return (
+        sum(v.size for v in sums) + sum(v.size for pieces in samples for v in pieces) + part.head.nbytes // 8
+    )
+
+
+def test_of_an_episode_a_few_numbers_are_kept_and_of_a_block_nothing_else(env_id, short, monkeypatch):
+    """Memory grows by less than one measurement an episode, and the arrays of a block go before the next is run."""
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    problem = problem_of(env_id)
+    shorter = {} if env_id == ENV else short
+    kept, held = [], []
+    for episodes in (16, 32, 64):
+        experiment = problem.experiment(episodes=episodes, keywords=shorter)
+        [asked] = evaluation_requests(problem, experiment, problem.baselines.score_paper, curves=False)
+        blocks = []
+
+        def run(*given, blocks=blocks):
+            held.append(sum(block() is not None for block in blocks))
+            return run_piece(*given)
+
+        def declare(run, asked=asked, blocks=blocks):
+            values = run["error"].values
+            while values.base is not None:
+                values = values.base
+            blocks.append(weakref.ref(values))
+            yield from record_statistics(run, asked.episodes, asked.metrics)
+
+        monkeypatch.setattr(summary, "run_piece", run)
+        kept.append(numbers_in(summary.reduce_episodes(asked, declare, lambda _: None)))
+        assert len(blocks) == episodes // 8
+    assert held == [0] * len(held)
+    each = (kept[2] - kept[1]) / 32
+    assert each == (kept[1] - kept[0]) / 16
+    whole = evaluate(env_id, problem.baselines.score_paper, episodes=1, **shorter).nbytes / 8
+    assert 1 <= each < whole / 10
 
 
 def shuffled(run):

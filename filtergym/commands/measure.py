@@ -16,6 +16,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record_experiment
 from ..evaluation.rollout import Progress
+from ..evaluation.threads import one_thread
 from ..names import find_competitor, is_learned
 from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
@@ -65,6 +66,7 @@ from .terminal import (
 )
 
 
+@one_thread()
 def evaluate_policies(
     environment: Annotated[
         str | None,
@@ -280,6 +282,7 @@ def write_offline(
     console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
 
 
+@one_thread()
 def benchmark(
     full: Annotated[
         bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
