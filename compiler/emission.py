@@ -6,6 +6,7 @@ than the length of a function. What crosses a cut lies in a scratch array on the
 of the constants, then two integers for each argument, address and stride.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -210,7 +211,9 @@ class _Part:
         matrix = self.new(f"getelementptr double, ptr {self.constants}, i64 {table}")
         given, found = self.scratch(self.places.vector), self.scratch(self.places.products[index])
         sizes = f"i64 {len(vector)}, i64 {-(-rows // BAND)}"
-        self.lines.append(f"call void @product(ptr {matrix}, ptr {given}, ptr {found}, {sizes})")
+        self.lines.append(
+            f"call void @{product_symbol(self.block)}(ptr {matrix}, ptr {given}, ptr {found}, {sizes})"
+        )
 
     def store(self, argument: int, row: int, step: int) -> None:
         """Write a result."""
@@ -282,8 +285,6 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library, block: 
                 own.hand_on(statement)
         header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
         text += [f"define internal void @part{number}({header}) {{", *own.lines, "ret void", "}"]
-    if vectors:
-        text += _product_function(block)
     text += _entry(block, len(parts), max(1, places.vector + max(vectors, default=0)))
     return "\n".join([*text, "!0 = !{}"])
 
@@ -307,13 +308,28 @@ def _entry(block: Block, parts: int, slots: int) -> Iterator[str]:
     yield "}"
 
 
-def _product_function(block: Block) -> Iterator[str]:
-    """The product of a matrix of constants with a vector of lane values: bands of rows side by side, each row's terms
-    added one after the other.
+def product_symbol(block: Block) -> str:
+    """Name of the function that programs call for the product of a matrix."""
+    return f"filtergym_product_{block.lanes}"
+
+
+@functools.cache
+def product_text(block: Block) -> str:
+    """Text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of constants with a
+    vector of lane values: bands of rows side by side, each row's terms added one after the other.
+
+    It is code of its own, and always optimised: programs spend their time in it.
+
+    Args:
+        block: lanes of the vector.
     """
+    return "\n".join(_product_lines(block))
+
+
+def _product_lines(block: Block) -> Iterator[str]:
     sums = range(BAND)
-    yield "define internal void @product(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
-    yield "                              ptr noalias %result, i64 %columns, i64 %bands) {"
+    yield "define void @program(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
+    yield "                     ptr noalias %result, i64 %columns, i64 %bands) {"
     yield "entry:"
     yield "br label %band"
     yield "band:"
@@ -355,6 +371,8 @@ def _product_function(block: Block) -> Iterator[str]:
 def _declarations(program: Program, library: Library, block: Block) -> Iterator[str]:
     """Intrinsics, and functions of a block made of the library's."""
     used = {step.operation for step in program.steps}
+    if "product" in used:
+        yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
     yield f"declare {block.numbers} {block.gather}({block.addresses}, i32, {block.truths}, {block.numbers})"
     yield f"declare {block.numbers} {block.intrinsic('fma')}({', '.join([block.numbers] * 3)})"
     for name in sorted(set(_INTRINSIC.values())):

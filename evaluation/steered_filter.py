@@ -234,7 +234,7 @@ def trace_decision(model: CompiledModel, policy: Policy) -> tuple[Function, Deci
 
 
 def _trace_decider(model: CompiledModel, policy: Policy, interval: int | None) -> tuple[Decider, Graph, Any]:
-    graph = Graph()
+    graph = Graph(loops=True)
     with namespace.tracing(graph):
         decider = decider_of(model.programs.traced, policy, interval)
         nothing = decider_of(model, policy, interval).start(numpy.zeros(LANES))
