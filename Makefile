@@ -29,18 +29,21 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,ins,adapters
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: benchmark test claims test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
 
-test: $(VENV)/.dev  ## run the test suite, without what only whole programs show
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+test: $(VENV)/.dev  ## run the tests of code, without what only whole programs show
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not claims"
+
+claims: $(VENV)/.dev  ## test what is said of results: tables, rankings, limits, records
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "claims and not slow"
 
 test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
-coverage: $(VENV)/.dev  ## run both, and show the lines that no test reaches
+coverage: $(VENV)/.dev  ## run them all, and show the lines that no test reaches
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
 
 core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch

@@ -12,12 +12,13 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy
 
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task
+from ..envs.data.foreign_files import parse_json, read_content
 from ..envs.engine.catalogue import short_name, task_class
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
@@ -36,6 +37,8 @@ OUTPUTS = ("clip", "tanh", "argmax")
 ENVELOPE = ("envelope_low", "envelope_high")
 """Arrays beside those of the network: least and largest value of each field in training, see :mod:`.envelope`."""
 HEADER = ("environment", "control", "interface", "fields", "output", "activation", "run")
+MOST_BYTES = 64_000_000
+"""Of a file; a network of twice 256 units has 0.3 MB."""
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are cut here, as in VecNormalize."""
 
@@ -209,26 +212,48 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
-    from safetensors import SafetensorError, safe_open
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
 
     try:
-        with safe_open(path, framework="numpy") as file:
-            header: dict[str, Any] = dict(file.metadata() or {})
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        content = read_content(path, MOST_BYTES)
+        arrays = load(content)  # first: it checks sizes and places
+        size = int.from_bytes(content[:8], "little")
+        header: dict[str, Any] = dict(parse_json(content[8 : 8 + size]).get("__metadata__") or {})
         lacking = [name for name in HEADER if name not in header]
         if lacking:
             raise ValueError(f"its header lacks {', '.join(lacking)}")
-        header |= {name: json.loads(header[name]) for name in ("fields", "run")}
+        header |= {name: parse_json(header[name].encode()) for name in ("fields", "run")}
         if header["output"] not in OUTPUTS or header["activation"] not in ACTIVATIONS:
-            raise ValueError(f"unknown output {header['output']!r} or activation {header['activation']!r}")
-        if not fits(header["fields"], list[str]) or not fits(header["run"], dict[str, Any]):
-            raise ValueError("its header has no list of fields or no record of a run")
+            raise ValueError(
+                f"unknown output {header['output']!r:.80} or activation {header['activation']!r:.80}"
+            )
+        if not fits(header["fields"], list[str]):
+            raise ValueError("its header has no list of fields")
+        _check_run(header["run"])
         header["answers"] = _count_answers(arrays, len(header["fields"]))
     except FileNotFoundError as error:
         raise ValueError(f"no learned policy at {path}") from error
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (SafetensorError, ValueError, TypeError, AttributeError, KeyError) as error:
         raise ValueError(f"{path} is not a learned policy of filtergym: {error}") from error
     return arrays, header
+
+
+def _check_run(run: Any) -> None:
+    """Check that what a header says of the run is of the types that a run's record has.
+
+    Raises:
+        ValueError: if not.
+    """
+    if not isinstance(run, dict):
+        raise ValueError("its header has no record of a run")
+    for name, hint in get_type_hints(TrainingRun).items():
+        if name in run and not fits(run[name], hint):
+            raise ValueError(
+                f"{name} of its run must be {getattr(hint, '__name__', hint)}, got {run[name]!r:.80}"
+            )
+    if not isinstance(run.get("hyperparameters", {}).get("env_kwargs", {}), dict):
+        raise ValueError("env_kwargs of its run must map names to values")
 
 
 def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:

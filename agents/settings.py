@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.contract.task import Task
+from ..envs.data.foreign_files import read_yaml
 from ..envs.engine.catalogue import nearest, parameter_names
 
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
@@ -84,12 +85,10 @@ def _read_table(path: Path, needs: str) -> dict[str, Any]:
     Raises:
         ValueError: if it cannot be read, or is no mapping; ``needs`` says of what.
     """
-    import yaml
-
     try:
-        table = with_numbers(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        table = with_numbers(read_yaml(path))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"cannot read settings from {path}: {reason}") from error
     if not isinstance(table, dict) or not table:
         raise ValueError(f"{path} needs {needs}")

@@ -11,7 +11,7 @@ from ..evaluation.stored import fits, read_json
 from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
 from .problem import Problem
 from .table import Tunable, tunable
-from .tuned_values import TunedPolicy, make_tuned_policy, round_value
+from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_value
 
 SUFFIX = ".filter.json"
 """Of the names of such files."""
@@ -116,6 +116,10 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
     if values.keys() != family.limits.keys():
         raise ValueError(
             f"{path} must give {table['filter']!r} a number for each of {', '.join(family.limits)}, got "
-            f"{', '.join(values)}"
+            f"{', '.join(values):.200}"
         )
+    try:
+        values = check_values(values, family)
+    except ValueError as error:
+        raise ValueError(f"{path}: filter {table['filter']!r}: {error}") from error
     return make_tuned_policy(f"{problem.id} fitted {table['filter']}", family, values)

@@ -32,6 +32,8 @@ class Tunable:
     """From values to keywords of the task and what makes the policy or estimator for it."""
     in_lanes: bool = True
     """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
+    beyond: Mapping[str, float] = field(default_factory=dict)
+    """How far beyond its limits a value of a file may lie: where a recording sets the limits, those of another one."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Of the values, without their logarithm; what is not named is a pure number."""
     anchored: bool = False

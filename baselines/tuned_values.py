@@ -112,19 +112,10 @@ class TunedValues:
 
     def _check(self, values: Any, policy: str, place: Any) -> dict[str, float]:
         """Raise ValueError if values are not those of a policy, within the limits of the search."""
-        limits = self.tunable[policy].limits
-        if not fits(values, dict[str, float]) or values.keys() != limits.keys():
-            raise ValueError(
-                f"{place} must give policy {policy!r} a number for each of {', '.join(limits)}, got "
-                f"{reprlib.repr(values)}: tune it again, or remove the file"
-            )
-        for name, (low, high) in limits.items():
-            # Values are stored rounded, so that one at a limit can lie just beyond it.
-            if not min(low, round_value(low)) <= values[name] <= max(high, round_value(high)):
-                raise ValueError(
-                    f"{place}: {name} of policy {policy!r} must be from {low:g} to {high:g}, got {values[name]!r}"
-                )
-        return values
+        try:
+            return check_values(values, self.tunable[policy])
+        except ValueError as error:
+            raise ValueError(f"{place}: policy {policy!r}: {error}: tune it again, or remove the file") from error
 
     def competitor(self, policy: str) -> TunedPolicy:
         """Return what makes a policy or estimator with its stored values.
@@ -137,6 +128,33 @@ class TunedValues:
         tunable = self.tunable[policy]
         values = self.values(policy)[0]
         return make_tuned_policy(f"{self.environment} {policy}", tunable, values)
+
+
+def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
+    """Check what a file says of a policy or estimator as if it were typed.
+
+    Args:
+        values: from the file.
+        tunable: what takes them.
+
+    Returns:
+        The same, by the names of the parameters.
+
+    Raises:
+        ValueError: if they are not a number for each parameter, within its limits.
+    """
+    limits = tunable.limits
+    if not fits(values, dict[str, float]) or values.keys() != limits.keys():
+        raise ValueError(f"it must give a number for each of {', '.join(limits)}, got {reprlib.repr(values)}")
+    for name, (low, high) in limits.items():
+        # Values are stored rounded, so that one at a limit can lie just beyond it.
+        beyond = tunable.beyond.get(name, 0.0)
+        if not min(low, round_value(low)) - beyond <= values[name] <= max(high, round_value(high)) + beyond:
+            raise ValueError(
+                f"{name} must be from {low - beyond:g} to {high + beyond:g}, got {reprlib.repr(values[name])}"
+            )
+    found: dict[str, float] = values
+    return found
 
 
 def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:

@@ -220,7 +220,7 @@ class _Names:
             for bottom in (y + 0.5 * gap, y - height - 0.5 * gap)
             for left in (self.window.x1 - width - gap, self.window.x0 + gap)
         ]
-        best = min(boxes, key=self._crowding)
+        best = boxes[int(numpy.argmin(self._crowding(numpy.array(boxes))))]
         self.taken.append(best)
         self._write(point.name, best, "black")
 
@@ -228,22 +228,23 @@ class _Names:
         """Find and take the best free box for a name; return it and how bad it is."""
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
-        found = []
-        for distance in DISTANCES:
-            for k in range(DIRECTIONS):
-                # Below the front nobody is: from there on round.
-                angle = math.pi * (1.25 + (k + 1) // 2 * (-1) ** k * 2.0 / DIRECTIONS)
-                reach = distance * self.pixels
-                cx = x + reach * math.cos(angle) + 0.5 * width * _unit(math.cos(angle))
-                cy = y + reach * math.sin(angle) + 0.5 * height * _unit(math.sin(angle))
-                box = (cx - 0.5 * width, cy - 0.5 * height, cx + 0.5 * width, cy + 0.5 * height)
-                badness = self._crowding(box) + 0.05 * distance + 0.06 * k
-                badness += 5.0 * self._crosses((x, y), _nearest(box, (x, y)))
-                found.append((badness, box))
-        badness, box = min(found)
-        self.taken.append(box)
+        k = numpy.arange(DIRECTIONS)
+        # Below the front nobody is: from there on round.
+        angle = math.pi * (1.25 + (k + 1) // 2 * (-1) ** k * 2.0 / DIRECTIONS)
+        reach = numpy.repeat(DISTANCES, DIRECTIONS) * self.pixels
+        cosine, sine = (numpy.tile(f(angle), len(DISTANCES)) for f in (numpy.cos, numpy.sin))
+        cx = x + reach * cosine + 0.5 * width * _unit(cosine)
+        cy = y + reach * sine + 0.5 * height * _unit(sine)
+        boxes = numpy.stack(
+            [cx - 0.5 * width, cy - 0.5 * height, cx + 0.5 * width, cy + 0.5 * height], axis=1
+        )
+        badness = self._crowding(boxes) + numpy.add.outer(0.05 * numpy.array(DISTANCES), 0.06 * k).ravel()
+        badness += 5.0 * self._crosses((x, y), boxes)
+        best = int(numpy.argmin(badness))
+        box = left, bottom, right, top = tuple(boxes[best].tolist())
+        self.taken.append((left, bottom, right, top))
         self._add_line((x, y), _nearest(box, (x, y)))
-        return box, badness
+        return box, float(badness[best])
 
     def _name(self, point: Point, box: tuple[float, float, float, float], colour: str) -> None:
         """Write a name, with a line to its point where that is not near."""
@@ -254,31 +255,36 @@ class _Names:
             self.axis.plot(line[:, 0], line[:, 1], color=colour, lw=0.5, zorder=2.5)
         self._write(point.name, box, colour)
 
-    def _crosses(self, start: tuple[float, float], end: tuple[float, float]) -> bool:
-        """Whether a line from a point to its name runs through another name or point."""
-        x, y = numpy.linspace(start, end, 12).T[:, :, None]
+    def _crosses(self, start: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
+        """Whether a line from a point to its name, in each of the boxes, runs through another name or point."""
+        ends = numpy.clip(numpy.array(start), boxes[:, :2], boxes[:, 2:])
+        x, y = numpy.linspace(numpy.broadcast_to(start, ends.shape), ends, 12, axis=1).T[..., None]
         a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
         others = ~((a <= start[0]) & (start[0] <= c) & (b <= start[1]) & (start[1] <= d))
-        return bool(((x > a) & (x < c) & (y > b) & (y < d) & others).any())
+        found: numpy.ndarray = ((x > a) & (x < c) & (y > b) & (y < d) & others).any(axis=(0, 2))
+        return found
 
-    def _crowding(self, box: tuple[float, float, float, float]) -> float:
-        """How much else there is in a box: names and points weigh more than lines, and the frame most."""
-        left, bottom, right, top = box
+    def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
+        """How much else there is in each box: names and points weigh more than lines, and the frame most."""
+        left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
         a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
         across = numpy.minimum(right + margin, c) - numpy.maximum(left - margin, a)
         along = numpy.minimum(top + margin, d) - numpy.maximum(bottom - margin, b)
-        found = 10.0 * numpy.count_nonzero((across > 0.0) & (along > 0.0))
-        x, y = numpy.moveaxis(numpy.array(self.lines), -1, 0)
+        found = 10.0 * numpy.count_nonzero((across > 0.0) & (along > 0.0), axis=1)
+        lines = numpy.array(self.lines)
+        x, y = lines.reshape(-1, 2).T
         inside = (x > left) & (x < right) & (y > bottom - margin) & (y < top)
-        found += 3.0 * numpy.count_nonzero(inside.any(axis=1))
+        found += 3.0 * numpy.count_nonzero(inside.reshape(len(boxes), len(lines), -1).any(axis=2), axis=1)
         window = self.window
-        return found + 100.0 * (
-            left < window.x0 + margin
-            or right > window.x1 - margin
-            or bottom < window.y0 + margin
-            or top > window.y1
+        outside = (
+            (left < window.x0 + margin)
+            | (right > window.x1 - margin)
+            | (bottom < window.y0 + margin)
+            | (top > window.y1)
         )
+        found += 100.0 * outside[:, 0]
+        return found
 
     def _write(self, text: str, box: tuple[float, float, float, float], colour: str) -> None:
         from matplotlib.patheffects import withStroke
@@ -296,9 +302,9 @@ def _nearest(box: tuple[float, float, float, float], point: tuple[float, float])
     return min(max(point[0], box[0]), box[2]), min(max(point[1], box[1]), box[3])
 
 
-def _unit(cosine: float) -> float:
+def _unit(cosine: numpy.ndarray) -> numpy.ndarray:
     """Side on which a box lies: that of its middle for directions near the other axis."""
-    return max(-1.0, min(1.0, 1.8 * cosine))
+    return numpy.clip(1.8 * cosine, -1.0, 1.0)
 
 
 def _octaves(percent: Any) -> Any:

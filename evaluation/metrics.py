@@ -242,14 +242,28 @@ def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
     return numpy.nan_to_num(run[f"{metric}_degrees"].values)
 
 
-def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
+    """Quantile of the chi-square distribution.
+
+    Args:
+        probability: of smaller numbers.
+        degrees: of freedom, a number or an array of any shape, larger than zero.
+
+    Returns:
+        The quantile for each number of degrees, in the same shape.
+    """
     from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
     # Few different ones, and the quantile is dear.
     different, which = numpy.unique(degrees, return_inverse=True)
-    low, high = (2.0 * gammaincinv(0.5 * runs * different, p) / runs for p in (0.025, 0.975))
-    return low[which].reshape(degrees.shape), high[which].reshape(degrees.shape)
+    quantiles: numpy.ndarray = 2.0 * gammaincinv(0.5 * different, probability)
+    return quantiles[which].reshape(numpy.shape(degrees))
+
+
+def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
+    return low, high
 
 
 def score(
@@ -258,7 +272,7 @@ def score(
     """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
-    # worse it would praise what is worse still: "no room".
+    # worse it would praise what is worse still.
     return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
 
 

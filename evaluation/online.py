@@ -4,6 +4,8 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 """
 
 import copy
+import importlib.metadata
+import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -18,9 +20,11 @@ from ..envs.engine.compiled import filter_stepper
 from ..filters.array_namespace import select_nested
 from .competitors import Kind, check_competitor, make_competitor
 from .dataset import FAULTS
-from .filters import put_in_loop
+from .filters import find_fault, put_in_loop
 from .stepping import SteppingPolicy
 
+LEAST_INTERVAL = 1e-6
+"""Of the sampling interval: measurements that are closer in time are the same moment, written twice."""
 REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
 """What a filter may report beside its estimate."""
 
@@ -80,7 +84,10 @@ class Estimate:
 
 
 class OnlineState(NamedTuple):
-    """All that a running filter remembers; it can be pickled."""
+    """All that a running filter remembers; it can be pickled.
+
+    ``owner`` says whose it is: environment and its interface, filter, tracks, version of the package.
+    """
 
     filter: Any
     """Of the filter, arrays ``(..., N)``."""
@@ -100,6 +107,8 @@ class OnlineState(NamedTuple):
     """Memory of an estimator that runs in Python."""
     watch: Any = None
     """Memory of the watch."""
+    owner: tuple[str, ...] = ()
+    """Of which filter it is; no other goes on from it."""
 
 
 class OnlineFilter:
@@ -152,12 +161,22 @@ class OnlineFilter:
         self._interval, self._averaged = interval, averaged if interval > 1 else []
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
         self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
+        of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
+        version = f"filtergym {importlib.metadata.version('filtergym')}"
+        self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
         """Without the filter's, which the stepper holds."""
 
     def __repr__(self) -> str:
         takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
         return f"<OnlineFilter {self.name!r} of {self.task.id}; update takes {takes}>"
+
+    def __reduce__(self) -> Any:
+        """Refuse copies: what a filter runs is machine code of this process."""
+        raise TypeError(
+            "a running filter cannot be copied or pickled: make another with filtergym.online, and let it restore what "
+            "save of this one returns"
+        )
 
     # --- what a user calls
 
@@ -179,6 +198,7 @@ class OnlineFilter:
         self.input.check_names(values, self.input.start_values)
         given = {**values, **{n: v for n, v in (("mean", mean), ("covariance", covariance)) if v is not None}}
         initial, memory = self.input.start(self._times(time), given)
+        self._check_covariance(initial)
         if tracks is not None:
             self._check_restart()
         state = self.model.start_filter(self._padded(initial))
@@ -208,8 +228,9 @@ class OnlineFilter:
         at = last + self._default_interval() if time is None else self._times(time)
         if not (at > last).all():
             raise ValueError(
-                f"time must increase: the last measurement was at {_plain(last)} s, got {time!r}"
+                f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(time)}"
             )
+        self._check_interval(at - last, time)
         self.input.check_names(values, self.input.values)
         measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
@@ -247,11 +268,22 @@ class OnlineFilter:
                 filter=self._stepper.state,
                 python=None if own is None else (own.memory, own.step),
                 watch=None if self.watch is None else self.watch.memory,
+                owner=self._owner,
             )
         )
 
     def restore(self, state: OnlineState) -> None:
-        """Go on from what :meth:`save` has returned."""
+        """Go on from what :meth:`save` has returned.
+
+        Raises:
+            ValueError: for anything else, and for what another filter has returned.
+        """
+        if not isinstance(state, OnlineState):
+            raise ValueError(f"restore takes what save has returned, got {reprlib.repr(state)}")
+        if state.owner != self._owner:
+            raise ValueError(
+                f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
+            )
         state = copy.deepcopy(state)
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step = state.python
@@ -297,14 +329,13 @@ class OnlineFilter:
         if self.tracks == 1:
             cut = lambda array: array[..., 0]  # noqa: E731
         answer = {name: cut(array) for name, array in found.items()}
-        if "lost" in answer:
-            answer["lost"] = self._each(
-                [FAULTS[int(i) - 1] if i else "" for i in numpy.atleast_1d(answer["lost"])]
-            )
-        watched = (
-            {} if self.watch is None else {"departure": self._each(self.watch.describe()[: self.tracks])}
+        if "lost" not in answer:  # a policy and an agent steer a filter that nobody else looks at
+            answer["lost"] = cut(_fault_of(found["mean"], found["covariance"]))
+        answer["lost"] = self._each(
+            [FAULTS[int(i) - 1] if i else "" for i in numpy.atleast_1d(answer["lost"])]
         )
-        return Estimate(_plain(time), self.names, self.units, **answer, **watched)
+        departure = [""] * self.tracks if self.watch is None else self.watch.describe()[: self.tracks]
+        return Estimate(_plain(time), self.names, self.units, **answer, departure=self._each(departure))
 
     def _each(self, words: list[str]) -> Any:
         return words[0] if self.tracks == 1 else words
@@ -317,18 +348,52 @@ class OnlineFilter:
         return self._state
 
     def _times(self, time: Any) -> numpy.ndarray:
-        found = numpy.asarray(time, dtype=float)
+        try:
+            found = numpy.asarray(time, dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            found = numpy.array(numpy.nan)
         if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
             raise ValueError(
-                f"time must be finite seconds, a number or ({self.tracks},) numbers, got {time!r}"
+                f"time must be finite seconds, a number or ({self.tracks},) numbers, got {reprlib.repr(time)}"
             )
         return numpy.broadcast_to(found, (self.tracks,)).copy()
+
+    def _has_interval(self) -> bool:
+        return bool(getattr(self.task.parameters, "sampling_interval", None) or self.task.interval)
 
     def _default_interval(self) -> float:
         interval = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
         if interval is None:
             raise ValueError(f"{self.task.id} has no sampling interval: give update the time")
         return float(interval)
+
+    def _check_interval(self, interval: numpy.ndarray, time: Any) -> None:
+        """Raise ValueError for times that are closer than any sensor is read: motion within them is rounding."""
+        least = (
+            LEAST_INTERVAL * self._default_interval() if time is not None and self._has_interval() else 0.0
+        )
+        if (interval < least).any():
+            raise ValueError(
+                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {reprlib.repr(time)} after "
+                f"{_plain(self._running().input['time'])} s"
+            )
+
+    def _check_covariance(self, initial: Any) -> None:
+        """Raise ValueError for an initial covariance that is none."""
+        covariance = getattr(initial, "covariance", None)
+        if covariance is None:
+            return
+        # Where an environment begins with what is known exactly, it may be: the others must be definite.
+        known = numpy.einsum("iin->in", self.input.initial.covariance)[:, :1] == 0.0
+        exact = known & (numpy.einsum("iin->in", covariance) == 0.0) & (covariance == 0.0).all(axis=1)
+        fault = _fault_of(initial.mean, covariance + numpy.eye(len(exact))[:, :, None] * exact)
+        if fault.any():
+            track = int((fault > 0.0).argmax())
+            which = f" of track {track}" if self.tracks > 1 else ""
+            raise ValueError(
+                f"the initial covariance{which} must be symmetric and positive definite, got "
+                f"{reprlib.repr(covariance[..., track].tolist())}"
+            )
 
     def _padded(self, part: Any) -> Any:
         """Repeat the last track up to a multiple of eight: rounding in matrix products must not depend on N."""
@@ -347,10 +412,17 @@ class OnlineFilter:
     def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
         """Let some tracks begin, and the others go on."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
+        numbers = numpy.asarray(tracks)
+        if numbers.dtype.kind not in "iub" or (numbers.dtype.kind == "b") != (
+            numbers.shape == (self.tracks,)
+        ):
+            numbers = numpy.array([-1 - self.tracks])
         try:
-            chosen[numpy.asarray(tracks)] = True
+            chosen[numbers] = True
         except IndexError:
-            raise ValueError(f"tracks are numbers from 0 to {self.tracks - 1}, got {tracks!r}") from None
+            raise ValueError(
+                f"tracks are numbers from 0 to {self.tracks - 1}, got {reprlib.repr(tracks)}"
+            ) from None
         old = self._running()
         return old._replace(
             filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
@@ -367,6 +439,12 @@ def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
         "covariance": model.filter.covariance(episode.filter),
         **{name: records[name] for name in REPORTED if name in records},
     }
+
+
+def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
+    """Numbers of what is wrong with estimates, see :func:`.filters.find_fault`, ``(N,)``."""
+    nothing = numpy.zeros(mean.shape[-1])
+    return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
 
 def _plain(values: numpy.ndarray) -> Any:

@@ -1,6 +1,7 @@
 """Episodes from their seeds to their end, with whatever competes in the loop."""
 
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -268,7 +269,9 @@ def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.
 
 TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
 """Episodes side by side, and measurements of each, of which a time is taken: enough for two digits."""
-TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.2, 3, 20
+RUN_SECONDS = 0.02
+"""How long a run takes, about, where the episodes are long enough."""
+TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
 """For how long, and how often, runs are repeated of which the quickest counts."""
 
 
@@ -305,7 +308,7 @@ def measure_time(
     steering = _steering_of(model, competitor, name) if steers else None
     if can_step(looped, _report_estimate) and (steering is not None or not steers):
         spent = _time_compiled(looped, steering, seeds, decisions)
-        return ProcessorTime(1e9 * spent / (len(seeds) * decisions * task.decision_interval), True)
+        return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
     steps = (
         _steer_by_python(model, competitor, seeds, _report_estimate, name)
         if steers
@@ -322,17 +325,26 @@ def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 def _time_compiled(
     looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
-    """Seconds of the quickest run."""
-    lanes, measurements = start_lanes(looped, seeds), decisions * looped.task.decision_interval
-    identities = identities_of_seeds(seeds)
-    spent: list[float] = []
-    lanes.run(_report_estimate, steering, measurements)  # compiles
-    while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+    """Seconds of a decision of all episodes, in the quickest run."""
+    lanes, identities = start_lanes(looped, seeds), identities_of_seeds(seeds)
+    interval = looped.task.decision_interval
+
+    def run(count: int) -> float:
         lanes.begin(identities)
         began = time.process_time()
-        lanes.run(_report_estimate, steering, measurements)
-        spent.append(time.process_time() - began)
-    return min(spent)
+        lanes.run(_report_estimate, steering, count * interval)
+        return time.process_time() - began
+
+    run(1)  # compiles
+    setting_up = min(run(1) for _ in range(FEWEST_RUNS))  # and a first decision
+    # No step branches, so that every decision takes as long: a dear one need not be repeated to the end.
+    count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
+    if count == 1:
+        return setting_up
+    spent: list[float] = []
+    while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+        spent.append(run(count))
+    return (min(spent) - setting_up) / (count - 1)
 
 
 def _time_steps(steps: Iterator[Any], decisions: int, interval: int) -> float:

@@ -1,10 +1,11 @@
 """What was written as JSON is what is read, or is refused."""
 
-import json
 import reprlib
 import types
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints, is_typeddict
+
+from ..envs.data import foreign_files
 
 Stored = TypeVar("Stored")
 
@@ -14,13 +15,13 @@ def read_json(path: Path) -> Any:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it cannot be read.
+        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.foreign_files`.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return foreign_files.read_json(path)
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from error
 
 

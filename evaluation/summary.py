@@ -44,6 +44,8 @@ class EvaluationRequest(NamedTuple):
     """Episode with which a piece of the work begins."""
     last: int | None = None
     """Episode before which it ends; None: the end."""
+    curves: bool = True
+    """Whether it is reduced to curves, too: who draws no figure needs none, and they take as long as the records."""
 
     @property
     def episodes(self) -> int:
@@ -72,7 +74,8 @@ class Summary(NamedTuple):
     """One competitor of an evaluation."""
 
     contender: Contender
-    curves: CompetitorCurves
+    curves: CompetitorCurves | None
+    """None where none were asked for."""
     head: xarray.Dataset
     """Its part of the evaluation, without what was kept of every episode."""
     episodes: int
@@ -88,11 +91,12 @@ class Part(NamedTuple):
         """Add the episodes that come next."""
         return self._replace(reduction=self.reduction.merge(later.reduction))
 
-    def summary(self, bootstrap: Bootstrap, metrics: OwnMetrics | None) -> Summary:
-        """Return the summary of all episodes."""
-        results = self.reduction.results()
-        contender = contender_of(results, self.head, bootstrap, metrics)
-        return Summary(contender, competitor_curves(results), self.head, bootstrap.episodes)
+    def summary(self, asked: EvaluationRequest) -> Summary:
+        """Return the summary of all episodes of what was asked for."""
+        results, bootstrap = self.reduction.results(), _resampling(asked.episodes)
+        contender = contender_of(results, self.head, bootstrap, asked.metrics)
+        curves = competitor_curves(results) if asked.curves else None
+        return Summary(contender, curves, self.head, asked.episodes)
 
 
 @functools.lru_cache(maxsize=1)
@@ -110,12 +114,13 @@ def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
         yield from record_statistics(run, asked.episodes, asked.metrics)
-        yield from curve_statistics(run, asked.episodes)
+        if asked.curves:
+            yield from curve_statistics(run, asked.episodes)
 
     part = reduce_episodes(asked, declare, tick)
     if asked.end - asked.first < asked.episodes:
         return part
-    return part.summary(_resampling(asked.episodes), asked.metrics)
+    return part.summary(asked)
 
 
 def reduce_episodes(
@@ -222,7 +227,7 @@ def _summarise(
             added[i] = added[i].merge(later) if i in added else later
         if done[i] == asked[i].episodes:
             with one_thread():
-                whole = added.pop(i).summary(_resampling(asked[i].episodes), asked[i].metrics)
+                whole = added.pop(i).summary(asked[i])
             yield i, whole
 
 
@@ -253,23 +258,28 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 
 @one_thread()
-def combine_summaries(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:
+def combine_summaries(
+    found: Sequence[Summary],
+) -> tuple[list[Record], xarray.Dataset | None, xarray.Dataset]:
     """Return what the summaries of all competitors of an evaluation come to.
 
     Returns:
-        Records, as :func:`.metrics.tidy_records` makes them; curves, as :func:`.curves.curves_of`; and the evaluation,
-        of whose variables there is what was kept of the first episodes, over policy, drawn_episode and time.
+        Records, as :func:`.metrics.tidy_records` makes them; curves, as :func:`.curves.curves_of`, or None where not
+        everybody has some; and the evaluation, of whose variables there is what was kept of the first episodes, over
+        policy, drawn_episode and time.
     """
     evaluation = _heads_together(found)
     records = records_of([one.contender for one in found], evaluation, _resampling(found[0].episodes))
-    each = [one.curves for one in found]
-    if len({one.contender.control for one in found if one.curves.actions}) > 1:
+    each = [one.curves for one in found if one.curves is not None]
+    if len(each) < len(found):
+        return records, None, evaluation
+    controls = [one.contender.control for one in found]
+    if len({control for control, own in zip(controls, each, strict=True) if own.actions}) > 1:
         each = [
-            one.curves._replace(actions=[f"{one.contender.control}: {part}" for part in one.curves.actions])
-            for one in found
+            own._replace(actions=[f"{control}: {part}" for part in own.actions])
+            for control, own in zip(controls, each, strict=True)
         ]
-    curves = stack_curves(each, evaluation, found[0].episodes)
-    return records, curves, evaluation
+    return records, stack_curves(each, evaluation, found[0].episodes), evaluation
 
 
 def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:

@@ -21,14 +21,14 @@ METRIC = "nanoseconds"
 """Of the records that hold the time."""
 COMPILED, IN_PYTHON = "compiled", "python"
 """Components of these records."""
-PYTHON_MARK, FRONT_MARK = "py", "front"
+PYTHON_MARK, FRONT_MARK = "py", "*"
 """In tables, of times that are mostly Python's, and of who lies on the front."""
 TIME_TITLE = "ns"
 """Of the column of times."""
 TIME_NOTE = (
-    f"{TIME_TITLE}: processor time of a measurement on one core, of simulated world and competitor together; "
-    f"{PYTHON_MARK}: asked in Python, whose time it mostly is. {FRONT_MARK}: no other ranked competitor "
-    "costs less in as much time or less."
+    f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
+    "An asterisk marks the front, where no other ranked competitor costs less in as much time or less. "
+    f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
 )
 EQUAL_TIMES = 1.1
 """Ratio up to which two times are taken for the same: so much they differ from run to run."""

@@ -4,6 +4,17 @@
 Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
+import sys
+
+if (
+    sys.argv[:1] == ["-m"]  # while Python looks for the module that it was told to run: before its first line
+    and (sys.orig_argv[-len(sys.argv)] == "filtergym" or sys.orig_argv[-len(sys.argv)].endswith("mfiltergym"))
+    and not sys.flags.safe_path
+):
+    del sys.path[
+        0
+    ]  # the working directory, in which Python would look for every library that is still to come
+
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -1,15 +1,11 @@
 """The command line: ``filtergym`` or ``python -m filtergym``."""
 
-import sys
-
-if __name__ == "__main__" and not sys.flags.safe_path:
-    del sys.path[0]  # the working directory, where Python would look for every library that is still to come
-
 import ast
 import functools
 import importlib
 import inspect
 import os
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext

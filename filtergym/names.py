@@ -202,6 +202,7 @@ def evaluation_requests(
     experiment: Experiment,
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
     trust: bool = False,
+    curves: bool = True,
 ) -> list[EvaluationRequest]:
     """Return what :func:`.evaluation.summary.summaries` makes of an experiment, for each competitor.
 
@@ -210,13 +211,17 @@ def evaluation_requests(
         experiment: on it, as :meth:`.baselines.problem.Problem.experiment` makes it.
         competitors: as of :func:`evaluate`.
         trust: likewise.
+        curves: whether figures will be drawn.
 
     Raises:
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
     own, horizon = problem.baselines.metrics, experiment.make_task().horizon
-    return [EvaluationRequest(experiment, name, maker, own, horizon) for name, maker in makers.items()]
+    return [
+        EvaluationRequest(experiment, name, maker, own, horizon, curves=curves)
+        for name, maker in makers.items()
+    ]
 
 
 def make_policy(

@@ -29,6 +29,7 @@ from .agents.named_policies import pretrained_agents
 from .agents.training_run import best_agent, training_scenarios
 from .baselines.problem import Problem, problem_of
 from .envs.contract.failures import own_line
+from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import import_user_module, nearest
 from .envs.engine.scenario_choice import find_mixture
 from .evaluation.competitors import RANKED, check_competitor, kind_of
@@ -158,28 +159,6 @@ class Verification(_Stored, frozen=True):
     format: Literal["filtergym verification 1"] = "filtergym verification 1"
 
 
-SCENARIOS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "filtergym/ManeuveringTarget-v0": (
-            "random", "paper", "atc", "cruise", "descent", "missed-detections", "irregular-scans", "glint", "biased",
-            "clutter",
-        ),
-        "filtergym/UavAutopilot-v0": (
-            "random", "paper-noise", "paper-step", "gust-front", "sensor-degradation", "actuator-lag", "gyro-bias",
-        ),
-        "filtergym/RadarEsmTracking-v0": (
-            "random", "paper", "fixed-type", "crowded", "silent", "class-change", "glint", "correlated-errors",
-        ),
-        "filtergym/LooselyCoupledNavigation-v0": (
-            "random", "paper", "outage", "jamming", "spoof-ramp", "quiet", "outliers", "coloured-receiver",
-        ),
-        "filtergym/TightlyCoupledNavigation-v0": (
-            "random", "paper", "kinematic", "matched", "rates-lost", "two-satellites", "accelerometer-failure",
-            "urban", "satellite-ramp", "satellite-bias", "coloured-ranges",
-        ),
-    }
-)  # fmt: skip
-"""Of the protocol ``board``; another environment's are all that it has."""
 EPISODES: Mapping[str, int] = MappingProxyType({"filtergym/TightlyCoupledNavigation-v0": 100})
 """Of the protocol ``board``, where they are not 500."""
 PROTOCOLS = ("board", "trial")
@@ -191,7 +170,7 @@ def protocol_of(problem: Problem, name: str) -> Protocol:
 
     Args:
         problem: whose scenarios it has.
-        name: ``"board"``, or ``"trial"``: 32 episodes of the training distribution.
+        name: ``"board"``: every scenario, the training distribution first; or ``"trial"``: 32 episodes of that.
 
     Raises:
         ValueError: for another name.
@@ -201,8 +180,7 @@ def protocol_of(problem: Problem, name: str) -> Protocol:
     default = problem.task.default_scenario
     if name == "trial":
         return Protocol(name, 1, (default,), 32, 0)
-    others = (own for own in problem.task.scenarios if own != default)
-    scenarios = SCENARIOS.get(problem.id, (default, *others))
+    scenarios = (default, *(own for own in problem.task.scenarios if own != default))
     return Protocol(name, 1, scenarios, EPISODES.get(problem.id, 500), 0)
 
 
@@ -251,16 +229,12 @@ def write_stored(path: Path, stored: Submission | Verification) -> str:
 
 
 def _read(path: Path) -> bytes:
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}")
     try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    if len(content) > MOST_BYTES:
-        raise ValueError(f"{path} is larger than {MOST_BYTES / 1e6:g} MB, which no submission is")
-    return content
+        return read_content(path, MOST_BYTES)
+    except FileNotFoundError:
+        raise ValueError(f"there is no file {path}") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is no submission: {error}") from error
 
 
 def _decode(path: Path, content: bytes, kind: Any) -> Any:
@@ -498,7 +472,8 @@ def run_protocol(
         experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
         horizon = experiment.make_task().horizon
         requests += [
-            EvaluationRequest(experiment, name, own, known.metrics, horizon) for name, own in makers.items()
+            EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
+            for name, own in makers.items()
         ]
     found = dict(summaries(requests, workers, progress))
     figures: list[Figure] = []

@@ -62,6 +62,7 @@ def product_in_another_order(seed):
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+@pytest.mark.claims
 def test_shipped_agent_scores_what_its_record_says(file, monkeypatch):
     record = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
     check = record["exported"]
@@ -92,6 +93,7 @@ def test_shipped_agent_scores_what_its_record_says(file, monkeypatch):
     [file for file in SHIPPED if file.parent.name in OPTIMAL],
     ids=lambda file: f"{file.parent.name}-{file.stem}",
 )
+@pytest.mark.claims
 def test_shipped_agent_does_not_beat_what_is_optimal(file):
     """An agent that is significantly better than the optimum has found a leak."""
     scenario, optimum, keywords, times = OPTIMAL[file.parent.name]

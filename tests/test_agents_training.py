@@ -440,7 +440,10 @@ def test_recurrent_agent_that_cannot_be_exported():
 
 
 def test_train_resume_export_evaluate(command, tmp_path):
-    train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run", "--no-compare")
+    train = (
+        *("train", ID, "--algo", "bptt", "--control", "gain", "--envs", 2),
+        *("--out", tmp_path / "run", "--no-compare"),
+    )
     assert command(*train, "--steps", 400)[0] == 0
     code, _, errors = command(*train, "--steps", 400)
     assert code == 2
@@ -458,7 +461,10 @@ def test_train_resume_export_evaluate(command, tmp_path):
 
 
 def test_seeds_are_trained_skipped_and_resumed(command, tmp_path):
-    words = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "x", "--no-compare")
+    words = (
+        *("train", ID, "--algo", "bptt", "--control", "gain", "--envs", 2),
+        *("--out", tmp_path / "x", "--no-compare"),
+    )
 
     assert command(*words, "--seeds", "0,2", "--steps", 400)[0] == 0
     assert command(*words, "--seeds", "2", "--steps", 800)[0] == 0

@@ -304,7 +304,7 @@ def test_filters_converge_from_a_wrong_start_at_rest(attitude, rng):
 
 def test_environment(attitude):
     env = gymnasium.make(ID, horizon=120)
-    check_env(env.unwrapped, skip_render_check=True)
+    check_env(env.unwrapped)
     vector = gymnasium.make_vec(ID, num_envs=3, horizon=120)
     shown, _ = vector.reset(seed=4)
     single, _ = env.reset(seed=6)

@@ -14,9 +14,9 @@ from filtergym.evaluation.curves import BAND_RESAMPLES, cost_in_stretches, curve
 from filtergym.evaluation.worst_episodes import describe_worst, main_causes, run_episodes, select_worst
 
 import filtergym
+from filtergym.reports.lines import fill
 from filtergym.reports.reasons import (
     explained_by_default,
-    fill,
     largest_reasons,
     reason_sentences,
     reasons_of,
@@ -237,8 +237,14 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
     assert [one.seed for one in found] == [one.seed for one in worst]
     assert found[0].ratio == pytest.approx(worst[0].cost / worst[0].opponent_cost)
     assert found[0].track.attrs["seed"] == worst[0].seed
-    names = [name for name, _ in worst_figures(found, phrases_of(dataset), 1)]
-    assert names == ["worst_episodes"]
+    [(name, figure)] = worst_figures(found, phrases_of(dataset), 1)
+    assert name == "worst_episodes"
+    track = found[0].track.sel(policy="imm")
+    truth, seen, *estimates = (line.get_xydata().T for line in figure.axes[0].get_lines())
+    np.testing.assert_array_equal(truth, track["truth"].values[:2])
+    np.testing.assert_array_equal(seen, track["seen"].values[:2])
+    # The competitor whose episodes they are is drawn last, on top of the others.
+    np.testing.assert_array_equal(estimates[-1], track["estimate"].values[:2])
 
 
 def test_main_causes_of_an_episode_by_a_loop(dataset):

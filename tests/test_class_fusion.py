@@ -201,6 +201,15 @@ def test_information_per_decision():
     assert pairs == pytest.approx([1.21, 1.47, 0.66, 0.64], abs=0.0055)
 
 
+def test_decisions_follow_the_rows_of_an_asymmetric_confusion():
+    rng = numpy.random.default_rng(2)
+    confusion, composition = rng.dirichlet([1.0] * 4, 4), rng.dirichlet([1.0] * 4, 3)
+    found = class_fusion.decision_probabilities(confusion, composition)
+    for s, decision in numpy.ndindex(3, 4):
+        expected = sum(composition[s, j] * confusion[j, decision] for j in range(4))
+        assert found[s, decision] == pytest.approx(expected, rel=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_fixed_type_posterior_sums_over_the_types(seed):
     rng = numpy.random.default_rng(seed)

@@ -17,6 +17,7 @@ from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
 from filtergym.commands import terminal
+from filtergym.commands.progress import ProgressLines
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
 from filtergym.reports.results import read_results
@@ -115,7 +116,7 @@ def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results
     assert not list(tmp_path.rglob("report.html"))
 
 
-@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 150), ("0", 150), ("wide", 150)])
+@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 100), ("0", 100), ("wide", 100)])
 def test_columns_says_how_wide_what_is_piped_may_be(said, width, monkeypatch):
     monkeypatch.setenv("COLUMNS", said)
     assert terminal.output_width() == width
@@ -165,9 +166,67 @@ def test_progress_bar_says_nothing_where_nobody_looks(capsys):
     assert capsys.readouterr().err == ""
 
 
+class Clock:
+    """Seconds that pass when it is told so."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_progress_where_nobody_looks_is_few_lines_with_the_time_that_is_left():
+    lines, clock = [], Clock()
+    with ProgressLines(lines.append, clock) as shown:
+        task = shown.add_task("tuning imm", total=1000)
+        for second in range(1, 1001):
+            clock.now = float(second)
+            shown.update(task, advance=1)
+    # One for every twentieth of the work.
+    assert len(lines) == 20
+    assert lines[0] == "tuning imm: 5 % done after 50 s, 15 min 50 s left"
+    assert lines[-1] == "tuning imm: 100 % done after 16 min 40 s"
+
+
+def test_progress_where_nobody_looks_comes_no_sooner_than_ten_seconds_and_no_later_than_a_minute():
+    lines, clock = [], Clock()
+    shown = ProgressLines(lines.append, clock)
+    task = shown.add_task("evaluating", total=100)
+    clock.now = 9.0
+    shown.update(task, completed=99)
+    assert lines == []
+    task = shown.add_task("training ppo", total=100_000)
+    for minute in range(1, 4):
+        clock.now += 60.0
+        shown.update(task, completed=minute)
+        shown.update(task, completed=minute)
+    assert len(lines) == 3
+    assert lines[0] == "training ppo: 0 % done after 1 min 0 s, 1666 h 39 min left"
+
+
+def test_what_has_been_finished_is_said_with_the_time_that_is_left():
+    lines, clock = [], Clock()
+    shown = ProgressLines(lines.append, clock)
+    shown.say("log.nc: 250 measurements")
+    task = shown.add_task("benchmark", total=10)
+    clock.now = 8.0
+    shown.update(task, advance=4)
+    shown.say("ManeuveringTarget, random: 41 competitors over 500 episodes")
+    assert lines == [
+        "log.nc: 250 measurements",
+        "ManeuveringTarget, random: 41 competitors over 500 episodes (40 % done after 8 s, 12 s left)",
+    ]
+
+
 def test_list_names_everything(tmp_path):
     result = in_a_process_of_its_own("list", cwd=tmp_path)
     assert result.returncode == 0
+    lines = result.stdout.splitlines()
+    assert [line.split()[0] for line in lines[: len(catalogue())]] == list(catalogue())
+    assert lines[len(catalogue())] == ""
+    result = in_a_process_of_its_own("list", ENV, cwd=tmp_path)
+    assert result.returncode == 0
+    assert max(map(len, result.stdout.splitlines())) <= 100
     for word in (ENV, "evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt"):
         assert word in result.stdout
     # What a reader needs to judge a number: whose algorithm it is, and what a reference is told.

@@ -19,7 +19,7 @@ from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
 from filtergym.evaluation.recording import NoFilter
 from models import make_model
-from rounding import REPETITIONS, assert_same, move_roundings
+from rounding import assert_same, flown_side_by_side
 
 import filtergym
 
@@ -32,14 +32,15 @@ KEYWORDS = {
 }
 
 
-def compared(env_id, count, **keywords):
-    """The same vector environment compiled, on NumPy, and on NumPy with roundings moved, several times."""
-    backends = ("compiled", *["numpy"] * (1 + len(REPETITIONS)))
-    envs = [gym.make_vec(env_id, num_envs=count, backend=b, **keywords) for b in backends]
-    assert [env.unwrapped.backend for env in envs] == list(backends)
-    for env, repetition in zip(envs[2:], REPETITIONS, strict=True):
-        move_roundings(env, repetition)
-    return envs
+def compare(env_id, count, fly, **keywords):
+    """What ``fly`` finds in a vector compiled, on NumPy, and a function that finds it with roundings moved."""
+
+    def make(backend):
+        env = gym.make_vec(env_id, num_envs=count, backend=backend, **keywords)
+        assert env.unwrapped.backend == backend
+        return env
+
+    return flown_side_by_side(fly, lambda: make("compiled"), lambda: make("numpy"))
 
 
 def flown(env, actions, **reset):
@@ -52,13 +53,14 @@ def flown(env, actions, **reset):
 
 def assert_same_episodes(env_id, count, actions, reset=None, **keywords):
     """Compiled episodes are those of NumPy."""
-    runs = []
-    for env in compared(env_id, count, **keywords):
+
+    def fly(env):
         first, *steps = flown(env, sampled(env, actions), **(reset or {}))
-        runs.append([np.stack([first, *steps[::4]]), *(np.stack(steps[i::4]) for i in (1, 2, 3))])
-    names = ("observation", "reward", "terminated", "truncated")
-    for name, found, expected, *others in zip(names, *runs, strict=True):
-        assert_same(found, expected, others, name, time=0, lanes=1)
+        return [np.stack([first, *steps[::4]]), *(np.stack(steps[i::4]) for i in (1, 2, 3))]
+
+    found, expected, moved = compare(env_id, count, fly, **keywords)
+    for i, name in enumerate(("observation", "reward", "terminated", "truncated")):
+        assert_same(found[i], expected[i], lambda i=i: [other[i] for other in moved()], name, time=0, lanes=1)
 
 
 def sampled(env, count):
@@ -90,18 +92,21 @@ def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
 
 
 def test_details_are_those_of_numpy(env_id, control, short):
-    envs = compared(env_id, 7, control=control, detailed_info=True, **short)
-    for env in envs:
+    def fly(env):
         env.reset(seed=2)
-    for action in sampled(envs[0], 3):
-        found, expected, *others = (env.step(action)[4] for env in envs)
+        return [env.step(action)[4] for action in sampled(env, 3)]
+
+    runs = compare(env_id, 7, fly, control=control, detailed_info=True, **short)
+    for step, (found, expected) in enumerate(zip(*runs[:2], strict=True)):
         assert found.keys() == expected.keys()
         for name, values in expected.items():
             assert found[name].dtype == values.dtype, name
+
+            def moved(step=step, name=name):
+                return [other[step][name] for other in runs[2]()]
+
             # Zeros of a covariance are differences of its large numbers.
-            assert_same(
-                found[name], values, [other[name] for other in others], name, lanes=tuple(range(values.ndim))
-            )
+            assert_same(found[name], values, moved, name, lanes=tuple(range(values.ndim)))
 
 
 @pytest.mark.parametrize("count", [1, 7, 64, 1100])

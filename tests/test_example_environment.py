@@ -40,7 +40,7 @@ def test_it_is_short():
 
 def test_environment(example):
     env = gymnasium.make(ID, render_mode="rgb_array", horizon=8)
-    check_env(env.unwrapped, skip_render_check=True)
+    check_env(env.unwrapped)
     vector = gymnasium.make_vec(ID, num_envs=3, horizon=8)
     shown, _ = vector.reset(seed=4)
     single, _ = env.reset(seed=6)

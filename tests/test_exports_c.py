@@ -370,13 +370,6 @@ def test_the_command_writes_a_filter(run, tmp_path):
     }  # fmt: skip
 
 
-def test_the_command_writes_python(run, tmp_path):
-    code, said, errors = run("export", "filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "python")
-    assert code == 0, errors
-    assert "saved in fixed-low.py" in said
-    compile((tmp_path / "fixed-low.py").read_text(), "fixed-low.py", "exec")
-
-
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -385,8 +378,8 @@ def test_the_command_writes_python(run, tmp_path):
         (("filtergym/ManeuveringTarget-v0", "imm"), "add --to c"),
         (("runs", "--float"), "--float is not for --to safetensors of a run: add --to c"),
         (
-            ("filtergym/ManeuveringTarget-v0", "imm", "--to", "python", "--float"),
-            "--float is not for --to python",
+            ("filtergym/ManeuveringTarget-v0", "bptt", "--to", "onnx", "--float"),
+            "--float is not for --to onnx",
         ),
         (
             ("filtergym/ManeuveringTarget-v0", "bptt", "--to", "onnx", "--set", "horizon=9"),

@@ -150,12 +150,14 @@ def opened(name, control, scenario, episodes, **keywords):
 
 
 @pytest.mark.parametrize(("name", "control", "scenario", "keywords"), AS_MODELLED)
+@pytest.mark.claims
 def test_it_stays_shut_where_nothing_is_wrong(name, control, scenario, keywords):
     episodes = 8 if scenario == "matched" else 64
     assert opened(name, control, scenario, episodes, **keywords) < 0.06
 
 
 @pytest.mark.parametrize("name", WRONG)
+@pytest.mark.claims
 def test_alarms_hear_what_is_wrong(name):
     control, scenario, keywords = WRONG[name]
     assert opened(name, control, scenario, 16, **keywords) > 0.6
@@ -209,7 +211,7 @@ def test_a_gated_agent_answers_as_one_of_its_two_filters():
     assert (variance[2][is_other] == variance[1][is_other]).all()
 
 
-@pytest.mark.parametrize("name", ["bptt", "kalman-net"])
+@pytest.mark.parametrize("name", [pytest.param("bptt", marks=pytest.mark.slow), "kalman-net"])
 def test_who_is_shown_one_plot_of_many_is_not_trusted(name):
     """The fallback takes in all plots of a scan, and has no density of the one that the agent's filter takes."""
     fallback = baselines_of(ID).fallback
@@ -227,8 +229,8 @@ def test_who_is_shown_one_plot_of_many_is_not_trusted(name):
     [
         ("ManeuveringTarget", "ppo"),
         ("ManeuveringTarget", "kalman-net"),
-        ("UavAutopilot", "ppo"),
-        ("RadarEsmTracking", "ppo"),
+        pytest.param("UavAutopilot", "ppo", marks=pytest.mark.slow),
+        pytest.param("RadarEsmTracking", "ppo", marks=pytest.mark.slow),
         pytest.param("LooselyCoupledNavigation", "ppo", marks=pytest.mark.slow),
         # Agents that were trained behind a gate, and as a correction: what is around them is compiled, too.
         pytest.param("TightlyCoupledNavigation", "bptt-small", marks=pytest.mark.slow),
@@ -327,6 +329,7 @@ def test_a_gate_that_falls_back_on_something_worse_than_the_paper_is_refused():
         GatedMaker(problem, "adaptive", competitor(ID, "adaptive"), fallback="imm-tuned")
 
 
+@pytest.mark.claims
 def test_every_environment_falls_back_on_something_better_than_the_paper(env_id):
     problem = problem_of(env_id)
     if not problem.baselines.fallback:

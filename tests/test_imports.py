@@ -119,6 +119,19 @@ def test_the_check_sees_every_kind_of_import() -> None:
     assert set(imported_rooms(Path("filtergym/commands/report.py"))) == {"evaluation", "filtergym"}
 
 
+def test_every_module_of_mathematics_is_imported_by_a_test() -> None:
+    modules = {path.stem for path in (ROOT / "filters").glob("*.py")} - {"__init__"}
+    package = "filtergym.filters"
+    tested = set()
+    for file in (ROOT / "tests").glob("test_*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == package:
+                tested |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package}."):
+                tested.add((node.module or "").removeprefix(f"{package}."))
+    assert modules - tested == set(), "each needs a test with a naive oracle"
+
+
 LIBRARIES = {
     *("xarray", "pandas", "scipy", "matplotlib", "PIL", "torch", "stable_baselines3", "plotly", "joblib"),
     *("llvmlite", "safetensors", "msgspec", "typer", "rich"),

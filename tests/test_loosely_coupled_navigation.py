@@ -104,6 +104,7 @@ def fixed_gain_root_mean_square(gain=None):
         ("mode", 2, 0.2253, fixed_gain_root_mean_square()),
     ],
 )
+@pytest.mark.claims
 def test_reference_table(control, action, printed, theory):
     runs = 4000
     model = make("paper", control)
@@ -150,6 +151,7 @@ def attenuated_mean_square(K, drift, coloured, correlation_time, white_intensity
     return constant + colour + (white_intensity + K * K * receiver_intensity) / (2.0 * K)
 
 
+@pytest.mark.claims
 def test_best_constant_gain():
     model = (0.6, 0.4, 1.0, 0.04, 0.02)
     K = loosely_coupled.best_constant_gain(*model)

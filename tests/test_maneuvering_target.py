@@ -264,6 +264,7 @@ def rounding(value, decimals):
 
 
 @pytest.mark.parametrize("name", [*MONTE_CARLO_ROWS, *EXACT_ROWS])
+@pytest.mark.claims
 def test_main_table_within_four_standard_errors(paper, name):
     row = MONTE_CARLO_ROWS.get(name) or EXACT_ROWS[name]
     # The reference has the same standard error at its own number of runs; exact rows have none.
@@ -279,6 +280,7 @@ def test_main_table_within_four_standard_errors(paper, name):
 
 
 @pytest.mark.parametrize("name", PEAKS)
+@pytest.mark.claims
 def test_peak_errors(paper, name):
     reference, scan = PEAKS[name]
     errors = paper.error.sel(policy=name, component="position_x").values
@@ -303,6 +305,7 @@ def exact_mean_squares(alpha):
 
 
 @pytest.mark.parametrize(("name", "alpha"), [("fixed-low", 0.3), ("fixed-high", 0.7)])
+@pytest.mark.claims
 def test_fixed_gains_equal_the_exact_recursion(paper, name, alpha):
     exact = exact_mean_squares(alpha)
     for (window, (first, last)), printed in zip(WINDOWS.items(), EXACT_ROWS[name], strict=True):
@@ -323,6 +326,7 @@ def test_best_fixed_gain_of_the_paper_flight_is_that_of_the_policy():
     assert velocity == pytest.approx(8.56, abs=0.005)
 
 
+@pytest.mark.claims
 def test_known_input_bound_is_the_exact_row(paper):
     squares = paper.mean_square.sel(policy="known-input-bound")
     for (_, (first, last)), expected in zip(WINDOWS.items(), BOUND_ROW, strict=True):
@@ -334,6 +338,7 @@ def test_known_input_bound_is_the_exact_row(paper):
             assert abs(value - reference) < rounding(reference, decimals) + 1e-3 * reference
 
 
+@pytest.mark.claims
 def test_no_estimator_beats_the_bound(paper):
     bound = paper.mean_square.sel(policy="known-input-bound").values.mean(axis=0)
     for name in [*MONTE_CARLO_ROWS, *EXACT_ROWS]:
@@ -342,6 +347,7 @@ def test_no_estimator_beats_the_bound(paper):
         assert (squares.mean(axis=0) > bound - 4 * standard_error - 1e-3 * bound).all(), name
 
 
+@pytest.mark.claims
 def test_mode_probabilities(paper):
     first_mode = paper.mode_probability.sel(policy="imm").values[..., 0]
     np.testing.assert_allclose(first_mode[:, 0], 0.5, rtol=0, atol=1e-12)  # identical filters at scan 1
@@ -353,6 +359,7 @@ def test_mode_probabilities(paper):
     assert 1 + np.flatnonzero((mean > 0.5) & (np.arange(1, 101) > 52))[0] == 66
 
 
+@pytest.mark.claims
 def test_known_turn_reports_an_honest_covariance(paper):
     # Where there is no manoeuvre its model is exact: NEES of four components.
     nees = paper.nees.sel(policy="known-turn", time=40).values

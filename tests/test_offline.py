@@ -100,6 +100,7 @@ def test_actions_are_brought_into_their_space():
     np.testing.assert_array_equal(action, np.array([[1.0, -1.0], [0.1, 0.2]], dtype=np.float32))
 
 
+@pytest.mark.claims
 def test_the_best_tuned_policy_acts_and_cost_least(env_id):
     name = problem_of(env_id).tuned_values.best_policy()
     assert kind_of(competitor(env_id, name)) == "policy"

@@ -338,3 +338,78 @@ def test_what_an_environment_needs_is_said():
     assert np.isfinite(held.mean).all()
     with pytest.raises(ValueError, match="needs command at every measurement"):
         uav.update(reading=np.zeros(sensors), control=0.0)
+
+
+# --- careless callers
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt-small"])
+def test_an_initial_covariance_is_one(name):
+    filter = filtergym.online(RADAR, name)
+    upper = COVARIANCE + np.triu(np.full((4, 4), 50.0), 1)
+    for covariance in (-COVARIANCE, 0.0 * COVARIANCE, upper, np.ones((4, 4))):
+        with pytest.raises(
+            ValueError, match="the initial covariance must be symmetric and positive definite, got"
+        ):
+            filter.start(STATE, covariance)
+    many = filtergym.online(RADAR, name, tracks=2)
+    both = np.stack([COVARIANCE, -COVARIANCE], axis=2)
+    with pytest.raises(ValueError, match="the initial covariance of track 1 must be symmetric"):
+        many.start(np.array([STATE, STATE]).T, both)
+    known = filtergym.online(LOOSE, "plain-reduced")
+    known.start([0.0], [[0.0]])  # which is how an episode begins there
+    with pytest.raises(
+        ValueError, match="the initial covariance must be symmetric and positive definite, got"
+    ):
+        known.start([0.0], [[-1.0]])
+
+
+def test_a_state_goes_back_to_the_filter_that_it_is_of():
+    filter = filtergym.online(RADAR, "imm")
+    filter.start(STATE, COVARIANCE)
+    other = filtergym.online(RADAR, "kalman-imm-turn")
+    for wrong in (5, None, "x", ()):
+        with pytest.raises(ValueError, match="restore takes what save has returned, got"):
+            filter.restore(wrong)
+    with pytest.raises(
+        ValueError, match=r"this state is of .*, imm, 1 track, .* and the filter is .*kalman-imm-turn"
+    ):
+        other.restore(filter.save())
+    with pytest.raises(ValueError, match="2 tracks"):
+        filtergym.online(RADAR, "imm", tracks=2).restore(filter.save())
+    with pytest.raises(TypeError, match="a running filter cannot be copied or pickled: make another"):
+        pickle.dumps(filter)
+    filter.restore(pickle.loads(pickle.dumps(filter.save())))
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt-small"])
+def test_wrong_arguments_get_one_sentence(name):
+    filter = filtergym.online(RADAR, name)
+    filter.start(STATE, COVARIANCE)
+    for value in (10**400, "x", object(), 1j, np.inf, -np.inf, [], {}, [[1.0, 2.0]]):
+        with pytest.raises(ValueError, match=r"x must (be|have)") as error:
+            filter.update(4.0, x=value, y=1e4)
+        assert len(str(error.value)) < 200
+        with pytest.raises(ValueError, match="time must be finite seconds"):
+            filter.update(value, x=1e4, y=1e4)
+        with pytest.raises(ValueError, match=r"mean must (be|have)"):
+            filter.start(value, COVARIANCE)
+        with pytest.raises(ValueError, match=r"tracks are numbers from 0 to 0|cannot start"):
+            filter.start(STATE, COVARIANCE, tracks=value if value is not np.inf else "x")
+    filter.update(4.0, x=1e4, y=2e4)
+    with pytest.raises(
+        ValueError, match=r"measurements of filtergym/ManeuveringTarget-v0 are at least .* s apart"
+    ):
+        filter.update(4.0 + 1e-9, x=1e4, y=2e4)
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt-small"])
+def test_policies_and_agents_say_where_they_are_lost(name):
+    filter = filtergym.online(RADAR, name, tracks=2)
+    filter.start(np.array([STATE, STATE]).T, np.stack([COVARIANCE, COVARIANCE], axis=2))
+    estimate = filter.update(4.0, x=[1e4, 1e4], y=[2e4, 2e4])
+    assert estimate.lost == estimate.departure == ["", ""]
+    if name != "kalman-imm-turn":  # an estimator is checked where it runs
+        broken = {"mean": estimate.mean, "covariance": estimate.covariance * np.array([1.0, -1.0])}
+        lost = filter._estimate(np.zeros(2), broken).lost
+        assert lost == ["", "the covariance is not positive definite"]

@@ -39,6 +39,7 @@ def root(mean_squares):
     return value, mean_squares.std() / math.sqrt(len(mean_squares)) / (2.0 * value)
 
 
+@pytest.mark.claims
 def test_errors_by_class(paper):
     """Published RMSE (M = 20000) and its standard error, windows 0.5-10, 10-30 and 30-60 s."""
     table = {
@@ -60,6 +61,7 @@ def test_errors_by_class(paper):
         assert abs(value - expected) < 4.0 * error
 
 
+@pytest.mark.claims
 def test_recognition_by_class(paper):
     table = (
         (0.747, 0.862, 0.963, 0.996, 0.999),
@@ -82,6 +84,7 @@ def test_recognition_by_class(paper):
             assert (first <= published - 0.5).mean() < share + 4.0 * error
 
 
+@pytest.mark.claims
 def test_calibration(paper):
     """Classes and types drawn as assumed: mean square error over mean reported variance is 1."""
     for i, component in enumerate(("range", "range_rate", "acceleration")):
@@ -91,6 +94,7 @@ def test_calibration(paper):
             assert ratio == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.claims
 def test_one_sensor_alone():
     """Published medians of the first P >= 0.9 by radar and by ESM alone, and mean P(true) by radar."""
     dataset = evaluate(ID, ["radar-only", "esm-only"], "paper", 4000, seed=1)
@@ -114,6 +118,7 @@ def test_one_sensor_alone():
         assert esm[0] <= numpy.median(first) <= esm[1]
 
 
+@pytest.mark.claims
 def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_its_repair():
     dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 1500)
     records = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
@@ -353,6 +358,7 @@ def significance(dataset, name, optimum):
     return difference.mean() / (difference.std() / math.sqrt(len(difference)) + 1e-300)
 
 
+@pytest.mark.claims
 def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
     """Types redrawn, nothing refused: posterior weights minimise the mean square error."""
     names = [name for name in baselines_of(ID).policies if name != "ungated"]
@@ -361,6 +367,7 @@ def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
         assert significance(dataset, name, "quasi-optimal") > -3.0, name
 
 
+@pytest.mark.claims
 def test_refused_decisions_are_all_that_can_be_won_on_paper():
     """The agent is shown them; with one emitter they are as good as any, and nothing beats using them."""
     names = ["ungated", "quasi-optimal", "joint-type", "leaky", "radar-only"]
@@ -369,6 +376,7 @@ def test_refused_decisions_are_all_that_can_be_won_on_paper():
         assert significance(dataset, name, "ungated") > 3.0, name
 
 
+@pytest.mark.claims
 def test_nothing_beats_the_joint_posterior_for_one_type():
     names = [name for name in baselines_of(ID).policies if name != "ungated"]
     dataset = evaluate(ID, names, "fixed-type", 600, **NEVER_REFUSED)
@@ -376,6 +384,7 @@ def test_nothing_beats_the_joint_posterior_for_one_type():
         assert significance(dataset, name, "joint-type") > -3.0, name
 
 
+@pytest.mark.claims
 def test_nothing_beats_the_ideal_filter():
     names = [*baselines_of(ID).policies, "ideal"]
     for scenario in ("paper", "class-change"):

@@ -68,6 +68,7 @@ def monte_carlo():
     return results
 
 
+@pytest.mark.claims
 def test_errors_of_the_paper_policy(monte_carlo):
     """The table of adaptive RMSE (M = 20000), within four standard errors of the difference."""
     table = {
@@ -87,6 +88,7 @@ def test_errors_of_the_paper_policy(monte_carlo):
             assert abs(rmse - expected) < 4.0 * math.hypot(own, published), (s, component, first, rmse)
 
 
+@pytest.mark.claims
 def test_recognition_of_the_paper_policy(monte_carlo):
     table = (
         (0.747, 0.862, 0.963, 0.996, 0.999),
@@ -103,6 +105,7 @@ def test_recognition_of_the_paper_policy(monte_carlo):
         assert abs(numpy.median(first) - (4.0, 5.5, 4.0)[s]) <= 0.5
 
 
+@pytest.mark.claims
 def test_the_paper_filter_is_bayesian(monte_carlo):
     """Uniform classes, redrawn types: mean squared error over mean reported variance is 1 within 3 %."""
     squared = sum(result[0] for result in monte_carlo)
@@ -112,6 +115,7 @@ def test_the_paper_filter_is_bayesian(monte_carlo):
         assert ratio == pytest.approx(numpy.ones(3), abs=0.03)
 
 
+@pytest.mark.claims
 def test_class_probabilities_are_calibrated():
     model = make(horizon=20)
     states = [state for *_, state in roll(model, draw(model, 20000, 5))]
@@ -126,6 +130,7 @@ def test_class_probabilities_are_calibrated():
         assert abs(true[chosen].mean() - P[chosen].mean()) < 4.0 * error
 
 
+@pytest.mark.claims
 def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_repairs_it():
     model = make("fixed-type")
     p = model.task.parameters

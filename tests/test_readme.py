@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 from filtergym.envs.engine.catalogue import catalogue
+from readme import with_printed
+from records import read_record
+
+import filtergym
 
 README = Path(__file__).parent.parent / "README.md"
 INDEX_PAGE = README.parent / "docs" / "package_index.md"
@@ -24,6 +28,47 @@ def test_snippet_runs(snippet, capsys):
     exec(compile(snippet, "README.md", "exec"), {"__name__": "snippet"})
     if "print(" in snippet:
         assert capsys.readouterr().out.strip()
+
+
+def without_times(text):
+    """What is the same on every machine: without the column of times, and however wide it is."""
+    return re.sub(r"[ ─]+", " ", re.sub(r" [\d,]+ (?:\*|py)", "", text))
+
+
+@pytest.mark.slow
+def test_commands_print_what_the_readme_shows():
+    """``python docs/make readme --printed`` puts it there again."""
+    text = README.read_text(encoding="utf-8")
+    assert without_times(with_printed(README)) == without_times(text)
+    # The text says over what, as the table's title does.
+    for words in (
+        "500 episodes, test split, seed 0",
+        "500 of the test split, seed 0",
+        "5,000 unseen flights",
+    ):
+        assert words in text
+
+
+def test_the_headline_names_the_episodes_of_its_record():
+    scenario = read_record("benchmark/ManeuveringTarget").data["scenarios"]["random"]
+    assert f"On {scenario['episodes']:,} unseen flights" in README.read_text(encoding="utf-8")
+
+
+def test_what_a_page_shows_of_its_commands_is_what_they_print(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "In `said.py`:\n\n```python\nraise SystemExit\n```\n\n```sh\nfiltergym --version\n```\n\n"
+        "<!-- printed: begin -->\nold\n<!-- printed: end -->\n"
+    )
+    shown = with_printed(page)
+    assert (
+        f"<!-- printed: begin -->\n\n```text\nfiltergym {filtergym.__version__}\n```\n\n<!-- printed: end -->"
+        in shown
+    )
+    assert "old" not in shown
+    page.write_text(page.read_text().replace("--version", "--nothing"))
+    with pytest.raises(ValueError, match="filtergym --nothing failed"):
+        with_printed(page)
 
 
 def test_links_exist():

@@ -1,6 +1,5 @@
 """Logs of receivers: RTKLIB, NMEA, ULog and bags of ROS 1, from small files of the same form."""
 
-import bz2
 import re
 import struct
 
@@ -8,7 +7,6 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
-from filtergym.envs.data import receiver_logs
 from filtergym.envs.data.flight_tables import read_table
 from filtergym.filters import geodesy
 
@@ -509,17 +507,6 @@ def test_a_bag_with_a_definition_of_its_own_is_refused(tmp_path):
     path.write_bytes(content.replace(digest, b"0" * 32))
     with pytest.raises(ValueError, match=r"its sensor_msgs/msg/NavSatFix is another than that of ROS 1"):
         read_recording(path, TARGET)
-
-
-def test_a_bag_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(receiver_logs, "MOST_CHUNK", 1000)
-    for compression in ("BZ2", "LZ4"):
-        path = bag(tmp_path / f"{compression}.bag", compression=compression)
-        with pytest.raises(ValueError, match=r"a part of it is larger than 0\.001 MB"):
-            read_recording(path, TARGET)
-    with pytest.raises(ValueError, match=r"a part of it is larger than 0\.001 MB"):
-        read_recording(bag2(tmp_path / "packed", "MCAP", compression=True), TARGET)
-    assert len(receiver_logs._bound_unpacking(bz2.decompress)(bz2.compress(b"a" * 999))) == 999
 
 
 def test_only_known_columns_of_a_log_are_given(tmp_path):

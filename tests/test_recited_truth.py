@@ -3,6 +3,7 @@ costs more than the paper's algorithm, in every environment.
 """
 
 import numpy as np
+import pytest
 from filtergym.baselines.catalogue import baselines_of
 
 from filtergym import evaluate
@@ -82,6 +83,7 @@ def reciters(env_id, paper):
     return {f"recited-{i}": each for i, each in enumerate(found)}
 
 
+@pytest.mark.claims
 def test_a_recited_truth_scores_below_zero(env_id):
     paper = baselines_of(env_id).score_paper
     recited = reciters(env_id, paper)

@@ -240,22 +240,40 @@ def test_human_mode_says_what_is_missing(backend):
     if backend == "TkAgg" and not sys.platform.startswith("linux"):
         pytest.skip("only X and Wayland can be taken away by environment variables")
     code = (
-        "import filtergym, gymnasium\n"
-        "try:\n"
-        f"    gymnasium.make({ID!r}, render_mode='human').reset()\n"
-        "except gymnasium.error.Error as error:\n"
-        "    assert 'needs a display' in str(error) and 'rgb_array' in str(error), error\n"
-        "else:\n"
-        "    raise SystemExit('no error')\n"
+        "import filtergym, gymnasium, warnings\n"
+        "with warnings.catch_warnings(record=True) as caught:\n"
+        "    warnings.simplefilter('always')\n"
+        f"    env = gymnasium.make({ID!r}, render_mode='human', horizon=3)\n"
+        "    env.reset(seed=0)\n"
+        "    env.step(env.action_space.sample())\n"
+        "    assert env.render() is None\n"
+        "    env.close()\n"
+        "[text] = [str(w.message) for w in caught if 'human' in str(w.message)]\n"
+        "assert 'needs a display' in text and 'rgb_array' in text, text\n"
     )
     environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
     subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "MPLBACKEND": backend})
 
 
+def test_human_mode_goes_on_where_a_window_cannot_be_opened(monkeypatch):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+
+    def refuse(*_, **__):
+        raise RuntimeError("no display name")
+
+    monkeypatch.setattr(rendering, "_missing_display", lambda: "")
+    monkeypatch.setattr(pyplot, "figure", refuse)
+    env = TaskEnv(ID, render_mode="human", horizon=3)
+    with pytest.warns(UserWarning, match="cannot open a window .no display name.; check DISPLAY"):
+        env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.render() is None
+
+
 def test_human_mode_draws_each_step_into_one_window(monkeypatch):
     pyplot = pytest.importorskip("matplotlib.pyplot")
     pyplot.switch_backend("agg")  # stands in for a window: it has a figure manager, and nothing is shown
-    monkeypatch.setattr(rendering, "_require_window", lambda: None)
+    monkeypatch.setattr(rendering, "_missing_display", lambda: "")
     monkeypatch.setattr(rendering.Figure, "show", lambda figure: None)
     already = set(pyplot.get_fignums())
     env, other = (TaskEnv(ID, render_mode="human", horizon=3) for _ in range(2))

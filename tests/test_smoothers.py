@@ -26,7 +26,8 @@ from filtergym import evaluate, record, tidy_records
 from filtergym.commands.evaluation import find_names
 from filtergym.reports.benchmark import result_of
 from filtergym.reports.html_report import report_html
-from filtergym.reports.ranking import best_of_origins, ranking, ranking_sentence, verdict
+from filtergym.reports.outcome import outcome_sentences
+from filtergym.reports.ranking import best_of_origins, ranking, ranking_sentence, remarks
 from filtergym.reports.results import Settings
 from filtergym.reports.tables import rank_competitors, results_tables
 
@@ -118,6 +119,7 @@ def test_smoothers_are_marked_and_never_ranked():
     ]
 
 
+@pytest.mark.claims
 def test_a_longer_lag_is_better_and_all_later_scans_are_best():
     lags = {f"{lag}": Variant(KalmanIMMSmoother, lag=lag) for lag in (0, 1, 2, 5, None)}
     found = evaluate(TARGET, lags, scenario="random", episodes=40)
@@ -270,7 +272,7 @@ def test_reports_mark_smoothers_and_compare_them_with_nobody():
     dataset = evaluate(TARGET, names, scenario="paper", episodes=20, drawn_episodes=1)
     found = result_of(problem_of(TARGET), dataset, tidy_records(dataset), curves_of(dataset), [])
     assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
-    assert "imm-smoother" not in " ".join(verdict([found]))
+    assert "imm-smoother" not in " ".join([*outcome_sentences([found]), *remarks([found])])
     page = report_html([found], Settings("filtergym benchmark", {}))
     assert "Not causal, with later measurements: <code>imm-smoother</code>." in page
 

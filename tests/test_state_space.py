@@ -347,7 +347,7 @@ class TestExamples:
         cls = task_class(example)
         for control in (*cls.controls, "kalman-net"):
             env = gymnasium.make(example, control=control, horizon=6)
-            check_env(env.unwrapped, skip_render_check=True)
+            check_env(env.unwrapped)
             vector = gymnasium.make_vec(example, num_envs=3, control=control, horizon=6)
             shown, _ = vector.reset(seed=4)
             single, _ = env.reset(seed=6)

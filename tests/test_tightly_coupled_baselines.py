@@ -41,12 +41,14 @@ def matched():
     return evaluate(ID, names, "matched", episodes=16, horizon=150, decision_interval=1)
 
 
+@pytest.mark.claims
 def test_known_mode_is_the_singer_filter_where_all_is_singer(matched):
     one, other = (matched["error"].sel(policy=name).values for name in ("known-mode", "singer"))
     # Both form the same numbers; the bank adds mixing with weights of zero, in another order.
     numpy.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.claims
 def test_nobody_beats_the_optimal_filter_where_it_is_optimal(matched):
     """A policy that is significantly better than the optimum has found a leak."""
     cost = matched["cost"].mean("time")
@@ -55,6 +57,7 @@ def test_nobody_beats_the_optimal_filter_where_it_is_optimal(matched):
         assert difference.mean() > -3 * difference.std() / math.sqrt(len(difference)) - 1e-9, name
 
 
+@pytest.mark.claims
 def test_bound_is_what_the_optimal_filter_reaches(matched):
     squares = (matched["error"].sel(policy="known-mode") ** 2).values[:, 50:]
     mean_square = matched["mean_square"].sel(policy="known-mode-bound").values[:, 50:]
@@ -130,6 +133,7 @@ def on_random():
     return evaluate(ID, names, episodes=32, horizon=400)
 
 
+@pytest.mark.claims
 def test_known_mode_is_no_worse_than_singer_on_any_leg(on_random):
     records = {
         (r.policy, r.component): r.value for r in tidy_records(on_random) if r.metric == "rmse_by_hypothesis"
@@ -140,12 +144,14 @@ def test_known_mode_is_no_worse_than_singer_on_any_leg(on_random):
             assert records["known-mode", name] <= 1.02 * records["singer", name], name
 
 
+@pytest.mark.claims
 def test_known_mode_reports_an_honest_covariance(on_random):
     nees = on_random["nees"].sel(policy="known-mode").values.mean(axis=1) / 17
     # At rest velocity and acceleration are known exactly; the filter keeps a little noise: below one.
     assert 0.5 < nees.mean() < 1.0 + 4 * nees.std() / math.sqrt(len(nees))
 
 
+@pytest.mark.claims
 def test_bound_is_below_the_reference(on_random):
     bound = on_random["mean_square"].sel(policy="known-mode-bound").values.mean(axis=1)
     squares = (on_random["error"].sel(policy="known-mode").values ** 2).mean(axis=1)
@@ -178,6 +184,7 @@ class Recited:
 
 
 @pytest.mark.parametrize("scenario", ["random", "urban"])
+@pytest.mark.claims
 def test_a_recited_truth_scores_below_zero(scenario):
     names = {"recited": Recited, "multi-hypothesis": "multi-hypothesis"}
     cost = evaluate(ID, names, scenario, episodes=48, seed=3)["cost"].mean(["time", "episode"])
@@ -187,6 +194,7 @@ def test_a_recited_truth_scores_below_zero(scenario):
 # --- the bank over faults
 
 
+@pytest.mark.claims
 def test_the_bank_over_faults_is_honest_and_no_better_than_its_reference():
     names = ["stuck-check", "fault-hypotheses", "known-mode"]
     data = evaluate(ID, names, episodes=64, seed=4, split="validation")
@@ -350,6 +358,7 @@ def constant(values):
     return Constant
 
 
+@pytest.mark.claims
 def test_robust_is_between_the_paper_and_hubers_update():
     """Zero is the paper; full strength is Huber's update of ranges and rates; noise is that of the control gain, 0.3
     times as far.
@@ -508,6 +517,7 @@ def test_metrics_follow_from_the_dataset(on_random):
     assert not [r for r in records if r[0] == "known-mode-bound" and r[1] == "cost_median"]
 
 
+@pytest.mark.claims
 def test_loss_of_track_is_found_and_timed():
     dataset = evaluate(
         ID, ["singer", "constant-velocity"], "paper", episodes=12, leg_steps=(150, 1000), horizon=280
@@ -549,6 +559,7 @@ def test_filters_side_by_side_are_the_filters_alone():
     assert 0.75 < known.nis.mean() < 1.14
 
 
+@pytest.mark.claims
 def test_slower_adaptation_without_rates():
     keywords = {"horizon": 300, "leg_steps": (200, 1000)}
     quick, slow = (

@@ -516,6 +516,26 @@ def test_urban_errors_have_the_stated_quantiles():
         assert (held.multipath == s.multipath).all()
 
 
+def test_the_papers_course_rests_goes_along_and_then_flies_across():
+    model = make("paper", heading=(10.0, 80.0))
+    p, rng = model.task.parameters, numpy.random.default_rng(3)
+    truth = model.begin(
+        rng.random((model.task.noise.uniforms, 16)),
+        rng.standard_normal((model.task.noise.initial_normals, 16)),
+    ).truth
+    legs, heading = truth.legs, truth.heading
+    numpy.testing.assert_array_equal(legs.kind, numpy.array([0.0, 1.0, 2.0])[:, None] + numpy.zeros(16))
+    numpy.testing.assert_array_equal(legs.start, numpy.array([0, *p.leg_steps])[:, None] + numpy.zeros(16))
+    assert numpy.ptp(heading) > 0.1
+    for n, angle in enumerate(heading):
+        forward = p.leg_acceleration * numpy.array([math.sin(angle), math.cos(angle), 0.0])
+        # A turn to the right by 90 degrees, seen from above.
+        across = numpy.array([forward[1], -forward[0], 0.0])
+        numpy.testing.assert_allclose(
+            legs.acceleration[..., n], numpy.stack([0.0 * forward, forward, across], axis=1), atol=1e-12
+        )
+
+
 def test_random_course_has_every_leg_and_bounded_strength():
     model = make("random", manoeuvre_throughout=0.0, **UNMIXED)
     rng = numpy.random.default_rng(13)
@@ -569,6 +589,7 @@ def within(values, reference, error, allowance=0.0):
     assert abs(root - reference) < 4.0 * numpy.hypot(own, error) + allowance, (root, own, reference)
 
 
+@pytest.mark.claims
 def test_reference_table_of_the_adaptive_filter():
     """Increment course, 24 runs: RMS errors of three legs, NIS, probabilities and adaptation times."""
     N, model = 24, make_model(TightlyCoupledNavigation.id, "evidence", "paper", backend="auto")
@@ -628,6 +649,7 @@ def test_reference_table_of_the_adaptive_filter():
         ("increment", 1, None),
     ],
 )
+@pytest.mark.claims
 def test_loss_of_track_with_the_aperture(course, hypothesis, band):
     """Median time from the motion of the first step of leg 2 to the first of ten lost rates.
 
@@ -646,6 +668,7 @@ def test_loss_of_track_with_the_aperture(course, hypothesis, band):
         assert band[0] <= numpy.median(lasting.argmax(axis=0) + 1) * 0.01 <= band[1]
 
 
+@pytest.mark.claims
 def test_matched_filter_is_consistent():
     """NEES / 17 and NIS / 14 of the Singer filter on its own model: 0.987 +- 0.018 and 1.001."""
     model, N = make("matched", "mode"), 32

@@ -9,8 +9,8 @@ import pytest
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.environment import TaskVectorEnv
 from filtergym.envs.engine.reward import charge
-from models import make_model
-from rounding import REPETITIONS, assert_same, move_roundings
+from models import make_model, short_episodes
+from rounding import assert_same, flown_side_by_side
 
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
@@ -45,13 +45,24 @@ def on_torch(id, device="cpu", **keywords):
     return gymnasium.make_vec(id, backend="torch", device=device, **{"num_envs": LANES, **keywords})
 
 
-def on_numpy(id, **keywords):
-    """The same environment on NumPy, and several with roundings moved."""
-    keywords = {"num_envs": LANES, **keywords}
-    envs = [gymnasium.make_vec(id, backend="numpy", **keywords) for _ in (None, *REPETITIONS)]
-    for env, repetition in zip(envs[1:], REPETITIONS, strict=True):
-        move_roundings(env, repetition)
-    return envs
+def compare(fly, id, device="cpu", **keywords):
+    """What ``fly`` finds on torch and on NumPy, and a function that finds it there with roundings moved.
+
+    ``fly`` is given an environment and what makes tensors, or leaves arrays as they are.
+    """
+
+    def make_reference():
+        return gymnasium.make_vec(id, backend="numpy", **{"num_envs": LANES, **keywords})
+
+    def tensor(array):
+        return torch.tensor(array, device=device)
+
+    convert = {"torch": tensor, "numpy": lambda array: array}
+    return flown_side_by_side(
+        lambda env: fly(env, convert[env.unwrapped.backend]),
+        lambda: on_torch(id, device, **keywords),
+        make_reference,
+    )
 
 
 def sampled(env):
@@ -60,36 +71,53 @@ def sampled(env):
     return action.astype(float) if action.dtype.kind == "f" else action
 
 
-def assert_close(tensor, arrays, name=""):
-    """A tensor is the first array, as near as the others say; the largest of its kind counts for all."""
-    assert isinstance(tensor, torch.Tensor)
-    reference, *others = arrays
-    assert_same(tensor.detach().cpu().numpy(), reference, others, name, lanes=tuple(range(reference.ndim)))
+def assert_close(runs, name=""):
+    """Tensors are the arrays of the reference; the largest of its kind counts for all."""
+    found, expected, moved = runs
+    assert len(found) == len(expected)
+    for i, (tensor, reference) in enumerate(zip(found, expected, strict=True)):
+        assert isinstance(tensor, torch.Tensor)
+
+        def others(i=i):
+            return [other[i] for other in moved()]
+
+        lanes = tuple(range(numpy.ndim(reference)))
+        assert_same(tensor.detach().cpu().numpy(), reference, others, name, lanes=lanes)
+
+
+def part(runs, name):
+    """Of what was found by name that of one name, as :func:`assert_close` takes it."""
+    found, expected, moved = runs
+    return found[name], expected[name], lambda: [other[name] for other in moved()]
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("id", "control", "scenario"), CELLS)
 def test_torch_equals_numpy(id, control, scenario, device):
-    keywords = {"control": control, "scenario": scenario, "detailed_info": True}
-    env, references = on_torch(id, device, **keywords), on_numpy(id, **keywords)
-    env.action_space.seed(1)
-    observation, _ = env.reset(seed=11)
-    assert observation.dtype == torch.float64
-    assert observation.device.type == device
-    assert_close(observation, [reference.reset(seed=11)[0] for reference in references])
-    for _ in range(DECISIONS):
-        action = sampled(env)
-        observation, reward, terminated, truncated, info = env.step(torch.tensor(action, device=device))
-        expected = [reference.step(action) for reference in references]
-        assert_close(observation, [answer[0] for answer in expected], "observation")
-        assert_close(reward, [answer[1] for answer in expected], "reward")
-        assert reward.shape == (LANES,)
-        for mask, values in ((terminated, expected[0][2]), (truncated, expected[0][3])):
-            assert mask.dtype == torch.bool
-            assert mask.device.type == device
-            assert (mask.cpu().numpy() == values).all()
-        for name in expected[0][4]:
-            assert_close(info[name], [answer[4][name] for answer in expected], name)
+    def fly(env, convert):
+        env.action_space.seed(1)
+        found = {"observation": [env.reset(seed=11)[0]], "reward": [], "masks": []}
+        for _ in range(DECISIONS):
+            observation, reward, *masks, info = env.step(convert(sampled(env)))
+            assert reward.shape == (LANES,)
+            found["observation"].append(observation)
+            found["reward"].append(reward)
+            found["masks"] += masks
+            for name in sorted(info):
+                found.setdefault(name, []).append(info[name])
+        return found
+
+    keywords = {"control": control, "scenario": scenario, **short_episodes(id)}
+    runs = compare(fly, id, device, detailed_info=True, **keywords)
+    found, expected, _ = runs
+    assert found["observation"][0].dtype == torch.float64
+    assert all(shown.device.type == device for shown in found["observation"])
+    for mask, values in zip(found.pop("masks"), expected.pop("masks"), strict=True):
+        assert mask.dtype == torch.bool
+        assert mask.device.type == device
+        assert (mask.cpu().numpy() == values).all()
+    for name in expected:
+        assert_close(part(runs, name), name)
 
 
 @pytest.mark.processors
@@ -97,14 +125,12 @@ def test_torch_equals_numpy(id, control, scenario, device):
     ("id", "reward"), [(id, ("log-likelihood", "relative")[i % 2]) for i, id in enumerate(catalogue())]
 )
 def test_other_rewards_equal_numpy(id, reward):
-    env, references = on_torch(id, reward=reward), on_numpy(id, reward=reward)
-    env.action_space.seed(2)
-    for each in (env, *references):
-        each.reset(seed=5)
-    for _ in range(DECISIONS):
-        action = sampled(env)
-        paid = env.step(torch.tensor(action))[1]
-        assert_close(paid, [reference.step(action)[1] for reference in references])
+    def fly(env, convert):
+        env.action_space.seed(2)
+        env.reset(seed=5)
+        return [env.step(convert(sampled(env)))[1] for _ in range(DECISIONS)]
+
+    assert_close(compare(fly, id, reward=reward, **short_episodes(id)), reward)
 
 
 @pytest.mark.parametrize(
@@ -114,37 +140,36 @@ def test_other_rewards_equal_numpy(id, reward):
 )
 def test_autoreset_equals_numpy(id, mode):
     last = 2
-    keywords = {"autoreset_mode": mode, "max_episode_steps": last, "detailed_info": True}
-    env, references = on_torch(id, **keywords), on_numpy(id, **keywords)
-    env.action_space.seed(3)
-    for each in (env, *references):
-        each.reset(seed=7)
     restarted = numpy.array([True, False, True, False, True])
-    ends = 0
-    for _ in range(3 * last):
-        action = sampled(env)
-        observation, reward, _, truncated, info = env.step(torch.tensor(action))
-        expected = [reference.step(action) for reference in references]
-        details = expected[0][4]
-        assert_close(observation, [answer[0] for answer in expected])
-        assert_close(reward, [answer[1] for answer in expected])
-        assert (truncated.numpy() == expected[0][3]).all()
-        ends += int(truncated.sum())
-        if mode == "SameStep" and truncated.any():
-            finished = info["_final_obs"].numpy()
-            assert (finished == details["_final_obs"]).all()
-            final = [numpy.stack(answer[4]["final_obs"][finished]) for answer in expected]
-            assert_close(info["final_obs"][info["_final_obs"]], final)
-            assert set(info["final_info"]) == set(details["final_info"])
-        if mode == "Disabled" and truncated.any():
-            with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
-                env.step(torch.tensor(action))
-            # In two parts, so that a mask that is a tensor meets lanes that must not be disturbed.
-            for part in (restarted, ~restarted):
-                shown, _ = env.reset(options={"reset_mask": torch.tensor(part)})
-                values = [each.reset(options={"reset_mask": part.copy()})[0] for each in references]
-                assert_close(shown, values)
-    assert ends >= 2 * LANES
+
+    def fly(env, convert):
+        env.action_space.seed(3)
+        shown, ended, details = [env.reset(seed=7)[0]], [], []
+        for _ in range(3 * last):
+            observation, reward, _, truncated, info = env.step(convert(sampled(env)))
+            shown += [observation, reward]
+            ended.append(numpy.asarray(truncated))
+            if mode == "SameStep" and truncated.any():
+                finished = numpy.asarray(info["_final_obs"])
+                details.append((finished.tolist(), set(info["final_info"])))
+                # Arrays of objects, one row for each lane that ended, on NumPy.
+                final = info["final_obs"][info["_final_obs"]]
+                shown.append(final if isinstance(final, torch.Tensor) else numpy.stack(final))
+            if mode == "Disabled" and truncated.any():
+                with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
+                    env.step(convert(sampled(env)))
+                # In two parts, so that a mask that is a tensor meets lanes that must not be disturbed.
+                shown += [
+                    env.reset(options={"reset_mask": convert(lanes)})[0] for lanes in (restarted, ~restarted)
+                ]
+        assert sum(mask.sum() for mask in ended) >= 2 * LANES
+        return {"shown": shown, "ended": ended, "details": details}
+
+    keywords = {"max_episode_steps": last, **short_episodes(id)}
+    runs = compare(fly, id, autoreset_mode=mode, detailed_info=True, **keywords)
+    for name in ("ended", "details"):
+        numpy.testing.assert_equal(runs[0][name], runs[1][name])
+    assert_close(part(runs, "shown"), mode)
 
 
 def test_lanes_that_restart_do_not_disturb_the_others():

@@ -256,6 +256,7 @@ def test_truth_follows_from_the_control_and_noise_covariances_are_those_stated(p
 
 
 @pytest.mark.parametrize(("plant", "feedback", "kw", "output", "control", "cost"), TABLE)
+@pytest.mark.claims
 def test_monte_carlo_of_the_reference_table(
     plant: str, feedback: str, kw: dict[str, Any], output: float, control: float, cost: float
 ) -> None:

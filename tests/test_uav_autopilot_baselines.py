@@ -66,6 +66,7 @@ TABLE = [
 
 
 @pytest.mark.parametrize(("plant", "name", "output", "control", "cost"), TABLE)
+@pytest.mark.claims
 def test_evaluation_meets_the_reference_table_and_its_theory(
     plant: str, name: str, output: float, control: float, cost: float
 ) -> None:
@@ -87,6 +88,7 @@ def test_evaluation_meets_the_reference_table_and_its_theory(
 
 
 @BOTH
+@pytest.mark.claims
 def test_theory_of_the_mistuned_filters_agrees_with_their_episodes(plant: str) -> None:
     found, dataset = records(plant, "paper-noise"), run(plant, "paper-noise")
     for name in ("over-smoothed", "wide-band"):
@@ -159,6 +161,7 @@ def innovations_of_matched(
 
 
 @BOTH
+@pytest.mark.claims
 def test_matched_filter_is_consistent_and_attains_the_bound_where_noise_changes(plant: str) -> None:
     dataset = run(plant, "random")
     matched = dataset.sel(policy="matched")
@@ -265,6 +268,7 @@ def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
 
 
 @BOTH
+@pytest.mark.claims
 def test_a_bound_does_not_depend_on_the_control_and_nobody_beats_it(plant: str) -> None:
     dataset = run(plant, "random")
     bound = dataset["mean_square"].sel(policy="known-noise-bound").mean(["episode", "time"])
@@ -294,6 +298,7 @@ def test_the_bound_told_of_a_slow_actuator_holds_for_the_filter_that_is_not(plan
 
 
 @BOTH
+@pytest.mark.claims
 def test_nobody_beats_the_optimal_filter_in_its_own_scenario(plant: str) -> None:
     """White noise, nominal and known: the loop's cost is least with the Kalman filter (separation)."""
     dataset = run(plant, "paper-noise")
@@ -403,6 +408,7 @@ def step_records(episodes: int) -> dict[str, Record]:
     return {r.metric: r for r in tidy_records(dataset) if r.window in ("transient", "steady")}
 
 
+@pytest.mark.claims
 def test_step_response_of_the_mean_output() -> None:
     found = step_records(6400)
     # The averaged response has noise of 0.003: the response without noise is 0.46 s, 0.54 s, no overshoot.
@@ -567,6 +573,7 @@ def test_an_imm_over_equal_gusts_is_one_filter(plant):
     numpy.testing.assert_allclose(error.sel(policy="imm"), error.sel(policy="one"), rtol=0, atol=1e-10)
 
 
+@pytest.mark.claims
 def test_who_learns_the_noise_flies_better_where_it_changes():
     """Each where its kind of change is meant; intervals of paired differences, 40 episodes."""
     for scenario, names in (
@@ -617,6 +624,7 @@ def test_a_slow_error_in_the_bank_is_the_one_of_the_told_filter() -> None:
     numpy.testing.assert_allclose(error.sel(policy="bank"), error.sel(policy="matched"), rtol=0, atol=1e-9)
 
 
+@pytest.mark.claims
 def test_the_banks_win_where_they_should_and_the_told_filter_stays_the_limit() -> None:
     """Paired differences of 60 episodes, four standard errors; the told filter is below all."""
     better = {"random": ("level-bank", "level-bank-vague"), "gyro-bias": ("level-bank-vague",)}

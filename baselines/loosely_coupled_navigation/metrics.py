@@ -8,7 +8,6 @@ covariance is right: ``k sigma``, sigma the reported deviation in the direction 
 the chi-square distribution of as many degrees as axes. NEES is ``(error / sigma)^2``, so that nothing else is needed.
 """
 
-import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,7 @@ from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.cause_split import VARIABLE, held_causes
 from ...evaluation.dataset import keywords_of
-from ...evaluation.metrics import Measure, sums_of_present
+from ...evaluation.metrics import Measure, chi_square_quantile, sums_of_present
 from ...evaluation.own_metrics import MetricInputs, OwnMetrics
 
 if TYPE_CHECKING:
@@ -50,14 +49,6 @@ UNITS = {
     "lost_tracks": "1",
 }
 """Of the metrics."""
-
-
-@functools.cache
-def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Quantile of the chi-square distribution."""
-    from scipy.stats import chi2
-
-    return float(chi2.ppf(probability, degrees))
 
 
 def recovery_times(
@@ -103,7 +94,7 @@ def alarms(nis: numpy.ndarray, degrees: int) -> numpy.ndarray:
     )
     sums, fixes = (values[:, WINDOW:] - values[:, :-WINDOW] for values in (sums, fixes))
     limits = numpy.array(
-        [math.inf, *(chi_square_quantile(1.0 - FALSE_ALARM, degrees * n) for n in range(1, WINDOW + 1))]
+        [math.inf, *chi_square_quantile(1.0 - FALSE_ALARM, degrees * numpy.arange(1, WINDOW + 1))]
     )
     return numpy.asarray(sums > limits[fixes])
 
@@ -148,7 +139,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
         "lost_tracks": (size > LOST * nominal).any(axis=1)[:, None].astype(float),
     }
     nees = run["nees"].values
-    quantile = chi_square_quantile(1.0 - RISK, p.axes)
+    quantile = float(chi_square_quantile(1.0 - RISK, p.axes))
     usable = nees > 0.0
     deviation = numpy.where(usable, size / numpy.sqrt(numpy.where(usable, nees, 1.0)), math.nan)
     found["protection_level"] = math.sqrt(quantile) * deviation

@@ -117,6 +117,20 @@ UNITS = {
 }
 """Of the parameters of all families."""
 
+DECADES = 12.0
+"""How far limits of sizes that follow a recording lie from those of 1 s and 1 m: of a millisecond and a kilometre."""
+BEYOND = {
+    **dict.fromkeys(
+        (
+            "log10_acceleration", "log10_jerk", "log10_acceleration_quiet", "log10_turn_rate", "log10_least",
+            "log10_turn_rate_change", "log10_turn_rate_start", "log10_error_deviation",
+        ),
+        DECADES,
+    ),
+    "log10_correlation_time": 1.0, "scale": 100.0, "heading_offset": 360.0,
+}  # fmt: skip
+"""How far values may lie beyond limits that follow a recording, see :attr:`.Tunable.beyond`."""
+
 
 def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     """Return what can be fitted to a log of positions, the simplest first.
@@ -177,7 +191,7 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     }
     if recording is None or "odometry_displacement" in recording.measurements:
         families["dead-reckoning"] = _anchored_family(recording, T, r)
-    return {name: dataclasses.replace(family, units=UNITS) for name, family in families.items()}
+    return {name: dataclasses.replace(family, units=UNITS, beyond=BEYOND) for name, family in families.items()}
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:

@@ -9,7 +9,7 @@ import numpy
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import groups_of
-from ...evaluation.metrics import Measure, squared_errors
+from ...evaluation.metrics import Measure, chi_square_quantile, squared_errors
 from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
 
 if TYPE_CHECKING:
@@ -111,9 +111,7 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
 
 def _integrity(run: "xarray.Dataset") -> Arrays:
     """Errors that the covariance does not cover, innovations, and what a test of them finds, of each episode."""
-    from scipy.stats import chi2  # it takes a second to import
-
-    limit = chi2.ppf(1.0 - RISK, run.sizes["component"])
+    limit = chi_square_quantile(1.0 - RISK, run.sizes["component"])
     found: dict[str, numpy.ndarray] = {"misleading": (run["nees"].values > limit).mean(axis=1)}
     if "nis" not in run or numpy.isnan(run["nis"].values).all() or "sensor_fails" not in run:
         return found
@@ -138,13 +136,12 @@ def innovation_alarm(nis: numpy.ndarray, degrees: numpy.ndarray) -> numpy.ndarra
         nis: ``(episodes, time)``.
         degrees: its degrees of freedom, likewise.
     """
-    from scipy.stats import chi2
 
     def summed(values: numpy.ndarray) -> numpy.ndarray:
         sums = numpy.cumsum(numpy.pad(values, ((0, 0), (TESTED, 0))), axis=1)
         return sums[:, TESTED:] - sums[:, :-TESTED]
 
-    alarm: numpy.ndarray = summed(nis) > chi2.ppf(1.0 - RISK, numpy.maximum(summed(degrees), 1.0))
+    alarm: numpy.ndarray = summed(nis) > chi_square_quantile(1.0 - RISK, numpy.maximum(summed(degrees), 1.0))
     return alarm
 
 

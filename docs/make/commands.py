@@ -17,7 +17,7 @@ from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
 from filtergym.evaluation.store import UNFINISHED, Store
 from front import draw_fronts, panels_of
-from readme import with_numbers
+from readme import with_numbers, with_printed
 from records import (
     BENCHMARK,
     FOLDER,
@@ -122,10 +122,13 @@ def readme(
         Path, typer.Option(help="PNG, SVG or PDF file for the fronts of cost and time.")
     ] = Path("docs/images/front.png"),
     columns: Columns = 2,
+    printed: Annotated[
+        bool, typer.Option("--printed", help="Run the page's commands, and put in what they print.")
+    ] = False,
 ) -> None:
     """Put the numbers into README, which nobody renders, and draw its picture, both from the records.
 
-    Example: python docs/make readme
+    Example: python docs/make readme --printed
     """
     check_columns(columns)
     check_formats([picture.suffix.removeprefix(".").lower()])
@@ -135,6 +138,8 @@ def readme(
         raise ValueError("the records hold no times: make them by filtergym benchmark")
     save(draw_fronts(panels, columns=columns), picture)
     write_text(page, text)
+    if printed:
+        write_text(page, with_printed(page))
 
 
 def seeds(

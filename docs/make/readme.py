@@ -1,10 +1,16 @@
 """README's numbers: it is shown as it stands, so what it has of the records is copied into it, and tested.
 
 A number stands between comments that no reader sees, ``<!-- value: PATH -->-43.6 %<!-- end -->``, with ``number`` in
-place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`.
+place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`. What the command before
+``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``.
 """
 
+import os
 import re
+import shlex
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 from sentence_numbers import number_text
@@ -22,3 +28,36 @@ def with_numbers(page: Path) -> str:
     if not NUMBER.search(text):
         raise ValueError(f"{page} holds no number of a record, such as <!-- value: PATH --><!-- end -->")
     return NUMBER.sub(lambda m: m[1] + number_text(m[3], interval=m[2] == "number") + m[4], text)
+
+
+PRINTED = re.compile(
+    r"(```sh\n(filtergym [^\n]+)\n```\n\n<!-- printed: begin -->\n)(.*?)(<!-- printed: end -->)", re.S
+)
+"""A command of one line, and what it prints."""
+MODULE = re.compile(r"In `(\w+\.py)`:\n\n```python\n(.*?)```", re.S)
+"""A file that the page tells to write."""
+WIDTH = 100
+
+
+def with_printed(page: Path) -> str:
+    """Return the text of a page with what its commands print, run beside the files that it tells to write.
+
+    Raises:
+        ValueError: if it has no such command, or one fails.
+    """
+    text = page.read_text(encoding="utf-8")
+    if not PRINTED.search(text):
+        raise ValueError(f"{page} has no command before <!-- printed: begin -->")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, source in MODULE.findall(text):
+            (Path(folder) / name).write_text(source, encoding="utf-8")
+        return PRINTED.sub(lambda m: f"{m[1]}\n```text\n{_output_of(m[2], folder)}```\n\n{m[4]}", text)
+
+
+def _output_of(command: str, folder: str) -> str:
+    words = [sys.executable, "-m", *shlex.split(command)]
+    environment = {**os.environ, "COLUMNS": str(WIDTH)}
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise ValueError(f"{command} failed: {done.stderr}")
+    return "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())

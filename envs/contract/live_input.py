@@ -4,6 +4,7 @@ A :class:`Feed` stands in a task where a recording would; what comes is made int
 :class:`LiveInput`.
 """
 
+import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,6 +14,8 @@ import numpy
 if TYPE_CHECKING:
     from .task import Task
 
+LARGEST = 1e15
+"""Of what a sensor says: nothing in SI units is larger here, and its square is still a number."""
 Memory = dict[str, Any]
 """What an input remembers of the measurements before: arrays ``(..., N)`` by name."""
 
@@ -108,8 +111,12 @@ class LiveInput:
         value: Any = values.get(name)
         try:
             array = numpy.asarray(numpy.nan if value is None else value, dtype=float)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} must be numbers, got {value!r:.80}") from None
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f"{name} must be numbers, got {_shortened(value)}") from None
+        if (numpy.abs(array) > LARGEST).any():
+            raise ValueError(
+                f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {_shortened(value)}"
+            )
         if array.shape == shape:
             array = array[..., None]
         elif value is None:
@@ -202,5 +209,10 @@ class LiveInput:
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
+def _shortened(value: Any) -> str:
+    """Return a value as Python writes it, cut where it is long, also a number of more digits than Python writes."""
+    return reprlib.repr(value if not isinstance(value, int) or abs(value) < 1e300 else float("inf"))
+
+
 def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name}={value!r:.40}" for name, value in values.items()) or "nothing"
+    return ", ".join(f"{name}={_shortened(value)}" for name, value in values.items()) or "nothing"

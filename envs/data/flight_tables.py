@@ -1,20 +1,30 @@
 """Tables of flights and of recordings in files, read by the names of their columns.
 
-Read whole or not at all: more rows than ``MOST_ROWS`` are refused before they fill the memory.
+Read whole or not at all, through the door for files from outside (:mod:`.foreign_files`).
 """
 
 import csv
 import gzip
 import io
-import json
 import math
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import numpy
 
+from .foreign_files import (
+    MOST_NUMBERS,
+    limits,
+    open_foreign,
+    parse_apart,
+    parse_json,
+    quote_shortened,
+    read_content,
+    refuse_memory,
+)
+from .foreign_parsers import MOST_COLUMNS, check_cells, check_column_names, check_rows
 from .receiver_logs import RECEIVER_READERS, receiver_columns
 
 if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
@@ -25,8 +35,9 @@ FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz", *RECEIVER_REA
 """Files that can be read."""
 MOST_ROWS = 1_000_000
 """Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
-MOST_BYTES = 1_000_000_000
-"""Of a file."""
+LONGEST_LINE = 1_000_000
+"""Characters of a row of CSV."""
+EXTRA = "pip install 'filtergym[flights]'"
 
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "time": ("time", "timestamp"),
@@ -79,45 +90,60 @@ class Table(NamedTuple):
     """What is to be told of the reading, a line each."""
 
 
-def _check_rows(rows: int) -> None:
-    if rows > MOST_ROWS:
-        raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
+class ColumnNames(frozenset[str]):
+    """Names of the columns that are read, in lower case, and of those that begin with ``prefix``, if there is one."""
+
+    prefix: str
+
+    def __new__(cls, names: Iterable[str], prefix: str = "") -> "ColumnNames":
+        """Make them of names."""
+        found = super().__new__(cls, names)
+        found.prefix = prefix
+        return found
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or bool(self.prefix and str(name).startswith(self.prefix))
+
+    @property
+    def request(self) -> dict[str, Any]:
+        """As a parser takes them."""
+        return {"names": sorted(self), "prefix": self.prefix}
 
 
-def _check_names(names: list[str]) -> list[str]:
-    """Return names of columns in lower case.
-
-    Raises:
-        ValueError: if they do not tell the columns apart.
-    """
-    lower = [name.lower() for name in names]
-    twice = sorted({name for name in lower if lower.count(name) > 1})
-    if twice:
-        raise ValueError(f"it has the column {', '.join(twice)} more than once")
-    return lower
-
-
-def _csv(file: Path, known: Container[str]) -> Table:
+def _csv(file: Path, known: ColumnNames) -> Table:
     import pandas
 
-    with file.open(encoding="utf-8-sig", newline="") as lines:
-        header = lines.readline()
+    with open_foreign(file) as content, io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as text:
+        lines = _bounded_lines(text)
+        header = next(lines, "")
         delimiter = next((d for d in ",;\t" if d in header), ",")
         names = [name.strip() for row in csv.reader([header], delimiter=delimiter) for name in row]
-        lower = _check_names(names)
+        lower = check_column_names(names)
         wanted = {name: i for i, name in enumerate(lower) if name in known}
         rows = []
         # Not read_csv of pandas, which fills up rows that are too short, and before its version 3.1 rounds numbers.
         for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
             if row and len(row) != len(names):
                 raise ValueError(f"{len(names)} column names but {len(row)} columns in row {number}")
-            _check_rows(number + 1)
+            check_rows(number + 1, MOST_ROWS)
             if row:
                 rows.append([row[i] for i in wanted.values()])
     if delimiter != ",":
         rows = [[*row] for row in zip(*map(_replace_decimal_commas, zip(*rows, strict=True)), strict=True)]
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
     return Table(columns.mask(columns.eq("")), names)
+
+
+def _bounded_lines(text: TextIO) -> Iterator[str]:
+    """Lines of a text.
+
+    Raises:
+        ValueError: for one that no row is as long as.
+    """
+    while line := text.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise ValueError(f"it has a line of more than {LONGEST_LINE:,} characters, and no row is so long")
+        yield line
 
 
 def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
@@ -137,33 +163,109 @@ def open_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
     Raises:
         ValueError: if it is none, or needs a package that is not installed.
     """
+    return decode_netcdf(read_netcdf_variables(file), **decoding)
+
+
+def _is_hdf(file: Path) -> bool:
+    with open_foreign(file) as content:
+        start = content.read(4)
+    if not start:
+        raise ValueError("it is empty")
+    if start != b"\x89HDF" and start[:3] != b"CDF":
+        raise ValueError("it is no NetCDF")
+    return start == b"\x89HDF"
+
+
+def netcdf_attribute_names(file: Path) -> list[str]:
+    """Return the names of the attributes of a NetCDF file.
+
+    Raises:
+        ValueError: if it is none, or needs a package that is not installed.
+    """
+    if _is_hdf(file):
+        found: list[str] = parse_apart("netcdf4_names", file, EXTRA)["names"]
+        return found
+    return [str(name) for name in read_netcdf_variables(file).attrs]
+
+
+def read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
+    """Read a NetCDF file, of the third or the fourth version, as it stands there: what its attributes say of offsets,
+    dates and missing values is not applied yet.
+
+    Args:
+        file: its path.
+        wanted: names of the variables that are read, others are empty; None: all are read.
+
+    Raises:
+        ValueError: if it is none, breaks a limit, or needs a package that is not installed.
+    """
     import xarray
 
-    # From memory: a mapped file stays open where its reading fails.
-    content = file.read_bytes()
-    if not content:
-        raise ValueError("it is empty")
-    engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
-    if engine == "scipy" and not content.startswith(b"CDF"):
-        raise ValueError("it is no NetCDF")
-    if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
-        raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
-    return xarray.open_dataset(io.BytesIO(content), engine=engine, **decoding)
+    if not _is_hdf(file):
+        # From memory: a mapped file stays open where its reading fails.
+        content = io.BytesIO(read_content(file))
+        with xarray.open_dataset(content, engine="scipy", decode_cf=False) as data:
+            numbers = sum(variable.size for variable in data.variables.values())
+            if numbers > MOST_NUMBERS:
+                raise ValueError(
+                    f"it holds {numbers:,} numbers, more than the {MOST_NUMBERS:,} that it may: split it"
+                )
+            return data.load()
+    found = parse_apart(
+        "netcdf4",
+        file,
+        EXTRA,
+        wanted=None if wanted is None else wanted.request,
+        bytes_limit=limits().memory,
+        numbers_limit=MOST_NUMBERS,
+    )
+    variables = {}
+    for name, dimensions, values, attributes in found["variables"]:
+        if isinstance(values, dict):
+            cells = numpy.array(values["words"], dtype=object)
+            values = cells.reshape(values["shape"])
+        if values is None:  # its name is all that is wanted
+            dimensions, values = [], numpy.nan
+        variables[name] = (dimensions, values, _plain_attributes(attributes))
+    return xarray.Dataset(variables, attrs=_plain_attributes(found["attrs"]))
 
 
-def _netcdf(file: Path, known: Container[str]) -> Table:
+def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return attributes by their names, single numbers as such."""
+    return {
+        name: value[()] if isinstance(value, numpy.ndarray) and value.ndim == 0 else value
+        for name, value in pairs
+    }
+
+
+def decode_netcdf(data: "xarray.Dataset", **decoding: Any) -> "xarray.Dataset":
+    """Apply what attributes say of offsets, dates and missing values.
+
+    Args:
+        data: as it stands in a file.
+        **decoding: as of ``xarray.decode_cf``.
+
+    Raises:
+        ValueError: if they make no sense.
+    """
+    import xarray
+
+    return xarray.decode_cf(data, **decoding)
+
+
+def _netcdf(file: Path, known: ColumnNames) -> Table:
     import pandas
 
-    with open_netcdf(file, decode_timedelta=False) as data:
+    with decode_netcdf(read_netcdf_variables(file, known), decode_timedelta=False) as data:
         names = list(map(str, data.variables))
         columns: dict[str, Any] = {}
-        for name, lower in zip(names, _check_names(names), strict=True):
+        for name, lower in zip(names, check_column_names(names), strict=True):
             if lower not in known:
                 continue
-            _check_rows(data[name].size)
+            check_rows(data[name].size, MOST_ROWS)
             unit, meant = str(data[name].attrs.get("units", "")), UNITS.get(_COLUMN_OF_ALIAS.get(lower, ""))
             if unit and meant and unit not in meant:
-                raise ValueError(f"{name} is in {unit!r}, and {meant[0]!r} is expected")
+                raise ValueError(f"{name} is in {quote_shortened(unit)}, and {meant[0]!r} is expected")
             values = data[name].values
             first = next(iter(columns.values()), values)
             if values.ndim != 1 or values.shape != first.shape:
@@ -174,40 +276,59 @@ def _netcdf(file: Path, known: Container[str]) -> Table:
     return Table(pandas.DataFrame(columns), names)
 
 
-def _parquet(file: Path, known: Container[str]) -> Table:
-    try:
-        from pyarrow import parquet
-    except ImportError as error:
-        raise ValueError("Parquet needs one more package: pip install 'filtergym[flights]'") from error
-    with parquet.ParquetFile(file) as data:
-        names = list(data.schema_arrow.names)
-        _check_rows(data.metadata.num_rows)
-        wanted = [name for name, lower in zip(names, _check_names(names), strict=True) if lower in known]
-        # What the file says of pandas could make an index of a column.
-        columns = data.read(columns=wanted).to_pandas(ignore_metadata=True)
-    return Table(columns.rename(columns=str.lower), names)
-
-
-def _json(file: Path, known: Container[str]) -> Table:
+def _parquet(file: Path, known: ColumnNames) -> Table:
     import pandas
 
-    with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as content:
-        text = content.read(MOST_BYTES + 1)
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-    rows = json.loads(text)
+    found = parse_apart(
+        "parquet", file, EXTRA, wanted=known.request, rows_limit=MOST_ROWS, bytes_limit=limits().memory
+    )
+    columns = {name.lower(): _parquet_column(column) for name, column in found["columns"]}
+    return Table(pandas.DataFrame(columns), found["names"])
+
+
+def _parquet_column(column: Mapping[str, Any]) -> Any:
+    """Return numbers, dates or words of a column."""
+    import pandas
+
+    if "codes" in column:
+        words = numpy.array([*column["words"], None], dtype=object)
+        return words[column["codes"]]
+    if "numbers" in column:
+        return column["numbers"]
+    dates = pandas.Series(column["dates"])
+    return dates.dt.tz_localize("UTC").dt.tz_convert(column["zone"]) if column["zone"] else dates
+
+
+def _json(file: Path, known: ColumnNames) -> Table:
+    import pandas
+
+    most = limits().memory // 3  # a text, and what it is made of
+    with open_foreign(file, limits().memory) as content:
+        text = (gzip.GzipFile(fileobj=content) if file.suffix == ".gz" else content).read(most + 1)
+    if len(text) > most:
+        raise refuse_memory(f"its text has more than {most / 1e6:,.0f} MB")
+    rows = parse_json(text)
     # A list of rows, or columns, each with the numbers of its rows.
     parts = list(rows.values()) if isinstance(rows, dict) else rows
     if not isinstance(rows, list | dict) or not rows or not all(isinstance(part, dict) for part in parts):
         raise ValueError("JSON of flights is a list of rows, each with the names of its columns")
-    _check_rows(len(rows) if isinstance(rows, list) else max(map(len, parts)))
-    found = pandas.DataFrame(rows).reset_index(drop=True)
-    names = list(map(str, found.columns))
-    found.columns = pandas.Index(_check_names(names))
-    return Table(found[[name for name in found if name in known]], names)
+    check_rows(len(rows) if isinstance(rows, list) else max(map(len, parts)), MOST_ROWS)
+    seen: dict[str, None] = {}
+    for part in parts if isinstance(rows, list) else [rows]:
+        seen.update(dict.fromkeys(part))
+        if len(seen) > MOST_COLUMNS:
+            break
+    names = [*seen]
+    # Only what is known: a row with names that no other has would be a column of a million empty cells.
+    chosen = {n: lower for n, lower in zip(names, check_column_names(names), strict=True) if lower in known}
+    if isinstance(rows, list):
+        found = pandas.DataFrame({n: [row.get(n, math.nan) for row in rows] for n in chosen})
+    else:
+        found = pandas.DataFrame({n: rows[n] for n in chosen}).reset_index(drop=True)
+    return Table(found.rename(columns=chosen), names)
 
 
-def _receiver(file: Path, known: Container[str]) -> Table:
+def _receiver(file: Path, known: ColumnNames) -> Table:
     columns, notes = receiver_columns(file, suffix_of(file), MOST_ROWS)
     return Table(columns[[name for name in columns if name in known]], list(columns), notes)
 
@@ -222,7 +343,7 @@ def suffix_of(file: Path) -> str:
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
-def read_table(file: Path, known: Container[str] = _COLUMN_OF_ALIAS) -> Table:
+def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> Table:
     """Read the known columns of a file.
 
     Args:
@@ -235,13 +356,21 @@ def read_table(file: Path, known: Container[str] = _COLUMN_OF_ALIAS) -> Table:
     try:
         if not suffix_of(file):
             raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
-        if file.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        return _READERS[suffix_of(file)](file, known)
+        wanted = known if isinstance(known, ColumnNames) else ColumnNames(known)
+        table = _READERS[suffix_of(file)](file, wanted)
+        for name, cells in table.columns.items():
+            if cells.dtype.kind == "O":  # words, whatever pandas keeps them in
+                check_cells(str(name), cells)
+        return table
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         raise ValueError(str(error) or type(error).__name__) from error
+
+
+def list_names(names: Sequence[str], most: int = 20) -> str:
+    """Return names in a row, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
 
 
 def flight_columns(table: Table) -> tuple["pandas.DataFrame", bool]:
@@ -262,7 +391,7 @@ def flight_columns(table: Table) -> tuple["pandas.DataFrame", bool]:
         missing += [name for name in position[bool(geodetic)] if name not in columns]
     if missing:
         raise ValueError(
-            f"it lacks the column {', '.join(missing)}; it has {', '.join(table.names)} and needs time, x, y (m) and "
+            f"it lacks the column {', '.join(missing)}; it has {list_names(table.names)} and needs time, x, y (m) and "
             "optionally vx, vy (m/s), or time, latitude, longitude (degrees)"
         )
     return columns, "groundspeed" in map(str.lower, table.names)
@@ -281,9 +410,19 @@ def numbers(name: str, values: "pandas.Series") -> "pandas.Series":
     cells = values.astype(object).where(values.notna() & values.ne(""), math.nan)
     try:
         return cells.map(float)
-    except (ValueError, TypeError):
-        row = (pandas.to_numeric(cells, errors="coerce").isna() & cells.notna()).idxmax()
-        raise ValueError(f"{name} has {cells[row]!r} in row {row}, which is no number") from None
+    except (ValueError, TypeError, OverflowError):
+        row = next(row for row, cell in cells.items() if not _is_number(cell))
+        raise ValueError(
+            f"{name} has {quote_shortened(cells[row])} in row {row}, which is no number"
+        ) from None
+
+
+def _is_number(cell: Any) -> bool:
+    try:
+        float(cell)
+    except (ValueError, TypeError, OverflowError):
+        return False
+    return True
 
 
 def is_true(values: "pandas.Series") -> "pandas.Series":
@@ -310,7 +449,9 @@ def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
     found = values.map(CLOCK.fullmatch)
     if found.isna().any():
         row = found.isna().idxmax()
-        raise ValueError(f"time has {values[row]!r} in row {row}, which is no time of day such as 12:00:00")
+        raise ValueError(
+            f"time has {quote_shortened(values[row])} in row {row}, which is no time of day such as 12:00:00"
+        )
     time = found.map(lambda parts: 3600.0 * int(parts[1]) + 60.0 * int(parts[2]) + float(parts[3]))
     return time + DAY * (time.diff() < -0.5 * DAY).cumsum()
 
@@ -378,14 +519,14 @@ def _parse_times(values: "pandas.Series") -> tuple["pandas.Series", float]:
         offset = values.str.contains(OFFSET)
         if offset.any() and not offset.all():
             raise ValueError(
-                f"time has {values[offset.idxmin()]!r} in row {offset.idxmin()}, without the offset from UTC that "
-                "other rows have: write it in all of them"
+                f"time has {quote_shortened(values[offset.idxmin()])} in row {offset.idxmin()}, without the offset "
+                "from UTC that other rows have: write it in all of them"
             )
         dates = pandas.to_datetime(values, utc=True, format="ISO8601", errors="coerce")
         if dates.isna().any():
             row = dates.isna().idxmax()
             raise ValueError(
-                f"time has {values[row]!r} in row {row}, which is neither seconds nor a date such as "
+                f"time has {quote_shortened(values[row])} in row {row}, which is neither seconds nor a date such as "
                 "2026-05-01T12:00:00Z"
             )
         values = dates

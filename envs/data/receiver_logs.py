@@ -12,12 +12,8 @@ file is read. A file is data and nothing more: no code, type or path that it hol
 refused before it fills the memory.
 """
 
-import bz2
-import contextlib
 import datetime
-import functools
 import math
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters.geodesy import east_north_up, geodetic
+from .foreign_files import open_foreign, parse_apart
+from .foreign_parsers import NAVSAT, check_rows
 
 if TYPE_CHECKING:
     import pandas
@@ -35,8 +33,6 @@ LONGEST_LINE = 4096
 """Bytes; what goes on is taken for another line."""
 MOST_BROKEN = 0.5
 """Share of lines that may be broken: more is a file of another kind."""
-MOST_CHUNK = 256_000_000
-"""Bytes of a part of a bag when it is unpacked."""
 EXTRA = "pip install 'filtergym[logs]'"
 DAY = 86400.0
 WEEK = 7 * DAY
@@ -55,11 +51,6 @@ def _count_of(count: int, what: str) -> str:
     return f"{count:,} {what}{'s' * (count != 1)}"
 
 
-def _check_rows(count: int, most: int) -> None:
-    if count > most:
-        raise ValueError(f"it has more than {most:,} rows: split it, or keep fewer a second")
-
-
 def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
     """Return the note on lines that were left out.
 
@@ -72,7 +63,7 @@ def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
 
 
 def _read_lines(file: Path) -> Iterator[bytes]:
-    with file.open("rb") as content:
+    with open_foreign(file) as content:
         while line := content.readline(LONGEST_LINE):
             yield line
 
@@ -121,7 +112,7 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
                 raise ValueError
         except ValueError:
             broken += 1
-        _check_rows(len(rows), most_rows)
+        check_rows(len(rows), most_rows)
     notes = _note_broken(broken, len(rows), "are no solutions")
     if not rows:
         raise ValueError("it holds no solution of RTKLIB")
@@ -236,7 +227,7 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
                 good += 1
             except (ValueError, TypeError, AttributeError, pynmea2.ParseError):
                 broken += 1
-        _check_rows(len(epochs), most_rows)
+        check_rows(len(epochs), most_rows)
     epochs = [epoch for epoch in epochs if epoch.positioned]
     if not epochs:
         raise ValueError(f"it holds no sentence GGA or RMC that is whole, and {broken:,} broken ones")
@@ -321,9 +312,6 @@ def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, nump
 
 # --- ULog
 
-TOPICS = ("vehicle_gps_position", "sensor_gps")
-"""With positions of a receiver, the first that a log has."""
-
 
 def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     """Read positions of the receiver from a log of PX4.
@@ -337,19 +325,8 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     Raises:
         ValueError: if it holds none, or more.
     """
-    try:
-        import pyulog
-    except ImportError as error:
-        raise ValueError(f"ULog needs one more package: {EXTRA}") from error
-    # The library prints what it finds strange.
-    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
-        log = pyulog.ULog(str(file), list(TOPICS))
-    held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    chosen = min(held, key=lambda key: (TOPICS.index(key[0]), key[1]), default=None)
-    if chosen is None:
-        raise ValueError(f"it holds neither {' nor '.join(TOPICS)}")
-    data = held[chosen]
-    _check_rows(len(data["timestamp"]), most_rows)
+    log = parse_apart("ulog", file, EXTRA, rows_limit=most_rows)
+    data = log["fields"]
 
     def column(*names: tuple[str, float]) -> Any:
         """Return the first of some fields, in units of so much."""
@@ -361,7 +338,9 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
         "altitude": column(("altitude_ellipsoid_m", 1.0), ("alt_ellipsoid", 1e-3)),
     }
     if places["latitude"] is None or places["longitude"] is None:
-        raise ValueError(f"its {chosen[0]} has no latitude and longitude; it has {', '.join(data)}")
+        raise ValueError(
+            f"its {log['topic']} has no latitude and longitude; it has {', '.join(log['names'][:20])}"
+        )
     # From 2 on a fix has a position in the plane.
     fixed = data["fix_type"] >= 2 if "fix_type" in data else numpy.ones(len(data["timestamp"]), dtype=bool)
     columns = {"time": 1e-6 * data["timestamp"]}
@@ -369,7 +348,7 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     if "eph" in data:
         sigma = data["eph"].astype(float) / math.sqrt(2.0)
         columns |= {"sigma_x": sigma, "sigma_y": sigma}
-    notes = [f"positions are of {chosen[0]}, times seconds since the start of the autopilot"]
+    notes = [f"positions are of {log['topic']}, times seconds since the start of the autopilot"]
     if not fixed.all():
         notes.append(f"{_count_of(int((~fixed).sum()), 'row')} without a fix")
     return ReceiverLog(columns, tuple(notes))
@@ -377,74 +356,7 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
 
 # --- ROS
 
-NAVSAT = "sensor_msgs/msg/NavSatFix"
-ODOMETRY = "nav_msgs/msg/Odometry"
-POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
-"""Messages with positions, the first that a bag without :data:`NAVSAT` has."""
 UNKNOWN_COVARIANCE, NO_FIX = 0, -1
-
-
-class _Bag(NamedTuple):
-    """An open bag, of ROS 1 or 2."""
-
-    reader: Any
-    parse: Callable[[bytes, str], Any]
-    digests: Callable[[str], str] | None
-    """Of a type's definition as the library knows it; None where a bag holds none."""
-
-    def busiest(self, kind: str) -> tuple[str, int]:
-        """Topic that has most messages of a type, and how many; no topic where there are none."""
-        counts: Counter[str] = Counter()
-        for connection in self.reader.connections:
-            if connection.msgtype == kind:
-                counts[connection.topic] += connection.msgcount
-        return next(iter(counts.most_common(1)), ("", 0))
-
-    def rows(
-        self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int
-    ) -> numpy.ndarray:
-        """Numbers of the messages of a topic, a column each: messages take a hundred times as much.
-
-        Raises:
-            ValueError: if there are none or too many, or they are of another definition.
-        """
-        chosen = [c for c in self.reader.connections if c.topic == topic and c.msgtype == kind]
-        _check_rows(sum(connection.msgcount for connection in chosen), most)
-        if self.digests is not None and any(c.digest != self.digests(kind) for c in chosen):
-            raise ValueError(f"its {kind} is another than that of ROS 1")
-        found = []
-        for _, _, raw in self.reader.messages(chosen):
-            found.append(values(self.parse(raw, kind)))
-            _check_rows(len(found), most)
-        if not found:
-            raise ValueError(f"its topic {topic} has no messages")
-        return numpy.array(found).T
-
-
-@contextlib.contextmanager
-def _open_bag(file: Path) -> Iterator[_Bag]:
-    """Open a bag with types as the library knows them: definitions in a bag become code.
-
-    Raises:
-        ValueError: if the library is missing.
-    """
-    try:
-        from rosbags.rosbag1 import Reader as FirstReader
-        from rosbags.rosbag2 import Reader as SecondReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ValueError(f"a bag needs one more package: {EXTRA}") from error
-    if file.suffix == ".bag":
-        types = get_typestore(Stores.ROS1_NOETIC)
-        with FirstReader(file) as bag:
-            for place, chunk in bag.chunks.items():
-                bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
-            yield _Bag(bag, types.deserialize_ros1, lambda kind: types.generate_msgdef(kind)[1])
-        return
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    # The file alone: metadata.yaml of its folder could name files elsewhere.
-    with _bound_chunks(), SecondReader(file) as bag:
-        yield _Bag(bag, types.deserialize_cdr, None)
 
 
 def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
@@ -460,91 +372,15 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
     Raises:
         ValueError: if it holds none, or more.
     """
-    with _open_bag(file) as bag:
-        topic, _ = bag.busiest(NAVSAT)
-        source, _ = bag.busiest(ODOMETRY)
-        if topic:
-            found = _navsat_columns(bag.rows(topic, NAVSAT, _fix_values, most_rows), topic)
-            if source:
-                found = _add_odometry(found, bag.rows(source, ODOMETRY, _pose_values, most_rows), source)
-            return found
-        for kind in POSES:
-            topic, _ = bag.busiest(kind)
-            if topic:
-                return _pose_columns(bag.rows(topic, kind, _pose_values, most_rows), topic)
-        held = sorted({connection.msgtype for connection in bag.reader.connections})
-        raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(held) or 'nothing'}")
-
-
-def _seconds(header: Any) -> float:
-    return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
-
-
-def _fix_values(fix: Any) -> tuple[float, ...]:
-    """Time, status, latitude, longitude, altitude, variances east and north, and what is known of them."""
-    variances = fix.position_covariance.reshape(3, 3).diagonal()
-    place = fix.latitude, fix.longitude, fix.altitude
-    known = fix.position_covariance_type
-    return _seconds(fix.header), fix.status.status, *place, *variances[:2].tolist(), known
-
-
-def _pose_values(message: Any) -> tuple[float, ...]:
-    """Time, x, y, and their variances, zero where they are not told."""
-    pose, variances = message.pose, (0.0, 0.0)
-    if hasattr(pose, "covariance"):
-        diagonal = pose.covariance.reshape(6, 6).diagonal()
-        pose, variances = pose.pose, (float(diagonal[0]), float(diagonal[1]))
-    return _seconds(message.header), pose.position.x, pose.position.y, *variances
-
-
-def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """Return a function that unpacks no more than a chunk of a bag of ROS 1 may have."""
-    packed_by = next((word for word in ("bz2", "lz4") if word in str(decompress.__module__)), "")
-    return lambda packed: _unpack(packed, packed_by)
-
-
-@contextlib.contextmanager
-def _bound_chunks() -> Iterator[None]:
-    """Let the library unpack no more of a chunk of MCAP than that may have."""
-    from rosbags.rosbag2 import storage_mcap
-
-    table: dict[str, Any] = storage_mcap.DECOMPRESSORS
-    before = dict(table)
-    for name in ("lz4", "zstd"):
-        table[name] = functools.partial(lambda name, packed, _: _unpack(packed, name), name)
-    try:
-        yield
-    finally:
-        table.update(before)
-
-
-def _unpack(packed: bytes, packed_by: str) -> bytes:
-    """Unpack a chunk.
-
-    Raises:
-        ValueError: if it is larger than a chunk may be.
-    """
-    if not packed_by:
-        return packed
-    unpacker: Any
-    if packed_by == "lz4":
-        import lz4.frame
-
-        unpacker = lz4.frame.LZ4FrameDecompressor()
-    elif packed_by == "zstd":
-        from rosbags.rosbag2 import storage_mcap
-
-        unpacker = storage_mcap.zstd.ZstdDecompressor()
-    else:
-        unpacker = bz2.BZ2Decompressor()
-    found: bytes = unpacker.decompress(packed, max_length=MOST_CHUNK)
-    if len(found) >= MOST_CHUNK:
-        raise ValueError(f"a part of it is larger than {MOST_CHUNK / 1e6:g} MB")
-    return found
+    bag = parse_apart("bag", file, EXTRA, rows_limit=most_rows)
+    if bag["kind"] != NAVSAT:
+        return _pose_columns(bag["values"], bag["topic"])
+    found = _navsat_columns(bag["values"], bag["topic"])
+    return _add_odometry(found, bag["odometry"], bag["source"]) if "source" in bag else found
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`_fix_values` returns them, ``(8, n)``."""
+    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(8, n)``."""
     time, status, latitude, longitude, altitude, east, north, covariance_type = values
     fixed = status != NO_FIX
     columns = {"time": time, "altitude": altitude}
@@ -562,7 +398,7 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Columns of messages, of which there are ``values`` as :func:`_pose_values` returns them, ``(5, n)``."""
+    """Columns of messages, of which there are ``values`` as :func:`.parse_bag` returns them, ``(5, n)``."""
     time, x, y, *variances = values
     columns = {"time": time, "x": x, "y": y}
     notes = (f"positions are of the topic {topic}, metres in its own frame",)
@@ -573,7 +409,7 @@ def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
 
 
 def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
-    """Add displacements since the row before, of poses ``(5, n)`` as :func:`_pose_values` returns them."""
+    """Add displacements since the row before, of poses ``(5, n)`` as :func:`.parse_bag` returns them."""
     order = numpy.argsort(values[0], kind="stable")
     time, x, y, *_ = values[:, order]
     now = log.columns["time"]

@@ -14,7 +14,7 @@ import numpy
 from ...filters.geodesy import east_north
 from ..contract.log_format import TrackLog
 from ..contract.task import Task
-from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, numbers, read_table, seconds
+from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, ColumnNames, list_names, numbers, read_table, seconds
 from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
 from .recording import Recording, measure_once, side_by_side
 from .truth_files import match_truth, offset_note, read_truth
@@ -252,19 +252,20 @@ def read_columns(
     if log_format is None:
         measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
-    known = _ColumnNames({*TIME, RECORDING, *log_format.columns})
+    known = {*TIME, RECORDING, *log_format.columns}
     if log_format.plane:
         known |= {true + alias for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
-    read, names, notes = read_table(path, known)
+    # All that begin with truth_, because components follow from the parameters.
+    read, names, notes = read_table(path, ColumnNames(known, TRUTH))
     names = [name.lower() for name in names]
     if log_format.plane:
         read, names = _rename_aliases(read, names)
     time_name = next((name for name in TIME if name in read), None)
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
-            f"it has the columns {', '.join(names) or 'none'}, and {cls.id} reads time and "
+            f"it has the columns {list_names(names) or 'none'}, and {cls.id} reads time and "
             f"{', '.join(log_format.columns)}"
         )
     table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
@@ -346,13 +347,6 @@ def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
         return numbers("time", values).to_numpy()
     except ValueError:
         return values.astype(str).to_numpy(dtype=str)
-
-
-class _ColumnNames(set[str]):
-    """Names of columns; and all that begin with ``truth_``, because components follow from the parameters."""
-
-    def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or str(name).startswith(TRUTH)
 
 
 def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:

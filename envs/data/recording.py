@@ -28,9 +28,6 @@ from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario, Task, named_arrays
 from ..contract.world import World
 
-MOST_NUMBERS = 50_000_000
-"""Of a recording: 400 MB; to replay it takes twice as much again."""
-
 
 class Replayed(NamedTuple):
     """Where an episode is in the tables of a recording."""

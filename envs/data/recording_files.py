@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy
 
 from ..contract.task import Task
-from .flight_tables import MOST_BYTES, open_netcdf
-from .recording import MOST_NUMBERS, Recording
+from .flight_tables import netcdf_attribute_names, open_netcdf
+from .foreign_files import MOST_NUMBERS
+from .recording import Recording
 
 if TYPE_CHECKING:
     import xarray
@@ -75,9 +76,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 def is_recording(path: Any) -> bool:
     """Whether this is the path of a NetCDF file that says of which environment it holds measurements."""
     try:
-        return (
-            Path(path).is_file() and Path(path).stat().st_size <= MOST_BYTES and names_environment(Path(path))
-        )
+        return names_environment(Path(path))
     except Exception:  # whatever it is, it is for somebody else to say what is wrong with it
         return False
 
@@ -90,8 +89,7 @@ def names_environment(path: Path) -> bool:
     """
     if path.suffix != ".nc":
         return False
-    with open_netcdf(path, decode_times=False) as data:
-        return "environment" in data.attrs
+    return "environment" in netcdf_attribute_names(path)
 
 
 def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ..contract.log_format import LogFormat
-from .flight_tables import COLUMNS, clock_seconds, numbers, read_table
+from .flight_tables import COLUMNS, clock_seconds, list_names, numbers, read_table
 
 if TYPE_CHECKING:
     import pandas
@@ -72,7 +72,7 @@ def read_truth(
             found[meant[name]] = numbers(name, table[name]).to_numpy()
     if time_name is None or not found:
         raise ValueError(
-            f"it has the columns {', '.join(names) or 'none'}, and needs time and {_wanted(log_format)}"
+            f"it has the columns {list_names(names) or 'none'}, and needs time and {_wanted(log_format)}"
         )
     clock, time = clock_seconds(table[time_name])
     first = numpy.append(True, numpy.diff(time) != 0.0)

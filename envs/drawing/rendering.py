@@ -265,8 +265,7 @@ class EpisodePicture:
         frames_per_second: how fast a window shows them at most.
         picture: what is drawn; default: what is made for the model, or the general one.
 
-    Raises:
-        gymnasium.error.Error: for "human" where no window can be opened.
+    Where "human" finds no window to open, the episode goes on unseen, with a warning of Gymnasium.
     """
 
     def __init__(
@@ -292,8 +291,10 @@ class EpisodePicture:
         self._last_shown = 0.0
         self._artists: set[str] = set()
         """Attributes of the picture that are parts of the figure."""
-        if mode == "human":
-            _require_window()
+        self._unseen = False
+        """Whether there is no window, nor will be: the episode goes on without one."""
+        if mode == "human" and (problem := _missing_display()):
+            self._go_on_unseen(problem)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the figure: a copy draws its own."""
@@ -366,11 +367,17 @@ class EpisodePicture:
         return numpy.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def show(self, state: Any) -> None:
-        """Draw into the window, not faster than ``frames_per_second``."""
+        """Draw into the window, not faster than ``frames_per_second``; where there is none, do nothing."""
+        if self._unseen:
+            return
         from matplotlib import pyplot
 
         opened = self._figure is not None
-        figure = self._draw(state)
+        try:
+            figure = self._draw(state)
+        except _NoWindow as error:
+            self._go_on_unseen(str(error))
+            return
         if not opened:
             figure.show()
         elif not pyplot.fignum_exists(figure.number):
@@ -380,6 +387,10 @@ class EpisodePicture:
         # The event loop is what draws, also when no time is left to wait.
         figure.canvas.start_event_loop(max(due - time.monotonic(), 0.001))
         self._last_shown = time.monotonic()
+
+    def _go_on_unseen(self, problem: str) -> None:
+        gymnasium.logger.warn(f"render_mode 'human' shows nothing: {problem}, or use render_mode='rgb_array'")
+        self._unseen = True
 
     def close(self) -> None:
         """Close the window and forget the figure."""
@@ -522,8 +533,12 @@ def _moving(axes: Axes) -> list[Artist]:
     )
 
 
-def _require_window() -> None:
-    """Say so where matplotlib has no way to open a window."""
+class _NoWindow(Exception):
+    """A window cannot be opened; says why, and what to check."""
+
+
+def _missing_display() -> str:
+    """Say what keeps matplotlib from opening a window, and what to do; empty where nothing is known to."""
     from matplotlib.backends import BackendFilter, backend_registry
 
     try:
@@ -534,12 +549,12 @@ def _require_window() -> None:
     except ImportError as error:
         backend = f"unusable: {error}"
     windowed = [name.lower() for name in backend_registry.list_builtin(BackendFilter.INTERACTIVE)]
-    if backend.lower() not in windowed and "ipympl" not in backend:
-        raise gymnasium.error.Error(
-            "render_mode 'human' needs a display and a matplotlib backend that opens windows, but the "
-            f"backend here is {backend!r}: install PyQt6 or tkinter, check DISPLAY and MPLBACKEND, or use "
-            "render_mode='rgb_array'"
-        )
+    if backend.lower() in windowed or "ipympl" in backend:
+        return ""
+    return (
+        "it needs a display and a matplotlib backend that opens windows, but the "
+        f"backend here is {backend!r}; install PyQt6 or tkinter, check DISPLAY and MPLBACKEND"
+    )
 
 
 def _window(title: str) -> Figure:
@@ -548,9 +563,8 @@ def _window(title: str) -> Figure:
     try:
         figure = pyplot.figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
     except Exception as error:  # every toolkit has exceptions of its own for a missing display
-        raise gymnasium.error.Error(
-            f"render_mode 'human' cannot open a window with the backend {matplotlib.get_backend()!r} "
-            f"({error}): check DISPLAY and MPLBACKEND, or use render_mode='rgb_array'"
+        raise _NoWindow(
+            f"the backend {matplotlib.get_backend()!r} cannot open a window ({error}); check DISPLAY and MPLBACKEND"
         ) from error
     if figure.canvas.manager is not None:
         figure.canvas.manager.set_window_title(title)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy
 
 from ..contract.task import Scenario, Task
-from ..data.flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
+from ..data.flight_tables import FLIGHT_SUFFIXES
 from ..data.flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from ..data.plausibility import check_recording
 from ..data.recorded_tables import TruthFile, read_columns
@@ -170,8 +170,6 @@ def _read_recording(
     """Read one file."""
     if not file.is_file():
         raise ValueError("there is no such file")
-    if file.stat().st_size > MOST_BYTES:
-        raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     if names_environment(file):
         if truth is not None:
             raise ValueError(

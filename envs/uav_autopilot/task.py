@@ -13,8 +13,8 @@ unmanned aircraft using optimal Kalman filter". Numbers in brackets are the pape
 action sets ``g``. The command r shifts the equilibrium: output r, everything else zero, which both plants
 hold without control because they integrate.
 
-Reading: (6) and (10) print no command; it enters the prediction with the control, else a unit command ends
-far from one. Reading: the noise printed in (10) has mean zero and is unknown, so it is dropped.
+Reading: (6) prints the feedback without the command, with which a unit command ends far from one; the prediction
+takes the control in force, ``B U`` of (8) and (10), command included. Reading: the noise printed in (10) has mean zero and is unknown, so it is dropped.
 """
 
 from typing import Any

@@ -36,8 +36,8 @@ from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.benchmark import result_of, without_smoothers_of_closed_loops
-from ..reports.export import latex_table, records_as_csv
-from ..reports.reasons import explained_by_default, fill, reason_sentences
+from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
+from ..reports.reasons import explained_by_default, reason_sentences
 from ..reports.recording_tables import recording_tables
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, WorstTrack, settings_of, write_results
@@ -45,7 +45,7 @@ from ..reports.tables import flights_table, results_tables
 from ..reports.work import work_of
 from ..reports.worst import worst_figures
 from .shown import REPORT, make_report
-from .terminal import command_line, console, pair, progress_bar
+from .terminal import command_line, console, pair, print_sentence, print_table, progress_bar
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
@@ -248,13 +248,15 @@ class Outcome(NamedTuple):
         best = max(known, key=means.__getitem__, default=None)
         return {} if best is None else {name: predictions.difference(name, best) for name in known}
 
-    def tables(self, problem: Problem, flights: list[Any]) -> list[Table]:
-        """Return what is printed, widest first."""
-        tables = [flights_table(self.dataset, flights, self.records, console.width)] if flights else []
+    def tables(
+        self, problem: Problem, flights: list[Any], differences: Mapping[str, Estimate], width: int
+    ) -> list[Table]:
+        """Return what is printed in so many columns, widest first."""
+        tables = [flights_table(self.dataset, flights, self.records, width)] if flights else []
         if self.has_truth:
-            tables += results_tables(self.records, problem.knows, console.width)
+            tables += results_tables(self.records, problem.knows, width)
         if self.dataset.attrs["recorded"]:
-            tables += recording_tables(self.records, self.differences(problem), self.has_truth, console.width)
+            tables += recording_tables(self.records, differences, self.has_truth, width)
         return tables
 
 
@@ -298,7 +300,7 @@ def run(
                 dataset = dataset.drop_vars(tracks)
             curves = None if outputs.folder is None else curves_of(dataset)
             return Outcome(dataset, records, curves, refusal, store, _episode_costs(dataset))
-        requests = evaluation_requests(problem, experiment, names, trust)
+        requests = evaluation_requests(problem, experiment, names, trust, curves=outputs.folder is not None)
         work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))
     records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
@@ -341,7 +343,11 @@ def write(
         worst: their worst episodes.
     """
     flights = outcome.flights
-    tables, records = outcome.tables(problem, flights), [*outcome.records, *flights]
+    differences = outcome.differences(problem) if outcome.dataset.attrs["recorded"] else {}
+    printed, in_file = (
+        outcome.tables(problem, flights, differences, width) for width in (console.width, LATEX_WIDTH)
+    )
+    records = [*outcome.records, *flights]
     if outputs.estimates is not None:
         write_estimates(outputs.estimates, outcome.dataset)
     if outputs.records is not None:
@@ -365,7 +371,7 @@ def write(
         with whole_files(outputs.folder) as place:
             write_records(place / "records.json", records)
             records_as_csv(place / "records.csv", records)
-            write_text(place / "table.tex", "\n".join(map(latex_table, tables)))
+            write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
             for name, figure in evaluation_figures(outcome.curves, outputs.columns, learned=learned):
@@ -377,14 +383,15 @@ def write(
             if results:
                 write_results(place / RESULTS, results, settings)
         outcome.store.clear()
-    for table in tables:
-        console.print(table)
+    for table in printed:
+        print_table(table)
     phrases = phrases_of(outcome.dataset)
+    console.print()
     for name in explained:
         for sentence in reason_sentences(outcome.records, phrases, name):
-            console.print(fill(sentence, console.width), highlight=False)
+            print_sentence(sentence)
     for note in notes_of(outcome.dataset):
-        console.print(note, highlight=False, soft_wrap=True)
+        print_sentence(note)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
         console.print(f"{what} in {outputs.folder}")
@@ -401,7 +408,7 @@ def say_departures(
 ) -> None:
     """Say what :func:`departure_lines` says."""
     for line in departure_lines(problem, data, learned, keywords, trust):
-        console.print(line, highlight=False, soft_wrap=True)
+        print_sentence(line)
 
 
 def departure_lines(

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..agents.export import export_run
-from ..baselines.problem import Problem, problem_of
+from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import check_names, nearest
 from ..envs.engine.scenario_choice import read_recording
-from ..evaluation.files import whole_file, writable_file, writable_folder
+from ..evaluation.files import writable_file, writable_folder
 from .terminal import (
     Parameters,
     ScenarioName,
@@ -27,7 +27,7 @@ from .terminal import (
 if TYPE_CHECKING:
     from ..exports.request import ExportRequest
 
-FORMS = ("safetensors", "c", "python", "onnx", "hub")
+FORMS = ("safetensors", "c", "onnx")
 """What can be written."""
 
 
@@ -52,8 +52,8 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; python, a filter as one "
-            "file that needs NumPy only; onnx, the network of an agent; hub, a folder with an agent and its card.",
+            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; onnx, the "
+            "network of an agent.",
             autocompletion=one_of(*FORMS),
         ),
     ] = "safetensors",
@@ -82,30 +82,23 @@ def export(
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
-    """Write a filter as C99 or as one file of Python, an agent's network as ONNX, or a run's agent as plain arrays.
+    """Write a filter as C99, an agent's network as ONNX, or a run's agent as plain arrays.
 
     Arrays evaluate without torch and cannot execute anything. Nothing is executed either: training has left them beside
     the model. A folder with the model only takes --trust.
 
-    C needs nothing but math.h, Python nothing but NumPy. What is written was run beside the filter itself, measurement
-    by measurement, over episodes of the scenario, or over a log.
+    C needs nothing but math.h. What is written was run beside the filter itself, measurement by measurement, over
+    episodes of the scenario, or over a log.
 
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
 
     Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to c --out imm
-
-    Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to python --out imm.py
     """
     if to not in FORMS:
         raise nearest("form of an export", to, FORMS)
     options: dict[str, Any] = {"a filter's name": name, "--float": single, "--scenario": scenario}
     options |= {"--recording": recording, "--set": settings}
-    allowed = {
-        "safetensors": (),
-        "onnx": ("a filter's name",),
-        "hub": ("a filter's name",),
-        "python": tuple(o for o in options if o != "--float"),
-    }
+    allowed = {"safetensors": (), "onnx": ("a filter's name",)}
     for option, given in options.items():
         if given and option not in allowed.get(to, options):
             raise ValueError(
@@ -117,9 +110,6 @@ def export(
     if name is None:
         raise ValueError(f"name the filter: filtergym export {environment} NAME --to {to}")
     problem = problem_of(environment)
-    if to == "hub":
-        _export_hub(problem, name, out)
-        return
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
     data: Any = scenario
@@ -133,18 +123,10 @@ def export(
     if to == "c":
         _export_c(request, out, "float" if single else "double")
         return
-    ending = ".py" if to == "python" else ".onnx"
-    path = writable_file(out or Path(request.name.replace(":", "_") + ending))
-    if to == "onnx":
-        from ..exports.onnx_network import export_onnx
+    from ..exports.onnx_network import export_onnx
 
-        export_onnx(request, path)
-    else:
-        from ..exports.python_source import export_python
-
-        text = export_python(request)
-        with whole_file(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+    path = writable_file(out or Path(request.name.replace(":", "_") + ".onnx"))
+    export_onnx(request, path)
     console.print(f"saved in {path}", soft_wrap=True)
 
 
@@ -172,19 +154,3 @@ def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
     run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
 
-
-def _export_hub(problem: Problem, name: str, out: Path | None) -> None:
-    """Write a folder that a model hub takes: a shipped agent, or a file of one, with its card."""
-    from ..agents.hub_folder import write_hub_folder
-    from ..agents.learned_policy import pretrained_path
-    from ..agents.named_policies import pretrained_agents
-
-    file = Path(name)
-    if file.suffix != ".safetensors":
-        shipped = pretrained_agents(problem.id)
-        if name not in shipped:
-            raise nearest("agent, or file .safetensors of one", name, shipped)
-        file = pretrained_path(problem.id, name)
-    folder = writable_folder(out or Path(file.stem))
-    write_hub_folder(problem, file, folder)
-    console.print(f"saved in {folder}: README.md, config.json, model.safetensors", soft_wrap=True)

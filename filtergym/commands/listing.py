@@ -6,26 +6,35 @@ import typer
 
 from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import catalogue
-from ..reports.listing import environment_lines
-from .terminal import complete_environment, console, import_environments
+from ..reports.listing import environment_lines, list_lines
+from .terminal import complete_environment, console, import_environments, print_sentence
 
 
 def list_environments(
     environment: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Environment ids, default all; module:id for one that a module registers.",
+            help="Environment ids, to be told all of each; module:id for one that a module registers.",
             autocompletion=complete_environment,
             callback=import_environments,
         ),
     ] = None,
 ) -> None:
-    """List environments with their papers, controls, scenarios, policies, references and bounds.
+    """List environments, a line each; or say of one its paper, controls, parameters, scenarios and competitors.
 
     Example: filtergym list filtergym/ManeuveringTarget-v0
     """
-    for id in environment or catalogue():
-        first, *lines = environment_lines(problem_of(id))
+    if not environment:
+        # Where the output is a file, a line is one line.
+        for line in list_lines(catalogue(), console.width if console.is_terminal else None):
+            console.print(line, highlight=False, soft_wrap=True)
+        console.print()
+        print_sentence(
+            "filtergym list ID says who competes in an environment, in which scenarios and parameters."
+        )
+        return
+    for id in environment:
+        first, *lines = environment_lines(problem_of(id), console.width)
         console.print(first, style="bold")
         for line in lines:
             console.print(line, highlight=False, soft_wrap=True)

@@ -19,7 +19,7 @@ from ..evaluation.rollout import Progress
 from ..names import find_competitor, is_learned
 from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
-from ..reports.export import latex_table, records_as_csv
+from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
@@ -35,7 +35,7 @@ from .evaluation import (
     say_departures,
     write,
 )
-from .shown import REPORT, make_report, print_results, print_verdict
+from .shown import REPORT, make_report, print_headline, print_outcome, print_results
 from .terminal import (
     Backend,
     Cluster,
@@ -321,7 +321,12 @@ def benchmark(
             line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
-        def print_details(result: Result) -> None:
+        def tell_result(result: Result) -> None:
+            first = result.records[0]
+            names = {record.policy for record in result.records}
+            bar.say(
+                f"{result.short}, {result.scenario}: {len(names)} competitors over {first.episodes:,} episodes"
+            )
             if details:
                 print_results(result.records, result.knows)
 
@@ -331,15 +336,20 @@ def benchmark(
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
-        results = run_benchmark(out, options, Callbacks(add_line, print_details, save_figures), workers)
+        results = run_benchmark(out, options, Callbacks(add_line, tell_result, save_figures), workers)
     tables = [headline_table(results)]
-    tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
+    tables += [table for r in results for table in results_tables(r.records, r.knows, LATEX_WIDTH)]
     with whole_files(out) as waiting:
         records_as_csv(waiting / "records.csv", all_records(results))
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
-    print_verdict(results)
-    console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
+    print_outcome(results)
+    console.print()
     make_report(results, settings_of(options.command), out / REPORT)
+    console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
+    console.print(
+        "what the environments are, and who competes in them: filtergym list, docs/environments.md\n"
+    )
+    print_headline(results)
 
 
 def animate(

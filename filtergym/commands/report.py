@@ -10,7 +10,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_formats
 from ..papers import paper_module, papers
 from ..reports.results import read_all_results
-from .shown import REPORT, make_report, print_verdict, report_maker
+from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
 from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
 
 
@@ -30,8 +30,11 @@ def make(
     report_maker()  # what it lacks is said before anything else
     writable_file(out)
     found, settings = read_all_results(results)
-    print_verdict(found)
+    print_outcome(found)
+    console.print()
     make_report(found, settings, out)
+    console.print()
+    print_headline(found)
 
 
 def reproduce(

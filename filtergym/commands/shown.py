@@ -6,10 +6,11 @@ from pathlib import Path
 from ..evaluation.files import write_text
 from ..evaluation.metrics import Record
 from ..reports.headline import headline_table
-from ..reports.ranking import verdict
+from ..reports.outcome import outcome_sentences, protocol_sentences
+from ..reports.ranking import remarks
 from ..reports.results import Result, Settings
 from ..reports.tables import results_tables
-from .terminal import console
+from .terminal import console, print_sentence, print_table
 
 REPORT = "report.html"
 
@@ -22,15 +23,24 @@ def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
         knows: what references and bounds know, by their names.
     """
     for table in results_tables(records, knows, console.width):
-        console.print(table)
+        print_table(table)
 
 
-def print_verdict(results: Sequence[Result]) -> None:
-    """Print what results come to: one screen."""
-    console.print(headline_table(results), width=min(console.width, 80))
+def print_outcome(results: Sequence[Result]) -> None:
+    """Print a sentence for each environment, and what they rest on."""
+    for sentence in outcome_sentences(results):
+        print_sentence(sentence.replace("`", ""))
     console.print()
-    for sentence in verdict(results):
-        console.print(sentence.replace("`", ""), width=min(console.width, 80), highlight=False)
+    for sentence in protocol_sentences(results):
+        print_sentence(sentence)
+
+
+def print_headline(results: Sequence[Result]) -> None:
+    """Print the best of every origin as a table, and remarks on it."""
+    print_table(headline_table(results))
+    console.print()
+    for sentence in remarks(results):
+        print_sentence(sentence.replace("`", ""))
 
 
 def report_maker() -> Callable[[Sequence[Result], Settings], str]:

@@ -12,7 +12,10 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ..reports.lines import fill
+from .progress import progress_bar as progress_bar
 
 # --- what a shell completes; imports wait until it asks
 
@@ -171,6 +174,10 @@ Split = Annotated[
 ]
 
 
+PAGE_WIDTH = 100
+"""Columns of what is printed into a file, and of sentences in a wide terminal."""
+
+
 class Output(Console):
     """Standard output that never stops the work: where it takes no more, the rest is not printed."""
 
@@ -199,12 +206,31 @@ def output_width() -> int | None:
     """Width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
     said = os.environ.get("COLUMNS", "")
     terminal = sys.stdout is not None and sys.stdout.isatty()
-    # Where the output is a file, wide enough for the table of results.
-    return None if terminal or (said.isdigit() and int(said) > 0) else 150
+    return None if terminal or (said.isdigit() and int(said) > 0) else PAGE_WIDTH
 
 
 # No markup: names and paths are printed as they are.
 console = Output(width=output_width(), markup=False, emoji=False)
+
+
+def print_sentence(sentence: str, width: int = PAGE_WIDTH) -> None:
+    """Print a sentence in lines of at most so many columns, no number apart from its unit."""
+    console.print(fill(sentence, min(console.width, width)), highlight=False, soft_wrap=True)
+
+
+def print_table(table: Table, width: int = PAGE_WIDTH) -> None:
+    """Print a table, its title above and its notes below as sentences, however narrow it is."""
+    title, notes = table.title, table.caption
+    table.title = table.caption = None
+    if title:
+        console.print(
+            fill(str(title), min(console.width, width)), style="bold", highlight=False, soft_wrap=True
+        )
+    console.print(table)
+    console.print()
+    for note in str(notes or "").splitlines():
+        print_sentence(note, width)
+    table.title, table.caption = title, notes
 
 
 def open_output() -> None:
@@ -223,22 +249,6 @@ def close_output(*_: Any, **__: Any) -> None:
         raise ValueError(
             f"cannot write to standard output: {console.refusal.strerror or console.refusal}"
         ) from console.refusal
-
-
-def progress_bar() -> Progress:
-    """Return a progress bar on standard error, so that tables can be piped; none where nobody looks."""
-    errors = Console(stderr=True)
-    errors.quiet = not errors.is_terminal  # rich before 14.3 ends a disabled bar with an empty line
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=errors,
-        transient=True,
-        disable=errors.quiet,
-    )
 
 
 def pair(option: str, text: str) -> tuple[float, float]:

@@ -271,6 +271,7 @@ class _Results:
         found[name] = summary
         if len(found) == len(cell.policies):
             records, curves, head = combine_summaries([found.pop(name) for name in cell.policies])
+            assert curves is not None  # they were asked for
             self.callbacks.drawn(cell, curves)
             learned = pretrained_agents(cell.environment)
             self._results[i] = result_of(cell.problem, head, records, curves, learned)

@@ -56,6 +56,10 @@ MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
 """A hyphen before a number."""
 
 
+LATEX_WIDTH = 160
+"""Columns of a terminal whose tables are written for LaTeX: all of them beside each other, with all intervals."""
+
+
 def records_as_csv(path: Path, records: Sequence[Any]) -> None:
     """Write records as a table of comma-separated values, a line each, all fields; empty where one is None.
 

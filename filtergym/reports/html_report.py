@@ -12,9 +12,11 @@ from ..evaluation.times import (
     points_of_records,
     times_of_records,
 )
+from .front_picture import front_images
 from .headline import headline
 from .html_page import pack, render_page
-from .ranking import origin, ranking_sentence, verdict
+from .outcome import outcome_sentences, protocol_sentences
+from .ranking import origin, ranking_sentence, remarks
 from .results import Result, Settings, serialise_datasets
 from .tables import (
     against_paper,
@@ -66,7 +68,10 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
     return render_page(
         "report.html.jinja",
         "report.js",
-        verdict=verdict(results),
+        outcome=outcome_sentences(results),
+        protocol=protocol_sentences(results),
+        fronts=front_images(results),
+        remarks=remarks(results),
         headline=headline(results),
         environments=environments,
         settings=settings,

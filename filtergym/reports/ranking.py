@@ -13,13 +13,6 @@ NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
 HARM = 0.02
 """Relative difference to the paper's algorithm beyond which, with its whole interval, a competitor does harm."""
-OUTCOMES = {
-    "learned best": "A learned agent costs significantly least",
-    "classical best": "A classical competitor costs significantly least",
-    "no significant difference": "Learned and classical competitors do not differ significantly",
-    "learned only": "Only learned agents take part",
-    "classical only": "No learned agent takes part",
-}
 
 
 class Place(NamedTuple):
@@ -132,8 +125,8 @@ def best_of_origins(result: Result) -> list[tuple[str, str]]:
     return list(best.items())
 
 
-def verdict(results: Sequence[Result]) -> list[str]:
-    """Say in sentences what results come to: who is best on the training distributions, who harms, who is honest.
+def remarks(results: Sequence[Result]) -> list[str]:
+    """Say which learned agents do harm, and whether the winners' covariances are honest.
 
     Args:
         results: of one or several environments.
@@ -141,23 +134,14 @@ def verdict(results: Sequence[Result]) -> list[str]:
     sentences = []
     usual = [result for result in results if result.default] or list(results)
     judged = [result for result in usual if ranking(result.records, result.learned)]
-    won: dict[str, list[str]] = {}
-    for result in judged:
-        first = ranking(result.records, result.learned)[0]
-        outcome = OUTCOMES[who_is_best(result.records, result.learned)]
-        won.setdefault(outcome, []).append(f"{result.short} (lowest: `{first.name}`)")
-    for outcome, names in won.items():
-        sentences.append(f"{outcome} in {len(names)} of {len(judged)}: {', '.join(names)}.")
-    if won and any(result.default for result in judged):
-        sentences[0] = f"On the training distributions: {sentences[0][0].lower()}{sentences[0][1:]}"
     harmful = [harm for result in results for harm in _harms(result)]
     agents = {(result.environment, name) for result in results for name in result.learned}
     if agents:
         cells = sum(len(result.learned) for result in results)
         sentences.append(
-            f"Learned agents cost more than {100.0 * HARM:g} % above the paper's algorithm, significantly, in "
-            f"{len(harmful)} of {cells} cases (agent and scenario)"
-            + (f"; worst: {max(harmful)[1]}." if harmful else ".")
+            f"{len(harmful) or 'None'} of {cells} results of learned agents {'is' if len(harmful) == 1 else 'are'} "
+            f"significantly worse than the paper's algorithm by more than {100.0 * HARM:g} %"
+            + (f"; the worst is {max(harmful)[1]}." if harmful else ".")
         )
     off = [
         f"`{name}` in {result.short} ({with_interval(nees)})"
@@ -167,9 +151,10 @@ def verdict(results: Sequence[Result]) -> list[str]:
     ]
     if judged:
         sentences.append(
-            "The covariance of every winner is consistent: the interval of its mean NEES over the dimension holds one."
+            "The covariance of every winner is as large as its errors."
             if not off
-            else f"Best, but with a covariance that is not consistent, mean NEES over the dimension: {', '.join(off)}."
+            else f"Of the winners, {len(off)} of {len(judged)} {'states' if len(off) == 1 else 'state'} a covariance "
+            f"that does not fit the errors (mean NEES over its dimension, which should be one): {', '.join(off)}."
         )
     return sentences
 

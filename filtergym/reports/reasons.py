@@ -1,7 +1,5 @@
 """Why a competitor costs what it costs: its records by cause in sentences and as a table."""
 
-import re
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -104,12 +102,6 @@ def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name
             sentence += f"; there it costs {_times(reason.ratio)}"
         sentences.append(f"{sentence}.")
     return sentences or [f"{name}: no cause holds much more of its cost than of the measurements."]
-
-
-def fill(sentence: str, width: int) -> str:
-    """Break a sentence into lines, no number from its unit and no interval apart."""
-    kept = re.sub(r"\[[^\]]*\]| %", lambda found: found[0].replace(" ", "\xa0"), sentence)
-    return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def _percent(record: Record) -> str:

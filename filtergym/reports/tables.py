@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import rich.box
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
@@ -91,10 +92,8 @@ def consistency(record: Any) -> str:
 
 
 def score_text(record: Any) -> str:
-    """Score with its interval, or that there is no room."""
-    if record is None or record.value is not None:
-        return with_interval(record, negligible=1e-9)
-    return "no room"
+    """Score with its interval; none where the reference is not significantly better than the paper's algorithm."""
+    return with_interval(record, negligible=1e-9)
 
 
 def main_components(records: Sequence[Any]) -> list[str]:
@@ -135,65 +134,27 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
             own, so that no number is cut.
     """
     first = records[0]
-    shown = main_components(records)
-    units = {r.component: r.unit for r in records if r.metric == "rmse"}
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
-
-    def rmse(component: str, name: str) -> str:
-        return with_interval(found.get((name, "rmse", component, "all")))
-
-    errors: dict[str, Callable[[str], str]] = {
-        f"RMSE {component.replace('_', ' ')}, {units[component]}": functools.partial(rmse, component)
-        for component in shown
-    }
-
-    def difference(name: str) -> str:
-        record = found.get((name, "relative_cost_difference", "", "all"))
-        return with_interval(record, 100.0, negligible=0.005)
-
-    costs: dict[str, Callable[[str], str]] = {
-        "cost vs paper, %": difference,
-        "median, %": lambda name: against_paper(found, name)[0],
-        "wins, %": lambda name: against_paper(found, name)[1],
-        "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
-        "score": lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0],
-    }
-    if times := column_of_times(records):
-        costs[TIME_TITLE] = lambda name: times.get(name, "-")
-    lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
-    if lost:
-        costs["lost"] = lambda name: f"{lost.get(name, 0)}"
     names = rank_competitors(records)
-    title = (
+    costs, notes = _cost_columns(records, found)
+    exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
+    fitting = [
+        ([competitors_table(names, {**costs, **exact}, True)], []),
+        ([competitors_table(names, {**costs, **exact}, False)], []),
+        *(
+            ([competitors_table(names, {**costs, **rounded}, False, compact)], [RMSE_NOTE])
+            for compact in (False, True)
+        ),
+    ]
+    tables, more = next(
+        ((tables, more) for tables, more in fitting if first_fitting(tables, width)),
+        (_tables_below_each_other(names, costs, exact, width), []),
+    )
+    tables[0].title = (
         f"{first.environment}, scenario {first.scenario} "
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
     )
-    # As many columns beside each other as fit.
-    tables = [competitors_table(names, {**costs, **errors}, True)]
-    if _widest(tables[0]) > width:
-        narrow = [competitors_table(names, costs, True), competitors_table(names, costs, False)]
-        fitting = first_fitting(narrow, width)
-        if fitting is None and TIME_TITLE in costs:
-            errors = {TIME_TITLE: costs.pop(TIME_TITLE), **errors}
-        tables = [fitting or competitors_table(names, costs, False, compact=True)]
-        beside = first_fitting(
-            [competitors_table(names, errors, False, compact) for compact in (False, True)], width
-        )
-        each = [competitors_table(names, {title: error}, False) for title, error in errors.items()]
-        tables += each if beside is None else [beside]
-    tables[0].title = title
-    notes = [
-        "median, wins: of the cost of each episode against the paper's algorithm. "
-        f"ANEES: 1 if errors are as large as the covariance says; {INCONSISTENT}: off by more than a factor of two.",
-        "score: 0 = the paper's algorithm, 1 = the reference that it is measured against; no room where that is not "
-        "significantly better.",
-    ]
-    if times:
-        notes.append(TIME_NOTE)
-    if lost:
-        notes.append(
-            "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."
-        )
+    notes += more
     smoothers = [name for name, kind, _ in names if kind == "smoother"]
     notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
@@ -201,21 +162,103 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
     return tables
 
 
+Columns = Mapping[str, Callable[[str], str]]
+"""What each competitor has in a column, by the column's title."""
+RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
+
+
+def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Columns on cost, consistency and time, and the sentences that explain them."""
+    columns: dict[str, Callable[[str], str]] = {
+        "cost vs paper, %": lambda name: with_interval(
+            found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+        ),
+        "median,\n%": lambda name: against_paper(found, name)[0],
+        "wins,\n%": lambda name: against_paper(found, name)[1],
+        "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
+    }
+    notes = [
+        "median and wins compare the cost of each episode with that of the paper's algorithm. ANEES is 1 if errors are "
+        f"as large as the covariance says; {INCONSISTENT} marks one that is off by more than a factor of two.",
+    ]
+    if any(r.metric == "score" and r.value is not None for r in records):
+        columns["score"] = lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0]
+        notes.append(
+            "score is 0 for the paper's algorithm and 1 for the reference that it is measured against."
+        )
+    if times := column_of_times(records):
+        columns[TIME_TITLE] = lambda name: times.get(name, "-")
+        notes.append(TIME_NOTE)
+    lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
+    if lost:
+        columns["lost"] = lambda name: f"{lost.get(name, 0)}"
+        notes.append(
+            "lost counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
+        )
+    return columns, notes
+
+
+def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: bool) -> dict[str, Any]:
+    """Columns of the RMSE of the main components."""
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+
+    def rmse(component: str, name: str) -> str:
+        text = with_interval(found.get((name, "rmse", component, "all")))
+        return text if intervals else text.partition(" [")[0]
+
+    return {
+        f"RMSE\n{component.replace('_', ' ')},{' ' if intervals else chr(10)}{units[component]}": functools.partial(
+            rmse, component
+        )
+        for component in main_components(records)
+    }
+
+
+def _tables_below_each_other(
+    names: Sequence[tuple[str, str, str]], costs: Columns, errors: Columns, width: int
+) -> list[Table]:
+    """Costs in one table and errors below, each in a table of its own where they do not fit beside each other."""
+    costs, errors = dict(costs), dict(errors)
+    table = first_fitting(
+        [competitors_table(names, costs, False, compact) for compact in (False, True)], width
+    )
+    if table is None:
+        if TIME_TITLE in costs:
+            errors = {TIME_TITLE: costs.pop(TIME_TITLE), **errors}
+        table = competitors_table(names, costs, False, compact=True)
+    below = first_fitting(
+        [competitors_table(names, errors, False, compact) for compact in (False, True)], width
+    )
+    each = [competitors_table(names, {title: error}, False, True) for title, error in errors.items()]
+    return [table, *(each if below is None else [below])]
+
+
 def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
     """Return the first table that needs no more columns than there are."""
     return next((table for table in tables if _widest(table) <= width), None)
 
 
+def plain_table(title: str | None = None) -> Table:
+    """Return an empty table as all look: no lines but one below its head, two spaces between columns."""
+    return Table(
+        title=title,
+        title_justify="left",
+        caption_justify="left",
+        box=rich.box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 0, 0, 1),
+    )
+
+
 def competitors_table(
     names: Sequence[tuple[str, str, str]],
-    columns: Mapping[str, Callable[[str], str]],
+    columns: Columns,
     control: bool,
     compact: bool = False,
 ) -> Table:
     """Return a table of what each competitor has in each column; those that are not ranked in sections of their own."""
-    table = Table(title_justify="left", caption_justify="left")
-    if compact:
-        table.box, table.pad_edge = None, False
+    table = plain_table()
     table.add_column("policy", overflow="fold")
     if control:
         table.add_column("control")
@@ -259,14 +302,11 @@ def flights_table(
         over_all: records of all of them together, which rank the competitors.
         width: columns of the terminal: of the competitors the best are shown, as many as fit.
     """
-    everything = _flights(dataset, records, over_all, SHOWN_OF_FLIGHTS, False)
-    tables = (_flights(dataset, records, over_all, shown, True) for shown in range(SHOWN_OF_FLIGHTS, 0, -1))
-    return first_fitting([everything], width) or first_fitting(tables, width) or everything
+    tables = [_flights(dataset, records, over_all, shown) for shown in range(SHOWN_OF_FLIGHTS, 0, -1)]
+    return first_fitting(tables, width) or tables[0]
 
 
-def _flights(
-    dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int, compact: bool
-) -> Table:
+def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
     """Return the table with at most some competitors beside the one that they are compared with."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
@@ -278,9 +318,7 @@ def _flights(
     flights, lengths = dataset["flight"].values, dataset["length"].values
     several = len(set(flights.tolist())) > 1
     what = "recording" if dataset.attrs["recorded"] else "flight"
-    table = Table(title=f"{len(set(flights.tolist()))} {what}{'s' * several}", title_justify="left")
-    if compact:
-        table.box, table.pad_edge = None, False
+    table = plain_table(f"{len(set(flights.tolist()))} {what}{'s' * several}")
     table.add_column(what, no_wrap=True)
     table.add_column("episodes", justify="right")
     table.add_column("measurements", justify="right")

@@ -22,7 +22,7 @@ from .experiment import (
     innovation_variance,
     loop_theory,
     matrices,
-    settles_without_command,
+    settled_output,
 )
 
 SCALES = (0.01, 1.0, 100.0)
@@ -73,10 +73,11 @@ CLAIMS = (
     ),
     Statement(
         "5",
-        "Command: equations (6), (10) print none.",
-        "taken literally a unit command settles at {literal[0]:.3f} (P) and {literal[1]:.3f} (U) in place of 1; with "
-        "the command in the prediction overshoot and settling are {overshoot[0]:.2f} %, {settling[0]:.2f} s (P), "
-        "{overshoot[1]:.2f} %, {settling[1]:.2f} s (U)",
+        "Command: equation (6) prints none.",
+        "with the feedback alone in the prediction, as (6) is printed, a unit command settles at {literal[0]:.3f} (P) "
+        "and {literal[1]:.3f} (U) in place of 1; with the control in force, B U of (8) and (10), at "
+        "{predicted[0]:.3f} and {predicted[1]:.3f}, and overshoot and settling are {overshoot[0]:.2f} %, "
+        "{settling[0]:.2f} s (P), {overshoot[1]:.2f} %, {settling[1]:.2f} s (U)",
         "fixed point of the loop; response as difference of runs with and without step on the same noise",
     ),
     Statement(
@@ -136,7 +137,8 @@ def quantities(r: Results) -> dict[str, Any]:
         "asleep": (gusts[1, 599], gusts[1, -1]),
         "flat": ", ".join(flat),
         "white_flatness": 1 - 0.5 / r.episodes,
-        "literal": [settles_without_command(s.task) for s in ours],
+        "literal": [settled_output(s.task, predicts_command=False) for s in ours],
+        "predicted": [settled_output(s.task, predicts_command=True) for s in ours],
         "overshoot": [100 * over for over, _, _ in transients],
         "settling": [settling for _, _, settling in transients],
         "cost": mean_ratio(lambda s: s.cost[:, STEADY_WINDOW]),

@@ -244,14 +244,21 @@ def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, nu
     }
 
 
-def settles_without_command(task: UavAutopilot) -> float:
-    """Output at which a unit command settles if (6) and (10) are taken as printed."""
+def settled_output(task: UavAutopilot, predicts_command: bool) -> float:
+    """Output at which a unit command settles.
+
+    Args:
+        task: whose loop it is.
+        predicts_command: whether the filter predicts with the control in force, command included, as (10) is printed;
+            otherwise with the feedback alone, as (6) is.
+    """
     F, B, H, L, K, _, _ = matrices(task)
     one = numpy.eye(len(F))
-    # x = F x + B (N - L y);  y = (1 - K H) (F - B L) y + K H x
+    # x = F x + B (N - L y);  y = (1 - K H) (F y + B (N - L y)) + K H x, where (6) leaves N out
     system = numpy.block([[one - F, B @ L], [-K @ H, one - (one - K @ H) @ (F - B @ L)]])
-    command = numpy.concatenate([B[:, 0] * task.design.feedforward, numpy.zeros(len(F))])
-    return float(numpy.linalg.solve(system, command)[task.output])
+    command = B[:, 0] * task.design.feedforward
+    predicted = (one - K @ H) @ command * predicts_command
+    return float(numpy.linalg.solve(system, numpy.concatenate([command, predicted]))[task.output])
 
 
 def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:

@@ -1,0 +1,114 @@
+"""How far a command has come: a bar in a terminal, and lines where standard error is a file or a pipe."""
+
+import time
+from collections.abc import Callable
+from typing import Any, Protocol, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+FEWEST_SECONDS, MOST_SECONDS = 10.0, 60.0
+"""Between two lines: no sooner than the first, and not later than the second where there is something new."""
+STEP = 0.05
+"""Share of the work that is worth a line."""
+
+
+class ProgressDisplay(Protocol):
+    """What shows how far a command has come; a context manager, as rich's ``Progress``."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: Any) -> None: ...
+
+    def add_task(self, description: str, *, total: float | None) -> Any:
+        """Begin to show a task; returns what :meth:`update` takes."""
+
+    def update(self, task: Any, *, advance: float | None = None, completed: float | None = None) -> None:
+        """Say how much more, or how much in all, is done."""
+
+    def say(self, text: str) -> None:
+        """Say that something has been read, fitted or finished; a bar shows it by itself."""
+
+
+class _Bar(Progress):
+    """A bar that goes when all is done."""
+
+    def say(self, text: str) -> None:
+        """Leave the bar alone."""
+
+
+class ProgressLines:
+    """Lines with the time that is left: few, and none of what takes seconds.
+
+    Args:
+        write: of a line.
+        clock: seconds.
+    """
+
+    def __init__(self, write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._write, self._clock = write, clock
+        self._begin("", 0.0)
+
+    def _begin(self, description: str, total: float) -> None:
+        self._description, self._total = description, total
+        self._done = self._told = 0.0
+        self._begun = self._told_at = self._clock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        pass
+
+    def add_task(self, description: str, *, total: float | None) -> int:
+        """Begin to show a task, in place of the one before."""
+        self._begin(description, total or 0.0)
+        return 0
+
+    def update(self, task: int, *, advance: float | None = None, completed: float | None = None) -> None:
+        """Say how much more, or how much in all, is done."""
+        self._done = self._done + (advance or 0.0) if completed is None else completed
+        since = self._clock() - self._told_at
+        if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._told:
+            return
+        if since >= MOST_SECONDS or self._done - self._told >= STEP * self._total:
+            self._write(f"{self._description}: {self._standing()}")
+            self._told_at, self._told = self._clock(), self._done
+
+    def say(self, text: str) -> None:
+        """Write a line of its own."""
+        standing = f" ({self._standing()})" if 0.0 < self._done < self._total else ""
+        self._write(f"{text}{standing}")
+        self._told_at, self._told = self._clock(), self._done
+
+    def _standing(self) -> str:
+        share = min(self._done / self._total, 1.0)
+        passed = self._clock() - self._begun
+        text = f"{100.0 * share:.0f} % done after {duration(passed)}"
+        return text if share >= 1.0 else f"{text}, {duration(passed * (1.0 - share) / share)} left"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as one says them: ``42 s``, ``3 min 20 s``, ``2 h 5 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def progress_bar() -> ProgressDisplay:
+    """Return what shows progress on standard error, so that tables can be piped: a bar, or lines where nobody looks."""
+    errors = Console(stderr=True, highlight=False, markup=False, emoji=False)
+    if not errors.is_terminal:
+        return ProgressLines(lambda line: errors.print(line, soft_wrap=True))
+    return _Bar(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=errors,
+        transient=True,
+    )
