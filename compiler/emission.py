@@ -42,6 +42,7 @@ class _Part:
         self.lines: list[str] = []
         self.known: set[int] = set()
         self._arguments: dict[int, tuple[str, str]] = {}
+        self._first_rows: dict[int, str] = {}
         self._names = 0
         self.constants = self._entry("ptr", 0)
 
@@ -56,9 +57,10 @@ class _Part:
     def place(self, argument: int, row: int) -> str:
         """Address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
+        if argument not in self._first_rows:
+            self._first_rows[argument] = self.new(f"getelementptr double, ptr {address}, i64 %lane")
         start = self.new(f"mul i64 {stride}, {row}")
-        start = self.new(f"add i64 {start}, %lane")
-        return self.new(f"getelementptr double, ptr {address}, i64 {start}")
+        return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def argument(self, argument: int) -> tuple[str, str]:
         """Address and stride of an argument."""
@@ -112,13 +114,10 @@ class _Part:
             elif operation == "entry":
                 row, product = arguments
                 address = self.scratch(self.places.products[product] + row)
-                self.new(f"load {self.numbers}, ptr {address}, align {self.block.alignment}", f"%v{step}")
+                self.new(f"load {self.numbers}, ptr {address}", f"%v{step}")
             else:
                 kind = self.truths if logical else self.numbers
-                self.new(
-                    f"load {kind}, ptr {self.scratch(self.places.slots[step])}, align {self.block.alignment}",
-                    f"%v{step}",
-                )
+                self.new(f"load {kind}, ptr {self.scratch(self.places.slots[step])}", f"%v{step}")
         return f"%v{step}"
 
     def step(self, index: int) -> None:
@@ -207,7 +206,7 @@ class _Part:
         for place, step in enumerate(vector):
             value = self.value(step)
             address = self.scratch(self.places.vector + place)
-            self.lines.append(f"store {self.numbers} {value}, ptr {address}, align {self.block.alignment}")
+            self.lines.append(f"store {self.numbers} {value}, ptr {address}")
         matrix = self.new(f"getelementptr double, ptr {self.constants}, i64 {table}")
         given, found = self.scratch(self.places.vector), self.scratch(self.places.products[index])
         sizes = f"i64 {len(vector)}, i64 {-(-rows // BAND)}"
@@ -247,13 +246,13 @@ class _Part:
 
     def scratch(self, place: int) -> str:
         """Address of a place in the scratch array."""
-        return self.new(f"getelementptr {self.numbers}, ptr %scratch, i64 {place}")
+        return self.new(f"getelementptr i8, ptr %scratch, i64 {place * self.block.alignment}")
 
     def hand_on(self, step: int) -> None:
         """Put a value into the scratch array."""
         kind = self.truths if self.program.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
-        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align {self.block.alignment}")
+        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
 
 
 def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block, part: int) -> str:

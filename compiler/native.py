@@ -90,7 +90,7 @@ def quick_setting(features: str, has_loops: bool) -> Setting:
         features: of the processor.
         has_loops: whether the program multiplies with matrices.
     """
-    return Setting(LANES if has_loops else block_for(features).lanes, 100, 0)
+    return Setting(LANES if has_loops else block_for(features).lanes, 150, 0)
 
 
 OPTIMISED = Setting(LANES, 200, 1)
