@@ -4,7 +4,6 @@ import collections
 import copy
 import functools
 import math
-from collections.abc import Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -188,7 +187,7 @@ def _answered(network: _Network | None) -> Any:
 
 def _interpret_update(
     traced: TracedFilter, dtype: Any, given: dict[int, Any], network: _Network | None
-) -> Sequence[numpy.ndarray]:
+) -> list[numpy.ndarray]:
     """Results of an update in NumPy."""
 
     def read(argument: int, row: int) -> Any:
@@ -212,7 +211,7 @@ class _CompiledUpdate:
             steps = code.steps[: first_steps(code, shown)]
             self._before = _Code(Program(steps, code.constants, code.results[:shown]), E)
 
-    def __call__(self, given: dict[int, Any], network: _Network | None) -> Sequence[numpy.ndarray]:
+    def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
         if network is not None and self._before is not None:
             network(self._before(given))
         return self._whole({**given, ANSWER: _answered(network)})
@@ -232,7 +231,7 @@ class _Code:
         self._constants, self._width = code.constants, width
         self._run = native(code._replace(results=results), [False] * len(self._arrays), portable())
 
-    def __call__(self, given: dict[int, Any]) -> Sequence[numpy.ndarray]:
+    def __call__(self, given: dict[int, Any]) -> list[numpy.ndarray]:
         for argument, row in self._inputs:
             values = numpy.asarray(given[argument][row], dtype=float)
             self._arrays[argument][row] = values if values.ndim == 0 else values[0]
