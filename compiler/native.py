@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from . import cache
 from .block import LANES, block_for, block_of
-from .emission import emit
+from .emission import emit, product_symbol, product_text
 from .library import Library, fastest
 from .program import LOCK, Program
 
@@ -82,9 +82,15 @@ class Setting(NamedTuple):
     """Of LLVM's optimisation of code."""
 
 
-def quick_setting(features: str) -> Setting:
-    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register."""
-    return Setting(block_for(features).lanes, 100, 0)
+def quick_setting(features: str, has_loops: bool) -> Setting:
+    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register; with loops those of
+    the fastest code, as the product of a matrix takes twice as long in half of a block.
+
+    Args:
+        features: of the processor.
+        has_loops: whether the program multiplies with matrices.
+    """
+    return Setting(LANES if has_loops else block_for(features).lanes, 150, 0)
 
 
 OPTIMISED = Setting(LANES, 200, 1)
@@ -100,6 +106,13 @@ Native = Callable[[int, int, int], None]
 """Called with the address of the table of arguments, and with the lanes from where to where."""
 NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 """The same for ctypes."""
+PRODUCT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, ctypes.c_int64)
+"""Of the product of a matrix, see :func:`~.emission.product_text`."""
+
+
+def address_of_code(code: Any) -> int:
+    """Address of a native function."""
+    return ctypes.cast(code, ctypes.c_void_p).value or 0
 
 
 class Code:
@@ -145,7 +158,8 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
         steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
-        quick = quick_setting(features)
+        has_loops = any(step.operation == "product" for step in program.steps)
+        quick = quick_setting(features, has_loops)
         made_of = repr((steps, results, list(lane_first), symbols)), _own_text()
         key = _key(*made_of, repr(quick))
         if key not in _CODES:
@@ -155,6 +169,9 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
             def code(setting: Setting, key: str) -> Native:
                 with LOCK:
                     block, part = block_of(setting.lanes), setting.part
+                    if has_loops:
+                        product = native_text(product_text(block), PRODUCT)
+                        binding.add_symbol(product_symbol(block), address_of_code(product))
                     return _load(
                         key, lambda: emit(program, lane_first, library, block, part), NATIVE, setting.level
                     )
