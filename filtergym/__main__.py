@@ -6,10 +6,11 @@ import gc
 import importlib
 import inspect
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -178,6 +179,8 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
     in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
     """
     debug = "--debug" in sys.argv
+    with suppress(ValueError):  # in a thread, where nobody may
+        signal.signal(signal.SIGTERM, _end)
     open_output()
     try:
         with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
@@ -194,6 +197,11 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
             text, code = f"Error: unexpected {type(error).__name__}: {error}{own_line(error)}; {REPORT}", 1
         _print_error(text, "red")
         sys.exit(code)
+
+
+def _end(number: int, _: Any) -> None:
+    """End as at an error: what is unfinished is taken away on the way out."""
+    sys.exit(128 + number)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
