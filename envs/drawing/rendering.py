@@ -533,7 +533,7 @@ def _moving(axes: Axes) -> list[Artist]:
     )
 
 
-class _NoWindow(Exception):
+class _NoWindow(Exception):  # noqa: N818  (no error of a user's: why no window opens)
     """A window cannot be opened; says why, and what to check."""
 
 
