@@ -18,20 +18,24 @@ import numpy
 import xarray
 
 from ..envs.contract.task import Task
-from ..envs.data.recording import Recording
+from ..envs.data.recording import Recording, fill_arrays, measure_once
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
+from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
+    DROP,
+    OUTLIER_SHARE,
     Fit,
     Interval,
     Profile,
+    ScaledNoise,
     fit,
-    profile_parameters,
-    search_profiles,
+    fit_profiles,
     with_noise_scale,
+    with_outliers,
 )
 from .problem import Problem
 from .table import Tunable
@@ -158,6 +162,8 @@ class Advice(NamedTuple):
 
     anchor: Anchor | None
     """None where the recording has no second sensor."""
+    outliers: numpy.ndarray
+    """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -204,11 +210,20 @@ def advise(
     fits: dict[str, Fit] = {}
     tunables: dict[str, Tunable] = {}
     likelihoods: dict[str, WindowLikelihood] = {}
+    outliers = True
     for i, (name, family) in enumerate(families.items()):
         progress(f"fitting {name}", 0.6 * i / len(families))
-        tunable = _with_noise(problem, family, noise)
-        likelihood = _likelihood(recording, task, share.fitted, share.warm_up, tunable)
-        fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
+        tried = [_with_noise(problem, family, noise, name in (own or {}), robust) for robust in (False, True)]
+        for tunable in tried if outliers and tried[1] != tried[0] else tried[:1]:
+            begin = tunable
+            if name in fits:
+                begin = dataclasses.replace(tunable, start={**tunable.start, **fits[name].values})
+            likelihood = _likelihood(recording, task, share.fitted, share.warm_up, begin)
+            found = fit(likelihood, begin, seed)
+            if name not in fits or found.log_likelihood > fits[name].log_likelihood + DROP:
+                fits[name], tunables[name], likelihoods[name] = found, tunable, likelihood
+        if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
+            outliers = OUTLIER_SHARE in fits[name].values
     makers = {
         **shipped,
         **{
@@ -239,21 +254,21 @@ def advise(
         if anchor.gain > 0.0:
             chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
+    profiles = {}
     if share.apart:  # to all that does not judge
         begin = dataclasses.replace(tunable, start=fits[name].values)
         spans = [*share.fitted, *share.chosen]
         likelihoods[name] = _likelihood(recording, task, spans, share.warm_up, begin)
-        fits[name] = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
+        again = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
+        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, again)
         fitted = make_tuned_policy(f"fitted {name}", tunable, fits[name].values)
         judgement = judge({name: fitted, rival: shipped[rival], best: shipped[best]})
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
-    profiles = {
-        each: _profiles(likelihoods[each], tunables[each], fits[each])
-        for each in (fits if every_profile else [name])
-        if each not in diverging
-    }
+    for each in fits if every_profile else [name]:
+        if each not in diverging and each not in profiles:
+            fits[each], profiles[each] = fit_profiles(likelihoods[each], tunables[each], fits[each])
     progress("done", 1.0)
     sure = tunable.anchored or chosen.gain.low > 0.0
     advised = chosen if sure else next(c for c in competitors if c.name == rival)
@@ -275,6 +290,7 @@ def advise(
         tunables,
         profiles,
         anchor,
+        find_outliers(task, recording, tunable, fits[name]),
     )
 
 
@@ -307,8 +323,38 @@ def fit_all(
     tunable = _with_noise(problem, family, noise)
     likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
     found = fit(likelihood, tunable, seed)
-    profiles = _profiles(likelihood, tunable, found)
+    robust = _with_noise(problem, family, noise, robust=True)
+    if robust != tunable:
+        begin = dataclasses.replace(robust, start={**robust.start, **found.values})
+        other = _likelihood(recording, task, spans, share.warm_up, begin)
+        again = fit(other, begin, seed)
+        if again.log_likelihood > found.log_likelihood + DROP:
+            tunable, likelihood, found = robust, other, again
+    found, profiles = fit_profiles(likelihood, tunable, found)
     return tunable, found, {name: each.interval for name, each in profiles.items()}
+
+
+def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit) -> numpy.ndarray:
+    """Return which measurements of a recording a fitted filter takes for outliers, ``(E, T)``; none where it knows no
+    outliers.
+    """
+    is_outlier = numpy.zeros(recording.seconds.shape, dtype=bool)
+    if OUTLIER_SHARE not in found.values:
+        return is_outlier
+    template, like = measure_once(type(task)(task.parameters), recording.measurements)
+    initial = {name: numpy.moveaxis(values, 0, -1) for name, values in recording.initial.items()}
+    estimator = tunable.apply(found.values)[1](task)
+    # The scale of the noise is outside, the choice between two updates within.
+    scaled = estimator if isinstance(estimator, ScaledNoise) else ScaledNoise(estimator, lambda m, _: m, 1.0)
+    memory = scaled.start(fill_arrays(template, initial.__getitem__, numpy), len(recording.names))
+    for k in range(recording.seconds.shape[1]):
+        row = {name: numpy.moveaxis(values[:, k], 0, -1) for name, values in recording.measurements.items()}
+        measurement = task.world.mask_missing(fill_arrays(like, row.__getitem__, numpy))
+        with numpy.errstate(all="ignore"):
+            taken = scaled.scaled(measurement, scaled.factor)
+            usual, wide, is_outlier[:, k], _ = scaled.own.compare(taken, memory)
+        memory = select_nested(is_outlier[:, k], wide[2], usual[2])
+    return is_outlier & (numpy.arange(is_outlier.shape[1]) < recording.rows[:, None])
 
 
 def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
@@ -317,12 +363,18 @@ def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -
     return make_task(problem.task, None, **{**parameters, **keywords, "horizon": 1})
 
 
-def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it."""
+def _with_noise(
+    problem: Problem, family: Tunable, noise: bool, own: bool = False, robust: bool = False
+) -> Tunable:
+    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it. Where it is
+    to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may be less.
+    """
     log_format = problem.task.log_format
-    if not noise or family.anchored or log_format is None or log_format.scale_noise is None:
+    if family.anchored or log_format is None or log_format.scale_noise is None:
         return family
-    return with_noise_scale(family, log_format.scale_noise)
+    if robust and not own:
+        family = with_outliers(family, log_format.scale_noise)
+    return with_noise_scale(family, log_format.scale_noise) if noise else family
 
 
 def _likelihood(
@@ -342,12 +394,6 @@ def _likelihood(
         every = max(1, round(APART / _interval(recording)))
     windows = cut_windows(recording, task, spans, warm_up, every)
     return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
-
-
-def _profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
-    """Profiles of the parameters, of an anchored filter by searches, since size and duration of its error are tied."""
-    find = search_profiles if tunable.anchored else profile_parameters
-    return find(likelihood, tunable, found)
 
 
 def _compare_anchored(

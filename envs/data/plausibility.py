@@ -193,6 +193,14 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray((values[1:-1] - line) / numpy.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
 
 
+def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
+    """Deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3, from the median distance to the line
+    through their neighbours; at least what 64-bit numbers of their size can tell.
+    """
+    scatter = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, values))))
+    return max(scatter, 1e-9 * float(numpy.abs(values).max(initial=0.0)), 1e-6)
+
+
 def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str]:
     """Return the notes on columns of a table that nobody reads.
 

@@ -7,14 +7,20 @@ import typer
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
-from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
+from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_advised
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
 from ..evaluation.files import writable_file, write_text
 from ..names import find_competitor
-from ..reports.advice import advice_lines, advice_table, further_sentences, parameter_lines
+from ..reports.advice import (
+    advice_lines,
+    advice_table,
+    further_sentences,
+    held_out_numbers,
+    parameter_lines,
+)
 from ..reports.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
@@ -59,7 +65,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     if name not in families:
         console.print(OWN)
         return
-    write_fitted(out, problem, name, fitted, intervals, command_line())
+    write_advised(out, problem, name, found, fitted, intervals, command_line())
     console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
 
 
@@ -76,7 +82,7 @@ def advise_on_log(
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
+            help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."
         ),
     ] = None,
     report: Annotated[
@@ -146,11 +152,21 @@ def advise_on_log(
     departures = list(departure_lines(problem, found, learned, keywords))
     for sentence in [*advice_lines(advice, learned), *departures]:
         console.print(sentence, highlight=False, soft_wrap=True)
-    if out is not None and advice.fitted.name in own:
+    name = advice.advised.name
+    if out is not None and name in own:
         console.print(OWN)
     elif out is not None:
-        name = advice.fitted.name
-        write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
+        fit = advice.fits[name] if advice.advised.fitted else None
+        write_advised(
+            out,
+            problem,
+            name,
+            found,
+            fit,
+            advice.intervals if fit is not None else {},
+            command_line(),
+            held_out=held_out_numbers(advice),
+        )
         console.print(
             f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
         )

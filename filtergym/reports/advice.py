@@ -88,6 +88,22 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
         yield Row(one, _label(advice, one), cells)
 
 
+def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
+    """Return what the judged measurements say of the advised filter; None where it is not known."""
+    one = advice.advised
+    numbers = {
+        "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
+        "rmse_of_estimates": one.error,
+        "rmse_of_predictions": one.prediction,
+        "nis": one.nis,
+        "relative_error": one.relative_error.value,
+        "relative_error_low": one.relative_error.low,
+        "relative_error_high": one.relative_error.high,
+    }
+    rounded = {key: None if math.isnan(value) else float(f"{value:.6g}") for key, value in numbers.items()}
+    return {**rounded, "relative_to": advice.rival}
+
+
 def _label(advice: Advice, one: Competitor) -> str:
     """Name of a filter, and what it is here."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
