@@ -70,7 +70,9 @@ def read_log(columns: Columns) -> TrackLog:
     assumed = _assume_deviation(columns, position[there], columns.time[there])
     variance = _variances(columns, position, there, assumed)
     said_deviations, deviations_from = _deviations_of(columns, there, assumed)
-    deviation_notes = (f"{deviations_from}: {_listed(said_deviations)}",) if "no column" in deviations_from else ()
+    deviation_notes = (
+        (f"{deviations_from}: {_listed(said_deviations)}",) if "no column" in deviations_from else ()
+    )
     stale = _find_stale(columns, position, numpy.sqrt(variance))
     there &= ~stale
     farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
@@ -263,16 +265,19 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
         position: of its plots, m, ``(n, 2)``.
         time: s, likewise.
     """
-    if not columns.has("x") or columns.origin is not None or columns.has("sigma_x") or columns.has("range_sigma"):
+    if (
+        not columns.has("x")
+        or columns.origin is not None
+        or columns.has("sigma_x")
+        or columns.has("range_sigma")
+    ):
         return 0.0
     if "range_sigma" in columns.given:
         return float(columns.given["range_sigma"])
     return float(f"{scatter_of(time, position):.3g}") if len(time) >= 3 else 0.0
 
 
-def _deviations_of(
-    columns: Columns, there: numpy.ndarray, assumed: float
-) -> tuple[dict[str, float], str]:
+def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
     """Typical deviations, as columns would state them, and who says so."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:
