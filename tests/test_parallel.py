@@ -167,6 +167,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     assert without_times(tmp_path / "one/results.json") == without_times(tmp_path / "two/results.json")
 
 
+@pytest.mark.slow
 def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatch):
     """What is done is not done again, unless something that it depends on has changed."""
     monkeypatch.chdir(tmp_path)
