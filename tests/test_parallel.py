@@ -222,6 +222,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     assert without_times(tmp_path / "one/results.json") == without_times(tmp_path / "two/results.json")
 
 
+@pytest.mark.slow
 def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatch):
     """What is done is not done again, unless something that it depends on has changed."""
     monkeypatch.chdir(tmp_path)
@@ -248,21 +249,6 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
     assert command(*words)[0] == 0
     assert done == ["imm", "known-turn", "known-turn"]
     assert without_times(tmp_path / "out/records.json") == whole
-
-
-def test_a_process_is_given_together_what_shares_a_model(monkeypatch):
-    """Every piece is in one batch, and no batch but a single piece goes beyond the limit."""
-    experiments = [problem_of(ENV).experiment(name, episodes=4) for name in ("paper", "random")]
-    asked = [
-        evaluation_requests(problem_of(ENV), one, ["imm"])[0]
-        for one in (*experiments, *experiments, experiments[0])
-    ]
-    pieces = list(enumerate(asked))
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0, 2, 4], [1, 3]]
-    monkeypatch.setattr(summary, "BATCH", 2 * asked[0].measurements)
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0, 2], [1, 3], [4]]
-    monkeypatch.setattr(summary, "BATCH", 1)
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0], [1], [2], [3], [4]]
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
