@@ -1,14 +1,15 @@
 """What a first use costs: commands with an empty cache of compiled code, and once more with a full one.
 
-    python benchmarks/cold.py [--quick] [--record]
+    python benchmarks/cold.py [--quick] [--only WORD] [--record]
 
 Every command runs twice in a folder of its own that is the user's home and holds the code cache: cold, where both are
 empty, then warm. A figure is of the whole process with its children: processor seconds, and seconds that pass (wall).
 Others on the machine take some of the second and, by its caches, a little of the first: take ratios.
 
 Two policies are evaluated over 500 episodes, and the benchmark is the quick one in one process. ``--quick`` leaves
-out the benchmark, which takes minutes, and all evaluations but that of ManeuveringTarget; ``--record`` writes
-``docs/records/cold.json``, whose table the documentation shows.
+out the benchmark, which takes minutes, and all evaluations but that of ManeuveringTarget; ``--only`` runs
+those that are called by the word; ``--record`` puts what was measured into ``docs/records/cold.json``, whose table the
+documentation shows, and leaves other rows as they are.
 """
 
 import argparse
@@ -127,15 +128,17 @@ def table_text(rows: Sequence[Sequence[str]]) -> str:
 
 
 def write_record(rows: Sequence[Sequence[str]]) -> None:
-    """Write the record, see ``docs/make/records.py``."""
+    """Put rows into the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
+    known = json.loads(RECORD.read_text(encoding="utf-8"))["data"]["rows"] if RECORD.exists() else []
+    by_name = {each[0]: list(each) for each in [*known, *rows]}
     versions = {"Python": platform.python_version()}
     versions |= {name: importlib.metadata.version(name) for name in LIBRARIES}
     record: dict[str, Any] = {
         "command": "python benchmarks/cold.py --record",
         "made": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "versions": versions,
-        "note": "On two shared cores: take ratios.",
-        "data": {"columns": COLUMNS, "rows": [list(each) for each in rows]},
+        "note": "On two cores that others used, too: the seconds that pass are several times those of a machine alone.",
+        "data": {"columns": COLUMNS, "rows": [by_name[name] for name in commands(False) if name in by_name]},
     }
     RECORD.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
 
@@ -146,12 +149,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="what takes a minute")
-    parser.add_argument("--record", action="store_true", help="write docs/records/cold.json")
+    parser.add_argument(
+        "--only", metavar="WORD", default="", help="what is called by it: benchmark, evaluate"
+    )
+    parser.add_argument("--record", action="store_true", help="put the rows into docs/records/cold.json")
     options = parser.parse_args()
-    if options.quick and options.record:
-        parser.error("--record needs all of the table: leave out --quick")
     rows = []
     for name, command in commands(options.quick).items():
+        if options.only not in name:
+            continue
         with tempfile.TemporaryDirectory(prefix="cold-") as home:
             rows.append(row(name, measure(command, Path(home)), measure(command, Path(home))))
         print(" ".join(rows[-1]), file=sys.stderr, flush=True)
