@@ -244,7 +244,10 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
         ValueError: for the first episode that cannot be true.
     """
     world: Any = task.world  # a RecordedWorld
-    moving = task.log_format is not None and task.log_format.targets_move
+    # Latitude and longitude have a known unit, and their receiver may stand.
+    moving = (
+        task.log_format is not None and task.log_format.targets_move and "latitude" not in recording.columns
+    )
     seen, sigma = world.all_observations()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
@@ -322,7 +325,7 @@ def _check_scale(
 ) -> None:
     """Check that measured positions are metres, by their speed and by their noise."""
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
-    if len(time) < FEWEST:
+    if len(time) < FEWEST or not moving:
         return
     # From end to end: from one to the next a speed may be all noise.
     speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))
