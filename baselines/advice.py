@@ -164,6 +164,9 @@ class Advice(NamedTuple):
     """None where the recording has no second sensor."""
     outliers: numpy.ndarray
     """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
+    dearer: tuple[str, Estimate] | None
+    """Likeliest family, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
+    None where it is the fitted one. ``fitted`` is the cheapest of those that it does not beat beyond chance."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -246,7 +249,15 @@ def advise(
     rival, best = judgement.rival(), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
-    chosen = _likeliest([c for c in competitors if c.fitted and c.name not in anchored])
+    candidates = [c for c in competitors if c.fitted and c.name not in anchored]
+    chosen = dearer = _likeliest(candidates)
+    # Families come the cheapest first: the first that the likeliest does not beat beyond chance.
+    for one in candidates:
+        extra = judgement.difference(dearer.name, one.name)
+        if extra.low <= 0.0 or one is dearer:
+            chosen = one
+            break
+    brought = judgement.difference(dearer.name, chosen.name)
     anchor = None
     for name in anchored:
         anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
@@ -289,6 +300,7 @@ def advise(
         profiles,
         anchor,
         find_outliers(task, recording, tunable, fits[name]),
+        None if chosen.name == dearer.name or tunable.anchored else (dearer.name, brought),
     )
 
 
@@ -512,6 +524,12 @@ class _Judgement:
         squares = self._squares or self._predicted
         known = name in squares and other in squares
         return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
+
+    def difference(self, name: str, other: str) -> Estimate:
+        """Chosen log-likelihood of a fitted filter less that of another, their parameters paid for, nats."""
+        found = self.predictions.difference(name, other, self.chosen)
+        penalty = (self.parameters[name] - self.parameters[other]) / self.chosen.sum()
+        return Estimate(*(value - penalty for value in found))
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.

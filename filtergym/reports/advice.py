@@ -185,6 +185,7 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
     yield from _hindsight(advice)
     yield from _fits(advice)
+    yield from _dearer(advice)
     yield from _outliers(advice)
     if not advice.tunables[advice.fitted.name].anchored:
         yield from _noise(advice)
@@ -338,6 +339,16 @@ def _fits(advice: Advice) -> Iterator[str]:
         lose, diverge = ("loses", "it diverges") if len(advice.diverging) == 1 else ("lose", "they diverge")
         yield (
             f"Left out: {', '.join(advice.diverging)}, fitted, {lose} the track in the whole recording: {diverge}."
+        )
+
+
+def _dearer(advice: Advice) -> Iterator[str]:
+    """What a family of more computation would bring."""
+    if advice.dearer is not None:
+        name, gain = advice.dearer
+        yield (
+            f"{advice.fitted.name} is the simplest of the fitted ones that are as likely within chance: {name} would "
+            f"bring {_interval(gain, '+.3f')} nats per measurement and takes more computation."
         )
 
 
