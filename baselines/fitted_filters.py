@@ -160,7 +160,8 @@ def write_advised(
                 "measurements": int(recording.rows.sum()),
                 "seconds": round_value(float(numpy.nanmax(seconds))),
                 "interval": [
-                    round_value(float(edge(numpy.diff(seconds, axis=1)))) for edge in (numpy.nanmin, numpy.nanmax)
+                    round_value(float(edge(numpy.diff(seconds, axis=1))))
+                    for edge in (numpy.nanmin, numpy.nanmax)
                 ],
             },
         },
@@ -209,7 +210,14 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         "deviations_from": str,
     }
     log_format = problem.task.log_format
-    names = {"time", "recording", "latitude", "longitude", "altitude", *(log_format.columns if log_format else ())}
+    names = {
+        "time",
+        "recording",
+        "latitude",
+        "longitude",
+        "altitude",
+        *(log_format.columns if log_format else ()),
+    }
     if (
         not isinstance(log, dict)
         or not all(fits(log.get(key), kind) for key, kind in kinds.items())
@@ -233,7 +241,9 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
     """
     found = read_artefact(path, problem)
     if found.fitted is None:
-        raise ValueError(f"{path} names the shipped filter {found.filter!r}, which has no parameters of its own")
+        raise ValueError(
+            f"{path} names the shipped filter {found.filter!r}, which has no parameters of its own"
+        )
     return found.fitted
 
 

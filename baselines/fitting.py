@@ -148,8 +148,7 @@ class RobustEstimator:
         """Update as stated and with wide deviations, and keep the likelier result; say the mixture's likelihood."""
         usual, wide, is_outlier, log_likelihood = self.compare(measurement, memory)
         mean, covariance, after = (
-            select_nested(is_outlier, other, one)
-            for one, other in zip(usual[:3], wide[:3], strict=True)
+            select_nested(is_outlier, other, one) for one, other in zip(usual[:3], wide[:3], strict=True)
         )
         nis = self.xp.where(is_outlier, wide[3].nis, usual[3].nis)
         return mean, covariance, after, Likelihood(log_likelihood, nis, usual[3].nis_degrees)
@@ -300,9 +299,7 @@ def _search_profiles(
     return profiles, None
 
 
-def _profile(
-    best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray
-) -> Profile:
+def _profile(best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray) -> Profile:
     """Put the places at which a parameter was held in order, with the best one, and find its interval."""
     (low, open_low), (high, open_high) = (
         _profile_end(places, drops, parameter, sign) for sign in (-1.0, 1.0)
@@ -386,4 +383,3 @@ def _profile_end(
             share = (math.sqrt(DROP) - roots[k - 1]) / (roots[k] - roots[k - 1])
             return distances[k - 1] + share * (distances[k] - distances[k - 1]), False
     return distances[-1], True
-

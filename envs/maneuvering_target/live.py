@@ -77,7 +77,9 @@ class PlotInput(LiveInput):
         position = numpy.stack([self._position(plot) for plot in plots])
         lasted = float(second["time"]) - float(first["time"])
         if not numpy.isfinite(position).all() or not 0.0 < lasted < numpy.inf:
-            raise ValueError(f"a track starts from two plots, the second later, got {first!r:.200} and {second!r:.200}")
+            raise ValueError(
+                f"a track starts from two plots, the second later, got {first!r:.200} and {second!r:.200}"
+            )
         variance = numpy.stack([self._variance(p, plot) for p, plot in zip(position, plots, strict=True)])
         begun = two_plot_start(
             numpy.moveaxis(position, -1, 0), numpy.moveaxis(variance, -1, 0), numpy.array([[lasted]])

@@ -262,16 +262,19 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
         position: of its plots, m, ``(n, 2)``.
         time: s, likewise.
     """
-    if not columns.has("x") or columns.origin is not None or columns.has("sigma_x") or columns.has("range_sigma"):
+    if (
+        not columns.has("x")
+        or columns.origin is not None
+        or columns.has("sigma_x")
+        or columns.has("range_sigma")
+    ):
         return 0.0
     if "range_sigma" in columns.given:
         return float(columns.given["range_sigma"])
     return float(f"{scatter_of(time, position):.3g}") if len(time) >= 3 else 0.0
 
 
-def _deviations_of(
-    columns: Columns, there: numpy.ndarray, assumed: float
-) -> tuple[dict[str, float], str]:
+def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
     """Typical deviations, as columns would state them, and who says so."""
     pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
     for pair in pairs:

@@ -82,9 +82,7 @@ def advise_on_log(
     ] = "filtergym/ManeuveringTarget-v0",
     out: Annotated[
         Path | None,
-        typer.Option(
-            help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."
-        ),
+        typer.Option(help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."),
     ] = None,
     report: Annotated[
         Path | None,

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..baselines.fitted_filters import LogSetup
 from ..compiler.c_source import (
     DOUBLE,
     FLOAT,
@@ -26,7 +27,6 @@ from ..compiler.c_source import (
     literal,
     write_program,
 )
-from ..baselines.fitted_filters import LogSetup
 from ..evaluation.files import whole_files
 from .c_network import memory_size, network_text
 from .replay import Replay, mean_rows, replay, run_filter
@@ -252,7 +252,9 @@ class Writer:
     def _guard(self) -> list[str]:
         """Statements that leave the state alone where the estimate is no finite number."""
         zero = literal(0.0, self.scalar)
-        rows = [row for row, member in enumerate(self.traced.estimate) if member.name in ("mean", "covariance")]
+        rows = [
+            row for row, member in enumerate(self.traced.estimate) if member.name in ("mean", "covariance")
+        ]
         places = self.structs["estimate"].places
         terms = " + ".join(f"{zero} * estimate->{places[row]}" for row in rows)
         return [
@@ -400,7 +402,9 @@ class Writer:
         if not polar and ("x" not in log.columns or "latitude" in log.columns):
             return ""
         names = ["range", "azimuth"] if polar else ["x", "y"]
-        deviations = ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
+        deviations = (
+            ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
+        )
         columns = [log.columns.get(name, name).lower() for name in ("time", *names, *deviations)]
         real, C = self.scalar.name, len(self.components)
         values = {
@@ -410,7 +414,10 @@ class Writer:
         struct = self.structs["measurement"]
         if not {*struct.columns.values()} <= {*values}:
             return ""
-        fill = [f"m.{struct.places[row]} = ({real}){values[struct.columns[row]]};" for row in sorted(struct.places)]
+        fill = [
+            f"m.{struct.places[row]} = ({real}){values[struct.columns[row]]};"
+            for row in sorted(struct.places)
+        ]
         begin = self.structs["initial"]
         initial = {"mean_0": "p[0]", "mean_1": "p[1]", "mean_2": "(p[0] - p0[0]) / lasted"}
         initial["mean_3"] = "(p[1] - p0[1]) / lasted"
@@ -836,7 +843,10 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
         "Estimates from a table of measurements:",
         f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
         *(
-            ["Estimates from a log of your own:", f"    cc -std=c99 -O2 log.c {own}.c -lm -o log && ./log mine.csv"]
+            [
+                "Estimates from a log of your own:",
+                f"    cc -std=c99 -O2 log.c {own}.c -lm -o log && ./log mine.csv",
+            ]
             if request.log is not None and writer.log_program(request.log)
             else []
         ),
