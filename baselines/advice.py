@@ -27,6 +27,7 @@ from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
     DROP,
+    NOISE_SCALE,
     OUTLIER_SHARE,
     Fit,
     Interval,
@@ -158,12 +159,14 @@ class Advice(NamedTuple):
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
-    """Likelihood of the parameters of ``fitted``; of the other fitted ones where that was asked for."""
-
+    """Likelihood of the parameters of ``fitted``."""
     anchor: Anchor | None
     """None where the recording has no second sensor."""
     outliers: numpy.ndarray
     """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
+    dearer: tuple[str, Estimate] | None
+    """Likeliest family, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
+    None where it is the fitted one. ``fitted`` is the cheapest of those that it does not beat beyond chance."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -183,7 +186,6 @@ def advise(
     own: Mapping[str, Tunable] | None = None,
     noise: bool = True,
     seed: int = 0,
-    every_profile: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     **keywords: Any,
 ) -> Advice:
@@ -196,7 +198,6 @@ def advise(
         own: further families, such as an estimator of a user's with limits of its parameters.
         noise: fit the scale of the measurement noise, too, where measurements state one.
         seed: of the starts of the fits.
-        every_profile: of all that are fitted, not only of the likeliest.
         progress: told what is done, and which share of all.
         **keywords: parameters of the task.
 
@@ -212,7 +213,6 @@ def advise(
     likelihoods: dict[str, WindowLikelihood] = {}
     outliers = True
     for i, (name, family) in enumerate(families.items()):
-        progress(f"fitting {name}", 0.6 * i / len(families))
         tried = [_with_noise(problem, family, noise, name in (own or {}), robust) for robust in (False, True)]
         for tunable in tried if outliers and tried[1] != tried[0] else tried[:1]:
             begin = tunable
@@ -222,6 +222,8 @@ def advise(
             found = fit(likelihood, begin, seed)
             if name not in fits or found.log_likelihood > fits[name].log_likelihood + DROP:
                 fits[name], tunables[name], likelihoods[name] = found, tunable, likelihood
+        mean = fits[name].log_likelihood / fits[name].measurements
+        progress(f"fitted {name}: {mean:.3f} nats per measurement", 0.6 * (i + 1) / len(families))
         if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
             outliers = OUTLIER_SHARE in fits[name].values
     makers = {
@@ -239,7 +241,7 @@ def advise(
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
         return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
 
-    progress("replaying the recording", 0.6)
+    progress(_first_verdict(fits, tunables, len(shipped)), 0.6)
     judgement = judge(makers)
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.items() if name not in anchored}
@@ -247,7 +249,15 @@ def advise(
     rival, best = judgement.rival(), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
-    chosen = _likeliest([c for c in competitors if c.fitted and c.name not in anchored])
+    candidates = [c for c in competitors if c.fitted and c.name not in anchored]
+    chosen = dearer = _likeliest(candidates)
+    # Families come the cheapest first: the first that the likeliest does not beat beyond chance.
+    for one in candidates:
+        extra = judgement.difference(dearer.name, one.name)
+        if extra.low <= 0.0 or one is dearer:
+            chosen = one
+            break
+    brought = judgement.difference(dearer.name, chosen.name)
     anchor = None
     for name in anchored:
         anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
@@ -266,9 +276,8 @@ def advise(
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
-    for each in fits if every_profile else [name]:
-        if each not in diverging and each not in profiles:
-            fits[each], profiles[each] = fit_profiles(likelihoods[each], tunables[each], fits[each])
+    if name not in profiles:
+        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     sure = tunable.anchored or chosen.gain.low > 0.0
     advised = chosen if sure else next(c for c in competitors if c.name == rival)
@@ -291,6 +300,25 @@ def advise(
         profiles,
         anchor,
         find_outliers(task, recording, tunable, fits[name]),
+        None if chosen.name == dearer.name or tunable.anchored else (dearer.name, brought),
+    )
+
+
+def _first_verdict(fits: Mapping[str, Fit], tunables: Mapping[str, Tunable], shipped: int) -> str:
+    """Say which family is likeliest on what it was fitted to, one nat less for each parameter."""
+    known = {
+        name: (found.log_likelihood - len(found.values)) / found.measurements
+        for name, found in fits.items()
+        if not tunables[name].anchored
+    }
+    first, *rest = sorted(known, key=known.__getitem__, reverse=True)
+    against = f", {known[first] - known[rest[0]]:.3f} more than {rest[0]}" if rest else ""
+    values = fits[first].values
+    noise = f", noise {10.0 ** values[NOISE_SCALE]:.2f} times as stated" if NOISE_SCALE in values else ""
+    outliers = f", {100.0 * 10.0 ** values[OUTLIER_SHARE]:.1f} % outliers" if OUTLIER_SHARE in values else ""
+    return (
+        f"First verdict, of the fitted ones: {first}, {known[first]:.3f} nats per measurement{against}{noise}{outliers}"
+        f". Next, {shipped} shipped filter{'s' * (shipped != 1)} on the same log"
     )
 
 
@@ -496,6 +524,12 @@ class _Judgement:
         squares = self._squares or self._predicted
         known = name in squares and other in squares
         return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
+
+    def difference(self, name: str, other: str) -> Estimate:
+        """Chosen log-likelihood of a fitted filter less that of another, their parameters paid for, nats."""
+        found = self.predictions.difference(name, other, self.chosen)
+        penalty = (self.parameters[name] - self.parameters[other]) / self.chosen.sum()
+        return Estimate(*(value - penalty for value in found))
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.

@@ -96,6 +96,18 @@ def find_log_setup(problem: Problem, name: Any) -> LogSetup | None:
     return read_artefact(Path(name), problem).log
 
 
+def assumed_parameters(env: str | None, names: Sequence[str]) -> dict[str, float]:
+    """Return the parameters under which a log without deviations is read as the one of an advised filter was; of the
+    first file among the names that says any.
+    """
+    for name in names:
+        if env is not None and name.endswith(SUFFIX):
+            log = find_log_setup(import_problem(env), name)
+            if log is not None and log.assumed:
+                return log.assumed
+    return {}
+
+
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)

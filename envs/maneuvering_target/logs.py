@@ -70,9 +70,6 @@ def read_log(columns: Columns) -> TrackLog:
     assumed = _assume_deviation(columns, position[there], columns.time[there])
     variance = _variances(columns, position, there, assumed)
     said_deviations, deviations_from = _deviations_of(columns, there, assumed)
-    deviation_notes = (
-        (f"{deviations_from}: {_listed(said_deviations)}",) if "no column" in deviations_from else ()
-    )
     stale = _find_stale(columns, position, numpy.sqrt(variance))
     there &= ~stale
     farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
@@ -110,7 +107,7 @@ def read_log(columns: Columns) -> TrackLog:
         parameters,
         float(columns.time[first]),
         time,
-        (*deviation_notes, *_stale_notes(stale), *_gap_notes(rows)),
+        (*_stale_notes(stale), *_gap_notes(rows)),
         {"range_sigma": said_deviations["sigma_x"]} if assumed else _typical_sigma(columns, there),
         said_deviations,
         deviations_from,
@@ -296,12 +293,6 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
         for column, name in names.items()
     }
     return values, "no column states deviations, assumed as of the environment's radar"
-
-
-def _listed(deviations: Mapping[str, float]) -> str:
-    """Deviations in words."""
-    units = {"azimuth_sigma": "degrees"}
-    return ", ".join(f"{name} {value:.3g} {units.get(name, 'm')}" for name, value in deviations.items())
 
 
 def _variances(

@@ -20,6 +20,7 @@ from ..reports.advice import (
     further_sentences,
     held_out_numbers,
     parameter_lines,
+    reading_lines,
 )
 from ..reports.results import settings_of
 from .evaluation import causal_names, departure_lines
@@ -105,6 +106,9 @@ def advise_on_log(
     speeds: Annotated[
         str, typer.Option(help="Speeds that are possible, m/s, from the lowest to the highest.")
     ] = "0.01,1000",
+    agents: Annotated[
+        bool, typer.Option("--agents", help="Compare the shipped learned agents, too; it takes longer.")
+    ] = False,
 ) -> None:
     """Fit every family of filters to a log, and say which one to take, with which numbers.
 
@@ -128,11 +132,20 @@ def advise_on_log(
     )
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
-    shipped = {name: find_competitor(problem, name) for name in causal_names(problem, found)}
-    learned = [name for name in pretrained_agents(problem.id) if name in shipped]
+    for line in reading_lines(found):
+        console.print(line, highlight=False, soft_wrap=True)
+    known = pretrained_agents(problem.id)
+    names = [name for name in causal_names(problem, found) if agents or name not in known]
+    shipped = {name: find_competitor(problem, name) for name in names}
+    learned = [name for name in known if name in shipped]
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)
+
+        def progress(what: str, share: float) -> None:
+            bar.update(line, completed=share)
+            bar.say(what)
+
         advice = advise(
             problem,
             found,
@@ -140,12 +153,9 @@ def advise_on_log(
             own,
             noise=noise,
             seed=seed,
-            every_profile=report is not None,
-            progress=lambda what, share: bar.update(line, description=what, completed=share),
+            progress=progress,
             **keywords,
         )
-    for note in found.notes:
-        console.print(note, highlight=False, soft_wrap=True)
     console.print(advice_table(advice, learned))
     departures = list(departure_lines(problem, found, learned, keywords))
     for sentence in [*advice_lines(advice, learned), *departures]:

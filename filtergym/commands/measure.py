@@ -17,7 +17,7 @@ from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record_experiment
 from ..evaluation.rollout import Progress
 from ..evaluation.threads import one_thread
-from ..names import find_competitor, is_learned
+from ..names import assumed_parameters, find_competitor, is_learned
 from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
@@ -171,7 +171,8 @@ def evaluate_policies(
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
     options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset)
     outputs.check()
-    problem, data = find_data(environment, scenario, recording, options, keywords)
+    read = {} if recording is None else assumed_parameters(environment, policy or [])
+    problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
     names = find_names(problem, data, policy)
     check_explained(why or [], names)
     learned = [name for name in names if is_learned(problem, name)]

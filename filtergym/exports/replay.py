@@ -94,7 +94,7 @@ def replay(
     Raises:
         ValueError: for what cannot be exported, or loses every episode.
     """
-    problem, name, maker, scenario, keywords = request
+    problem, name, maker, scenario, keywords = request[:5]
     kind = kind_of(maker)
     control = control_of(maker, kind, None, problem.task, name)
     given = {**getattr(maker, "task_keywords", {}), **keywords}
