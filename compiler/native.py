@@ -1,10 +1,12 @@
 """Programs as code of the processor at hand."""
 
+import contextvars
 import ctypes
 import functools
 import importlib.util
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -115,6 +117,22 @@ def address_of_code(code: Any) -> int:
     return ctypes.cast(code, ctypes.c_void_p).value or 0
 
 
+_EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=False)
+"""Whether programs are optimised before they have run long."""
+
+
+@contextmanager
+def optimised_code() -> Iterator[None]:
+    """Let every program that runs inside be optimised at once, for times that depend neither on a cache nor on how long it
+    has run.
+    """
+    token = _EAGER.set(True)
+    try:
+        yield
+    finally:
+        _EAGER.reset(token)
+
+
 class Code:
     """Code of a program, called as :data:`Native`.
 
@@ -139,7 +157,7 @@ class Code:
     def expect(self, lanes: int) -> None:
         """Prepare to run over so many lanes: make better code where it has become worth its time."""
         self._lanes += lanes
-        if self._optimise is not None and self._lanes > HOT:
+        if self._optimise is not None and (self._lanes > HOT or _EAGER.get()):
             optimise, self._optimise = self._optimise, None
             self.run = optimise()
 
@@ -177,7 +195,7 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
                     )
 
             better = _key(*made_of, repr(OPTIMISED))
-            if cache.holds(better):
+            if cache.holds(better) or (_EAGER.get() and len(steps) < LONG):
                 _CODES[key] = Code(code(OPTIMISED, better))
             else:
                 optimise = functools.partial(code, OPTIMISED, better) if len(steps) < LONG else None

@@ -314,6 +314,13 @@ def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
     assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
 
 
+def test_what_is_timed_is_optimised_at_once(monkeypatch):
+    first, better = quick_setting(native.processor()[1], False)[:2], OPTIMISED[:2]
+    with native.optimised_code():
+        assert settings_used(monkeypatch, chain(7), runs=2) == [better]
+    assert settings_used(monkeypatch, chain(8), runs=2) == [first]
+
+
 def test_long_programs_stay_as_they_are(monkeypatch):
     monkeypatch.setattr(native, "HOT", 40)
     monkeypatch.setattr(native, "LONG", 30)
