@@ -123,8 +123,8 @@ _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=F
 
 @contextmanager
 def optimised_code() -> Iterator[None]:
-    """Let every program that runs inside be optimised at once, for times that depend neither on a cache nor on how long it
-    has run.
+    """Let every program that runs inside be optimised at once: times then depend neither on a cache nor on how long
+    it has run.
     """
     token = _EAGER.set(True)
     try:

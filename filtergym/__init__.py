@@ -30,7 +30,7 @@ def _forget_half_imported() -> None:
         if frame.f_globals.get("__name__") == "importlib._bootstrap":
             return
         frame = frame.f_back
-    getattr(importlib._bootstrap, "_module_locks", {}).clear()  # type: ignore[attr-defined]
+    getattr(importlib._bootstrap, "_module_locks", {}).clear()
     for name, module in list(sys.modules.items()):
         if getattr(getattr(module, "__spec__", None), "_initializing", False):
             del sys.modules[name]
