@@ -18,20 +18,25 @@ import numpy
 import xarray
 
 from ..envs.contract.task import Task
-from ..envs.data.recording import Recording
+from ..envs.data.recording import Recording, fill_arrays, measure_once
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
+from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
+    DROP,
+    NOISE_SCALE,
+    OUTLIER_SHARE,
     Fit,
     Interval,
     Profile,
+    ScaledNoise,
     fit,
-    profile_parameters,
-    search_profiles,
+    fit_profiles,
     with_noise_scale,
+    with_outliers,
 )
 from .problem import Problem
 from .table import Tunable
@@ -154,10 +159,14 @@ class Advice(NamedTuple):
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
-    """Likelihood of the parameters of ``fitted``; of the other fitted ones where that was asked for."""
-
+    """Likelihood of the parameters of ``fitted``."""
     anchor: Anchor | None
     """None where the recording has no second sensor."""
+    outliers: numpy.ndarray
+    """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
+    dearer: tuple[str, Estimate] | None
+    """Likeliest family, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
+    None where it is the fitted one. ``fitted`` is the cheapest of those that it does not beat beyond chance."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -177,7 +186,6 @@ def advise(
     own: Mapping[str, Tunable] | None = None,
     noise: bool = True,
     seed: int = 0,
-    every_profile: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     **keywords: Any,
 ) -> Advice:
@@ -190,7 +198,6 @@ def advise(
         own: further families, such as an estimator of a user's with limits of its parameters.
         noise: fit the scale of the measurement noise, too, where measurements state one.
         seed: of the starts of the fits.
-        every_profile: of all that are fitted, not only of the likeliest.
         progress: told what is done, and which share of all.
         **keywords: parameters of the task.
 
@@ -204,11 +211,21 @@ def advise(
     fits: dict[str, Fit] = {}
     tunables: dict[str, Tunable] = {}
     likelihoods: dict[str, WindowLikelihood] = {}
+    outliers = True
     for i, (name, family) in enumerate(families.items()):
-        progress(f"fitting {name}", 0.6 * i / len(families))
-        tunable = _with_noise(problem, family, noise)
-        likelihood = _likelihood(recording, task, share.fitted, share.warm_up, tunable)
-        fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
+        tried = [_with_noise(problem, family, noise, name in (own or {}), robust) for robust in (False, True)]
+        for tunable in tried if outliers and tried[1] != tried[0] else tried[:1]:
+            begin = tunable
+            if name in fits:
+                begin = dataclasses.replace(tunable, start={**tunable.start, **fits[name].values})
+            likelihood = _likelihood(recording, task, share.fitted, share.warm_up, begin)
+            found = fit(likelihood, begin, seed)
+            if name not in fits or found.log_likelihood > fits[name].log_likelihood + DROP:
+                fits[name], tunables[name], likelihoods[name] = found, tunable, likelihood
+        mean = fits[name].log_likelihood / fits[name].measurements
+        progress(f"fitted {name}: {mean:.3f} nats per measurement", 0.6 * (i + 1) / len(families))
+        if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
+            outliers = OUTLIER_SHARE in fits[name].values
     makers = {
         **shipped,
         **{
@@ -224,7 +241,7 @@ def advise(
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
         return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
 
-    progress("replaying the recording", 0.6)
+    progress(_first_verdict(fits, tunables, len(shipped)), 0.6)
     judgement = judge(makers)
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.items() if name not in anchored}
@@ -232,28 +249,35 @@ def advise(
     rival, best = judgement.rival(), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
-    chosen = _likeliest([c for c in competitors if c.fitted and c.name not in anchored])
+    candidates = [c for c in competitors if c.fitted and c.name not in anchored]
+    chosen = dearer = _likeliest(candidates)
+    # Families come the cheapest first: the first that the likeliest does not beat beyond chance.
+    for one in candidates:
+        extra = judgement.difference(dearer.name, one.name)
+        if extra.low <= 0.0 or one is dearer:
+            chosen = one
+            break
+    brought = judgement.difference(dearer.name, chosen.name)
     anchor = None
     for name in anchored:
         anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
         if anchor.gain > 0.0:
             chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
+    profiles = {}
     if share.apart:  # to all that does not judge
         begin = dataclasses.replace(tunable, start=fits[name].values)
         spans = [*share.fitted, *share.chosen]
         likelihoods[name] = _likelihood(recording, task, spans, share.warm_up, begin)
-        fits[name] = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
+        again = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
+        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, again)
         fitted = make_tuned_policy(f"fitted {name}", tunable, fits[name].values)
         judgement = judge({name: fitted, rival: shipped[rival], best: shipped[best]})
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
-    profiles = {
-        each: _profiles(likelihoods[each], tunables[each], fits[each])
-        for each in (fits if every_profile else [name])
-        if each not in diverging
-    }
+    if name not in profiles:
+        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     sure = tunable.anchored or chosen.gain.low > 0.0
     advised = chosen if sure else next(c for c in competitors if c.name == rival)
@@ -275,6 +299,26 @@ def advise(
         tunables,
         profiles,
         anchor,
+        find_outliers(task, recording, tunable, fits[name]),
+        None if chosen.name == dearer.name or tunable.anchored else (dearer.name, brought),
+    )
+
+
+def _first_verdict(fits: Mapping[str, Fit], tunables: Mapping[str, Tunable], shipped: int) -> str:
+    """Say which family is likeliest on what it was fitted to, one nat less for each parameter."""
+    known = {
+        name: (found.log_likelihood - len(found.values)) / found.measurements
+        for name, found in fits.items()
+        if not tunables[name].anchored
+    }
+    first, *rest = sorted(known, key=known.__getitem__, reverse=True)
+    against = f", {known[first] - known[rest[0]]:.3f} more than {rest[0]}" if rest else ""
+    values = fits[first].values
+    noise = f", noise {10.0 ** values[NOISE_SCALE]:.2f} times as stated" if NOISE_SCALE in values else ""
+    outliers = f", {100.0 * 10.0 ** values[OUTLIER_SHARE]:.1f} % outliers" if OUTLIER_SHARE in values else ""
+    return (
+        f"First verdict, of the fitted ones: {first}, {known[first]:.3f} nats per measurement{against}{noise}{outliers}"
+        f". Next, {shipped} shipped filter{'s' * (shipped != 1)} on the same log"
     )
 
 
@@ -307,8 +351,38 @@ def fit_all(
     tunable = _with_noise(problem, family, noise)
     likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
     found = fit(likelihood, tunable, seed)
-    profiles = _profiles(likelihood, tunable, found)
+    robust = _with_noise(problem, family, noise, robust=True)
+    if robust != tunable:
+        begin = dataclasses.replace(robust, start={**robust.start, **found.values})
+        other = _likelihood(recording, task, spans, share.warm_up, begin)
+        again = fit(other, begin, seed)
+        if again.log_likelihood > found.log_likelihood + DROP:
+            tunable, likelihood, found = robust, other, again
+    found, profiles = fit_profiles(likelihood, tunable, found)
     return tunable, found, {name: each.interval for name, each in profiles.items()}
+
+
+def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit) -> numpy.ndarray:
+    """Return which measurements of a recording a fitted filter takes for outliers, ``(E, T)``; none where it knows no
+    outliers.
+    """
+    is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
+    if OUTLIER_SHARE not in found.values:
+        return is_outlier
+    template, like = measure_once(type(task)(task.parameters), recording.measurements)
+    initial = {name: numpy.moveaxis(values, 0, -1) for name, values in recording.initial.items()}
+    estimator = tunable.apply(found.values)[1](task)
+    # The scale of the noise is outside, the choice between two updates within.
+    scaled = estimator if isinstance(estimator, ScaledNoise) else ScaledNoise(estimator, lambda m, _: m, 1.0)
+    memory = scaled.start(fill_arrays(template, initial.__getitem__, numpy), len(recording.names))
+    for k in range(recording.seconds.shape[1]):
+        row = {name: numpy.moveaxis(values[:, k], 0, -1) for name, values in recording.measurements.items()}
+        measurement = task.world.mask_missing(fill_arrays(like, row.__getitem__, numpy))
+        with numpy.errstate(all="ignore"):
+            taken = scaled.scaled(measurement, scaled.factor)
+            usual, wide, is_outlier[:, k], _ = scaled.own.compare(taken, memory)
+        memory = select_nested(is_outlier[:, k], wide[2], usual[2])
+    return is_outlier & (numpy.arange(is_outlier.shape[1]) < recording.rows[:, None])
 
 
 def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
@@ -317,12 +391,18 @@ def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -
     return make_task(problem.task, None, **{**parameters, **keywords, "horizon": 1})
 
 
-def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it."""
+def _with_noise(
+    problem: Problem, family: Tunable, noise: bool, own: bool = False, robust: bool = False
+) -> Tunable:
+    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it. Where it is
+    to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may be less.
+    """
     log_format = problem.task.log_format
-    if not noise or family.anchored or log_format is None or log_format.scale_noise is None:
+    if family.anchored or log_format is None or log_format.scale_noise is None:
         return family
-    return with_noise_scale(family, log_format.scale_noise)
+    if robust and not own:
+        family = with_outliers(family, log_format.scale_noise)
+    return with_noise_scale(family, log_format.scale_noise) if noise else family
 
 
 def _likelihood(
@@ -342,12 +422,6 @@ def _likelihood(
         every = max(1, round(APART / _interval(recording)))
     windows = cut_windows(recording, task, spans, warm_up, every)
     return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
-
-
-def _profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
-    """Profiles of the parameters, of an anchored filter by searches, since size and duration of its error are tied."""
-    find = search_profiles if tunable.anchored else profile_parameters
-    return find(likelihood, tunable, found)
 
 
 def _compare_anchored(
@@ -450,6 +524,12 @@ class _Judgement:
         squares = self._squares or self._predicted
         known = name in squares and other in squares
         return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
+
+    def difference(self, name: str, other: str) -> Estimate:
+        """Chosen log-likelihood of a fitted filter less that of another, their parameters paid for, nats."""
+        found = self.predictions.difference(name, other, self.chosen)
+        penalty = (self.parameters[name] - self.parameters[other]) / self.chosen.sum()
+        return Estimate(*(value - penalty for value in found))
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.

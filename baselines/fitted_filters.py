@@ -1,14 +1,19 @@
-"""Files of fitted filters: what was fitted to a recording, to be evaluated on others."""
+"""Files of advised filters: what to run on logs like the one that was advised on, and how to read them."""
 
+import importlib.metadata
 import json
+import math
+import reprlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy
 
 from ..evaluation.files import write_text
 from ..evaluation.stored import fits, read_json
-from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
+from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable
 from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_value
@@ -58,37 +63,120 @@ def own_family(name: str, cls: Any) -> Tunable:
     return replace(tunable(cls, **declared), in_lanes=bool(getattr(cls, "lane_parameters", False)))
 
 
-def write_fitted(
-    path: Path, problem: Problem, name: str, found: Fit, intervals: Mapping[str, Interval], command: str
+class LogSetup(NamedTuple):
+    """How the log was read that a filter is advised for: what one needs to feed the filter in the same way."""
+
+    interval: float
+    """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
+    parameters: dict[str, Any]
+    """Of the task."""
+    columns: dict[str, str]
+    """Names in the log, by what the columns are called here; empty where the log was no table."""
+    deviations: dict[str, float]
+    """Of measurements that state none, in the names and units of the columns."""
+    deviations_from: str
+    """Who says so."""
+
+    @property
+    def assumed(self) -> dict[str, float]:
+        """Parameters under which a log without deviations is read as the fitted one was; empty where it stated any."""
+        isotropic = self.deviations.get("sigma_x") if "no column" in self.deviations_from else None
+        return {} if isotropic is None else {"range_sigma": isotropic}
+
+
+class Artefact(NamedTuple):
+    """What a file of an advised filter holds."""
+
+    filter: str
+    """Name of the family, or of the shipped filter."""
+    fitted: TunedPolicy | None
+    """What makes it; None for a shipped one."""
+    log: LogSetup | None
+    """None in files that do not say it."""
+
+
+def setup_of(problem: Problem, recording: Any) -> LogSetup:
+    """Return how a recording was read."""
+    parameters = recording.scenario(problem.task, {}).parameters
+    left_out = "horizon", "decision_interval"
+    deviations, source = dict(recording.deviations), recording.deviations_from
+    if not deviations and "variance" in recording.measurements:
+        there = recording.measurements["available"] > 0.0
+        usual = numpy.sqrt(numpy.median(recording.measurements["variance"][there], axis=0))
+        deviations = {f"sigma_{axis}": float(each) for axis, each in zip("xy", usual, strict=True)}
+        source = "median of the recording"
+    return LogSetup(
+        float(f"{numpy.nanmedian(numpy.diff(recording.seconds, axis=1)):.9g}"),
+        {name: value for name, value in parameters.items() if name not in left_out},
+        dict(recording.columns),
+        {name: round_value(value) for name, value in deviations.items()},
+        source,
+    )
+
+
+def write_advised(
+    path: Path,
+    problem: Problem,
+    name: str,
+    recording: Any,
+    found: Fit | None,
+    intervals: Mapping[str, Interval],
+    command: str,
+    **further: Any,
 ) -> None:
-    """Write a fitted filter.
+    """Write an advised filter, fitted or shipped, with how its log was read.
 
     Args:
         path: of the file, whose name ends in ``SUFFIX``.
         problem: of the filter.
-        name: of its family.
-        found: of the fit.
+        name: of its family, or of the shipped filter.
+        recording: that it was fitted to, or judged on.
+        found: of the fit; None for a shipped filter.
         intervals: of its parameters.
         command: that made it.
+        **further: what else is to be known of it, such as its held-out numbers.
     """
-    table = {
+    log = setup_of(problem, recording)
+    known = problem.task.log_format.columns if problem.task.log_format else {}
+    seconds = recording.seconds
+    table: dict[str, Any] = {
         "environment": problem.id,
         "filter": name,
-        "values": {key: round_value(value) for key, value in found.values.items()},
+        "fitted": found is not None,
+        "values": {} if found is None else {key: round_value(value) for key, value in found.values.items()},
         "intervals": {
             key: [round_value(each.low), round_value(each.high)] for key, each in intervals.items()
         },
-        "measurements": found.measurements,
+        "measurements": None if found is None else found.measurements,
+        "log": {
+            **log._asdict(),
+            "units": {key: known[key] for key in log.columns if key in known},
+            "noise_scale": 1.0 if found is None else round_value(10.0 ** found.values.get(NOISE_SCALE, 0.0)),
+            "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
+            if found is not None and OUTLIER_SHARE in found.values
+            else None,
+            "start": "from the first two measurements: the second, and their difference over the time between them",
+            "ranges": {
+                "measurements": int(recording.rows.sum()),
+                "seconds": round_value(float(numpy.nanmax(seconds))),
+                "interval": [
+                    round_value(float(edge(numpy.diff(seconds, axis=1))))
+                    for edge in (numpy.nanmin, numpy.nanmax)
+                ],
+            },
+        },
+        **further,
+        "version": importlib.metadata.version("filtergym"),
         "command": command,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")
 
 
-def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
-    """Return what makes a fitted filter.
+def read_artefact(path: Path, problem: Problem) -> Artefact:
+    """Read the file of an advised filter.
 
     Args:
-        path: of a file of :func:`write_fitted`.
+        path: of a file of :func:`write_advised`.
         problem: in which it is to run.
 
     Raises:
@@ -103,23 +191,83 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
         raise ValueError(f"{path} is no fitted filter: filtergym advise writes one")
     if table["environment"] != problem.id:
         raise ValueError(f"{path} is fitted to {table['environment']}, not to {problem.id}")
+    fitted = table.get("fitted", True)
+    if fitted not in (True, False):
+        raise ValueError(f"{path}: fitted must be true or false, got {reprlib.repr(fitted)}")
+    made = _make_fitted(path, problem, table["filter"], table["values"]) if fitted else None
+    return Artefact(table["filter"], made, _read_setup(path, problem, table.get("log")))
+
+
+def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
+    """Check what a file says of its log as if it were typed."""
+    if log is None:
+        return None
+    kinds = {
+        "interval": float,
+        "parameters": dict[str, Any],
+        "columns": dict[str, str],
+        "deviations": dict[str, float],
+        "deviations_from": str,
+    }
+    log_format = problem.task.log_format
+    names = {
+        "time",
+        "recording",
+        "latitude",
+        "longitude",
+        "altitude",
+        *(log_format.columns if log_format else ()),
+    }
+    if (
+        not isinstance(log, dict)
+        or not all(fits(log.get(key), kind) for key, kind in kinds.items())
+        or not 0.0 < log["interval"] < math.inf
+        or not {*log["columns"], *log["deviations"]} <= names
+        or not all(0.0 < value < math.inf for value in log["deviations"].values())
+    ):
+        raise ValueError(f"{path}: what it says of its log is none: filtergym advise writes it anew")
+    try:
+        problem.task.Parameters(**log["parameters"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: parameters of its log: {error}") from error
+    return LogSetup(**{key: log[key] for key in kinds})
+
+
+def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
+    """Return what makes a fitted filter; arguments and refusals as of :func:`read_artefact`.
+
+    Raises:
+        ValueError: if it names a shipped filter.
+    """
+    found = read_artefact(path, problem)
+    if found.fitted is None:
+        raise ValueError(
+            f"{path} names the shipped filter {found.filter!r}, which has no parameters of its own"
+        )
+    return found.fitted
+
+
+def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, float]) -> TunedPolicy:
+    """Return what makes a filter of a family with values of a file."""
     families = families_of(problem)
-    if table["filter"] not in families:
-        raise ValueError(f"{path}: {problem.id} has no filter {table['filter']!r} that can be fitted")
-    family = families[table["filter"]]
-    values = table["values"]
-    if NOISE_SCALE in values:
-        log_format = problem.task.log_format
-        if log_format is None or log_format.scale_noise is None:
-            raise ValueError(f"{path}: measurements of {problem.id} state no deviations that could be scaled")
-        family = with_noise_scale(family, log_format.scale_noise)
+    if name not in families:
+        raise ValueError(f"{path}: {problem.id} has no filter {name!r} that can be fitted")
+    family = families[name]
+    for wrapped, wrap in ((OUTLIER_SHARE, with_outliers), (NOISE_SCALE, with_noise_scale)):
+        if wrapped in values:
+            log_format = problem.task.log_format
+            if log_format is None or log_format.scale_noise is None:
+                raise ValueError(
+                    f"{path}: measurements of {problem.id} state no deviations that could be scaled"
+                )
+            family = wrap(family, log_format.scale_noise)
     if values.keys() != family.limits.keys():
         raise ValueError(
-            f"{path} must give {table['filter']!r} a number for each of {', '.join(family.limits)}, got "
+            f"{path} must give {name!r} a number for each of {', '.join(family.limits)}, got "
             f"{', '.join(values):.200}"
         )
     try:
         values = check_values(values, family)
     except ValueError as error:
-        raise ValueError(f"{path}: filter {table['filter']!r}: {error}") from error
-    return make_tuned_policy(f"{problem.id} fitted {table['filter']}", family, values)
+        raise ValueError(f"{path}: filter {name!r}: {error}") from error
+    return make_tuned_policy(f"{problem.id} fitted {name}", family, values)

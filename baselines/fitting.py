@@ -3,7 +3,11 @@
 The likelihood of a filter's one-step predictions is that of the recording under its model (Schweppe, IEEE Trans. IT 11,
 1965). It is maximised by L-BFGS-B within the limits of the parameters from several starts. The intervals are profile
 likelihood's: a value lies inside where the likelihood, the other parameters adapted, is at most half the chi-square
-quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988).
+quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988). Where a profile finds a point of
+higher likelihood, the fit starts again from there.
+
+Measurements may come from a mixture: most have the stated deviations, a fitted share has ``WIDE`` times as large ones
+(Huber, Annals of Mathematical Statistics 35, 1964). Two updates are made, and the likelier one is kept.
 """
 
 import dataclasses
@@ -13,7 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..evaluation.competitors import Likelihood
 from ..evaluation.likelihood import WindowLikelihood
+from ..filters.array_namespace import select_nested
 from .table import Tunable
 
 STARTS = 3
@@ -23,9 +29,18 @@ DROP = 1.9207
 NOISE_SCALE = "log10_noise_scale"
 """Name of the parameter that multiplies the stated deviations of the measurements, as its decimal logarithm."""
 NOISE_LIMITS = (-1.5, 0.0, 1.5)
+OUTLIER_SHARE = "log10_outlier_share"
+"""Name of the parameter that is the share of outliers among the measurements, as its decimal logarithm."""
+SHARE_LIMITS = (-4.0, -1.7, -0.5)
+WIDE = 20.0
+"""Times that the deviations of an outlier are those of the other measurements."""
+SCREENED = 24
+"""Points inside the limits of which the likeliest ones begin a fit."""
+HIGHER = 0.1
+"""Nats by which a point of a profile must be likelier than the fit for the fit to start again from there."""
+MOST_RESTARTS = 6
 STEPS = 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0, 12.0
 """Distances from the maximum at which a profile is computed, in units of the parameter's deviation at the maximum."""
-NEWTON_STEPS = 5
 IDENTIFIABLE = 100.0
 """Largest ratio of the ends of an interval of a size; what is wider says nothing."""
 
@@ -109,6 +124,66 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
     return dataclasses.replace(tunable, limits=limits, start=start_values, apply=apply)
 
 
+class RobustEstimator:
+    """An estimator that takes every measurement either as stated or as an outlier, whichever is likelier.
+
+    Args:
+        own: the estimator.
+        scaled: multiplies the deviations stated in a measurement by a factor.
+        share: of outliers, a number, or ``(N,)``.
+        xp: array namespace.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, own: Any, scaled: Callable[[Any, Any], Any], share: Any, xp: Any) -> None:
+        self.own, self.scaled, self.share, self.xp = own, scaled, share, xp
+        self.traceable = getattr(own, "traceable", False)
+
+    def start(self, initial: Any, N: int) -> Any:
+        """Start as the estimator does."""
+        return self.own.start(initial, N)
+
+    def update(self, measurement: Any, memory: Any) -> Any:
+        """Update as stated and with wide deviations, and keep the likelier result; say the mixture's likelihood."""
+        usual, wide, is_outlier, log_likelihood = self.compare(measurement, memory)
+        mean, covariance, after = (
+            select_nested(is_outlier, other, one) for one, other in zip(usual[:3], wide[:3], strict=True)
+        )
+        nis = self.xp.where(is_outlier, wide[3].nis, usual[3].nis)
+        return mean, covariance, after, Likelihood(log_likelihood, nis, usual[3].nis_degrees)
+
+    def compare(self, measurement: Any, memory: Any) -> tuple[Any, Any, Any, Any]:
+        """Return both updates, whether the second is likelier, and the log-likelihood of the mixture, ``(N,)``."""
+        xp = self.xp
+        usual = self.own.update(measurement, memory)
+        wide = self.own.update(self.scaled(measurement, WIDE), memory)
+        one = usual[3].log_likelihood + xp.log(1.0 - self.share)
+        other = wide[3].log_likelihood + xp.log(self.share)
+        # Of a measurement that was not received both are NaN: the first update is kept.
+        is_outlier = other > one
+        top = xp.where(is_outlier, other, one)
+        return usual, wide, is_outlier, top + xp.log(xp.exp(one - top) + xp.exp(other - top))
+
+
+def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
+    """Return a tunable estimator with the share of outliers as one more parameter; arguments as of
+    :func:`with_noise_scale`.
+    """
+    low, start, high = SHARE_LIMITS
+
+    def apply(values: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+        own = {name: value for name, value in values.items() if name != OUTLIER_SHARE}
+        keywords, make = tunable.apply(own)
+        share = 10.0 ** values[OUTLIER_SHARE]
+        return keywords, lambda task: RobustEstimator(make(task), scaled, share, task.xp)
+
+    limits = {**tunable.limits, OUTLIER_SHARE: (low, high)}
+    return dataclasses.replace(
+        tunable, limits=limits, start={**tunable.start, OUTLIER_SHARE: start}, apply=apply
+    )
+
+
 def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: int = STARTS) -> Fit:
     """Maximise the likelihood of a recording's measurements.
 
@@ -130,21 +205,22 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
             return 1e6, numpy.zeros(len(vector))
         return -value / likelihood.count, -gradient / likelihood.count
 
-    ends = []
-    for i in range(starts):
-        begin = low + (high - low) * generator.uniform(0.15, 0.85, len(low))
-        if i == 0:
-            begin = numpy.clip([tunable.start[name] for name in tunable.limits], low, high)
-        ends.append(
-            minimize(
-                objective,
-                begin,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=limits,
-                options={"maxiter": 80, "ftol": 1e-9},
-            )
+    first = numpy.clip([tunable.start[name] for name in tunable.limits], low, high)
+    begins = [first]
+    if starts > 1:
+        inside = low + (high - low) * generator.uniform(0.05, 0.95, (SCREENED, len(low)))
+        begins += list(inside[numpy.argsort(-likelihood(inside.T))[: starts - 1]])
+    ends = [
+        minimize(
+            objective,
+            begin,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=limits,
+            options={"maxiter": 80, "ftol": 1e-9},
         )
+        for begin in begins
+    ]
     best = min(ends, key=lambda end: float(end.fun))
     edge = 1e-3 * (high - low)
     at_limit = tuple(
@@ -179,44 +255,32 @@ class _Place(NamedTuple):
     """From the best value of that parameter."""
 
 
-def profile_parameters(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
-    """Profile likelihood of all parameters, side by side.
+def fit_profiles(
+    likelihood: WindowLikelihood, tunable: Tunable, found: Fit
+) -> tuple[Fit, dict[str, Profile]]:
+    """Profile likelihood of all parameters, the others searched anew at every step; and the fit at its maximum.
 
-    Every parameter is moved away from its best value, in steps to either limit; the others follow by Newton's method
-    with the curvature at the maximum, which only ever raises the likelihood: an interval may be too narrow where the
-    curvature changes much, never too wide by it.
-
-    Args:
-        likelihood: of the tunable's parameters.
-        tunable: the estimator, with limits.
-        found: of :func:`fit`.
-    """
-    names = list(tunable.limits)
-    limits = numpy.array(list(tunable.limits.values())).T
-    best = numpy.array([found.values[name] for name in names])
-    information = _information(likelihood, best, limits)
-    points, places = _profile_points(best, information, limits)
-    held = numpy.array([place.parameter for place in places])
-    value = likelihood(points)
-    if len(names) > 1:
-        value = _climb(likelihood, points, value, held, information, limits)
-    # The maximum may turn out to be none: then the drop is counted from the highest point.
-    drops = max(found.log_likelihood, float(value.max())) - value
-    at_best = max(found.log_likelihood, float(value.max())) - found.log_likelihood
-    return {name: _profile(best[i], i, places, drops, at_best) for i, name in enumerate(names)}
-
-
-def search_profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
-    """Profile likelihood of all parameters, whose others are searched anew at every step.
-
-    As :func:`profile_parameters`, and right where parameters are tied so closely that one curvature does not lead along
-    their ridge, as are size and duration of an error; one run after another, so that it takes longer.
+    Where a step of a profile is likelier than the fit, the fit was none: it starts again from there.
 
     Args:
         likelihood: of the tunable's parameters.
         tunable: the estimator, with limits.
         found: of :func:`fit`.
     """
+    for _ in range(MOST_RESTARTS):
+        profiles, higher = _search_profiles(likelihood, tunable, found)
+        if higher is None:
+            return found, profiles
+        start = dict(zip(tunable.limits, map(float, higher), strict=True))
+        again = fit(likelihood, dataclasses.replace(tunable, start=start), starts=1)
+        found = again._replace(spread=found.spread + again.log_likelihood - found.log_likelihood)
+    return found, _search_profiles(likelihood, tunable, found, stop=False)[0]
+
+
+def _search_profiles(
+    likelihood: WindowLikelihood, tunable: Tunable, found: Fit, stop: bool = True
+) -> tuple[dict[str, Profile], numpy.ndarray | None]:
+    """Profiles, and a point that is likelier than the fit, at which the search ends if it is to ``stop``."""
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
@@ -225,15 +289,17 @@ def search_profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) 
         places: list[_Place] = []
         drops: list[float] = []
         for sign in (-1.0, 1.0):
-            walked, lower = _walk_profile(likelihood, limits, found, best, i, sign, float(deviation[i]))
+            walked, lower, point = _walk_profile(
+                likelihood, limits, found, best, i, sign, float(deviation[i]), stop
+            )
+            if stop and lower and lower[-1] < -HIGHER:
+                return {}, point
             places, drops = [*places, *walked], [*drops, *lower]
         profiles[name] = _profile(best[i], i, places, numpy.array(drops))
-    return profiles
+    return profiles, None
 
 
-def _profile(
-    best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray, at_best: float = 0.0
-) -> Profile:
+def _profile(best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray) -> Profile:
     """Put the places at which a parameter was held in order, with the best one, and find its interval."""
     (low, open_low), (high, open_high) = (
         _profile_end(places, drops, parameter, sign) for sign in (-1.0, 1.0)
@@ -242,7 +308,7 @@ def _profile(
     values = numpy.array([*(best + places[k].sign * places[k].distance for k in mine), best])
     order = numpy.argsort(values)
     interval = Interval(float(best - low), float(best + high), open_low, open_high)
-    return Profile(values[order], numpy.append(drops[mine], at_best)[order], interval)
+    return Profile(values[order], numpy.append(drops[mine], 0.0)[order], interval)
 
 
 def _walk_profile(
@@ -253,8 +319,11 @@ def _walk_profile(
     parameter: int,
     sign: float,
     deviation: float,
-) -> tuple[list[_Place], list[float]]:
-    """Places on the way to a limit, up to where the likelihood has fallen far enough, and how far it has at each."""
+    stop: bool,
+) -> tuple[list[_Place], list[float], numpy.ndarray]:
+    """Places on the way to a limit, up to where the likelihood has fallen far enough, how far it has at each, and the
+    last point; with ``stop`` no further than a point that is likelier than the fit.
+    """
     from scipy.optimize import minimize
 
     room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
@@ -280,14 +349,14 @@ def _walk_profile(
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options={"maxiter": 12, "ftol": 1e-6},
+            options={"maxiter": 20, "ftol": 1e-7},
         )
         point[others] = end.x
         places.append(_Place(parameter, sign, float(distance)))
         drops.append(found.log_likelihood + float(end.fun))
-        if drops[-1] > DROP:
+        if drops[-1] > DROP or (stop and drops[-1] < -HIGHER):
             break
-    return places, drops
+    return places, drops, point
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
@@ -299,26 +368,6 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
     floor = 4.0 / (high - low).max() ** 2
     information: numpy.ndarray = (vectors * numpy.clip(eigenvalues, floor, None)) @ vectors.T
     return information
-
-
-def _profile_points(
-    best: numpy.ndarray, information: numpy.ndarray, limits: numpy.ndarray
-) -> tuple[numpy.ndarray, list[_Place]]:
-    """Points ``(P, n)`` on both sides of every parameter, the others where a quadratic likelihood has its ridge."""
-    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(information)))
-    points, places = [], []
-    for i in range(len(best)):
-        others = numpy.delete(numpy.arange(len(best)), i)
-        follow = numpy.linalg.solve(information[numpy.ix_(others, others)], information[others, i])
-        for sign, limit in zip((-1.0, 1.0), limits[:, i], strict=True):
-            room = sign * (limit - best[i])
-            for distance in [*(d for d in numpy.array(STEPS) * deviation[i] if d < room), room]:
-                point = best.copy()
-                point[i] += sign * distance
-                point[others] -= follow * sign * distance
-                points.append(numpy.clip(point, *limits))
-                places.append(_Place(i, sign, float(distance)))
-    return numpy.stack(points, axis=1), places
 
 
 def _profile_end(
@@ -334,42 +383,3 @@ def _profile_end(
             share = (math.sqrt(DROP) - roots[k - 1]) / (roots[k] - roots[k - 1])
             return distances[k - 1] + share * (distances[k] - distances[k - 1]), False
     return distances[-1], True
-
-
-def _climb(
-    likelihood: WindowLikelihood,
-    state: numpy.ndarray,
-    value: numpy.ndarray,
-    held: numpy.ndarray,
-    information: numpy.ndarray,
-    limits: numpy.ndarray,
-) -> numpy.ndarray:
-    """Raise the likelihood of many points, each with one of its parameters held; return it.
-
-    Args:
-        likelihood: that is raised.
-        state: points, ``(P, n)``.
-        value: their log-likelihood, ``(n,)``.
-        held: number of the parameter that each point holds, ``(n,)``.
-        information: curvature at the maximum, ``(P, P)``.
-        limits: of the parameters, ``(2, P)``.
-    """
-    P, count = state.shape
-    step, scale = 1e-4, numpy.ones(count)
-    for _ in range(NEWTON_STEPS):
-        moved = [state + step * numpy.eye(P)[:, [i]] for i in range(P)]
-        found = likelihood(numpy.concatenate(moved, axis=1)).reshape(P, count)
-        with numpy.errstate(invalid="ignore"):
-            gradient = numpy.nan_to_num((found - value) / step, posinf=0.0, neginf=0.0)
-        direction = numpy.zeros_like(state)
-        for i in range(P):
-            others, mine = numpy.delete(numpy.arange(P), i), numpy.flatnonzero(held == i)
-            direction[numpy.ix_(others, mine)] = numpy.linalg.solve(
-                information[numpy.ix_(others, others)], gradient[numpy.ix_(others, mine)]
-            )
-        trial = numpy.clip(state + scale * direction, limits[0][:, None], limits[1][:, None])
-        risen = likelihood(trial)
-        better = risen > value
-        state, value = numpy.where(better, trial, state), numpy.where(better, risen, value)
-        scale = numpy.where(better, numpy.minimum(1.0, 2.0 * scale), 0.25 * scale)
-    return value

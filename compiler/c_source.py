@@ -144,9 +144,9 @@ def literal(value: float, scalar: Scalar = DOUBLE) -> str:
     What is beyond the range of ``float`` is the largest or the smallest normal number that it has.
     """
     if value != value:
-        return "NAN"
+        return f"({scalar.name})NAN"  # of C they are float
     if math.isinf(value):
-        return "INFINITY" if value > 0.0 else "(-INFINITY)"
+        return f"({'-' * (value < 0.0)}({scalar.name})INFINITY)"
     if is_beyond(value, scalar):
         text = scalar.largest if abs(value) > 1.0 else scalar.smallest
     else:

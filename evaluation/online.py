@@ -25,6 +25,8 @@ from .stepping import SteppingPolicy
 
 LEAST_INTERVAL = 1e-6
 """Of the sampling interval: measurements that are closer in time are the same moment, written twice."""
+MOST_MISSED = 1000
+"""Scans without a measurement, after which a track is another one."""
 REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
 """What a filter may report beside its estimate."""
 
@@ -209,8 +211,24 @@ class OnlineFilter:
             begun = begun._replace(policy=self._policy.begin(range(self.tracks)))
         self._go_on(begun)
 
+    def start_from(self, first: dict[str, Any], second: dict[str, Any]) -> None:
+        """Start the track from its first two measurements, as that of a log starts.
+
+        Args:
+            first: its ``time`` and what the sensors say, as of :meth:`update`.
+            second: likewise.
+
+        Raises:
+            ValueError: for what is missing or unknown, or where two measurements start no track.
+        """
+        for measured in (first, second):
+            self.input.check_names(measured, {**self.input.values, "time": "s"})
+            if measured.get("time") is None:
+                raise ValueError("each of the two measurements needs its time")
+        self.start(**self.input.start_from(first, second), time=second["time"])
+
     def update(self, time: Any = None, **values: Any) -> Estimate:
-        """Take a measurement in.
+        """Take a measurement in; one of the same time as the last is fused with it, where the sensors allow it.
 
         Args:
             time: s, a number or ``(N,)``; default: one sampling interval after the last.
@@ -226,12 +244,48 @@ class OnlineFilter:
         before = self._running()
         last = before.input["time"]
         at = last + self._default_interval() if time is None else self._times(time)
-        if not (at > last).all():
+        together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
+        if not ((at > last).all() or together):
             raise ValueError(
                 f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(time)}"
             )
-        self._check_interval(at - last, time)
         self.input.check_names(values, self.input.values)
+        if together:
+            return self._fuse(at, values)
+        self._check_interval(at - last, time)
+        for scan in self._missed_scans(last, at):
+            self._step(scan, {})
+        return self._step(at, values)
+
+    def _fuse(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
+        """Take in one more measurement of the same time."""
+        saved = self.save()
+        found = self._step(at, values)
+        if not (numpy.isfinite(found.mean).all() and numpy.isfinite(found.covariance).all()):
+            self.restore(saved)
+            raise ValueError(
+                f"{self.name!r} cannot take two measurements of one time, {_plain(at)} s: give the second a later one"
+            )
+        return found
+
+    def _missed_scans(self, last: numpy.ndarray, at: numpy.ndarray) -> list[numpy.ndarray]:
+        """Times of the scans between that missed the target, as a log that is read has them; none where the filter was
+        not advised for a log.
+        """
+        interval = getattr(self.task.recording, "scan_interval", None)
+        if interval is None:
+            return []
+        scans = int(max(numpy.rint((at - last) / interval).max(), 1))
+        if scans > MOST_MISSED:
+            raise ValueError(
+                f"{_plain(at - last)} s lie between two measurements, {scans - 1:,} scans of {interval:g} s: start the "
+                "track anew"
+            )
+        return [last + (at - last) * number / scans for number in range(1, scans)]
+
+    def _step(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
+        """Advance to a time and take in what came."""
+        before = self._running()
         measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
         stepper = self._stepper

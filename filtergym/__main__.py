@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import gc
 import importlib
 import inspect
 import os
@@ -21,6 +22,7 @@ from rich.console import Console
 from . import __version__
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
+from .compiler.program import without_collection
 from .envs.contract.failures import own_line
 from .envs.engine.catalogue import modules_from
 
@@ -119,7 +121,12 @@ def import_command(command: Callable[..., None] | str) -> Callable[..., None]:
     if not isinstance(command, str):
         return command
     module, _, name = command.partition(":")
-    function: Callable[..., None] = getattr(importlib.import_module(f"{__package__}.commands.{module}"), name)
+    place = f"{__package__}.commands.{module}"
+    if place not in sys.modules:
+        with without_collection():  # a hundred thousand objects come, none of which is garbage
+            importlib.import_module(place)
+        gc.freeze()  # they stay to the end: nobody need look through them again
+    function: Callable[..., None] = getattr(sys.modules[place], name)
     return function
 
 

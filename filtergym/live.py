@@ -12,7 +12,7 @@ from .evaluation.competitors import kind_of, make_competitor
 from .evaluation.evaluate import control_of
 from .evaluation.online import OnlineFilter
 from .evaluation.stepping import SteppingPolicy
-from .names import find_competitor, import_problem, with_normalisation
+from .names import find_competitor, find_log_setup, import_problem, with_normalisation
 
 
 def online(
@@ -35,7 +35,8 @@ def online(
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         policy: a name or a path, see :func:`~filtergym.names.competitor`, or an object or a class as in
-            :func:`~filtergym.evaluate`.
+            :func:`~filtergym.evaluate`. A file of ``filtergym advise`` brings the interval, the noise level and the
+            parameters of the log that it was advised for.
         control: demand this control; by default the policy's own.
         scenario: whose parameters are taken; default: the environment's.
         tracks: how many are followed side by side.
@@ -54,11 +55,18 @@ def online(
     name = str(policy) if named else type(policy).__name__
     maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
     kind = kind_of(maker)
-    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
+    log = find_log_setup(problem, policy)
+    read = {} if log is None else log.parameters
+    keywords = {**read, **getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(
         find_scenario(problem.task, scenario, keywords),
         flights=(),
-        recording=Feed(regular, second_sensor or getattr(maker, "anchored", False)),
+        recording=Feed(
+            regular,
+            second_sensor or getattr(maker, "anchored", False),
+            () if log is None else tuple(log.deviations.items()),
+            None if log is None else log.interval,
+        ),
     )
     own = control_of(maker, kind, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)

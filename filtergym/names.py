@@ -9,7 +9,7 @@ import xarray
 
 from .agents.gate import GatedMaker
 from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
-from .baselines.fitted_filters import SUFFIX, read_fitted
+from .baselines.fitted_filters import SUFFIX, LogSetup, read_artefact
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.contract.model import Model
 from .envs.data.recording import Recording
@@ -49,7 +49,7 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
     """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
     if isinstance(name, Path) and name.name.endswith(SUFFIX):
-        return read_fitted(name, problem)
+        return _find_advised(problem, name)
     if isinstance(name, Path):
         found = find_learned_policy(problem.task, str(name.absolute()), trust)
         if found is None:
@@ -58,7 +58,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
             )
         return found
     if name.endswith(SUFFIX):
-        return read_fitted(Path(name), problem)
+        return _find_advised(problem, Path(name))
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))
@@ -76,6 +76,36 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
     return check_competitor(name, getattr(holder, attribute))
+
+
+def _find_advised(problem: Problem, path: Path) -> Any:
+    """Return what makes the filter of a file of ``filtergym advise``: a fitted one, or one that is shipped."""
+    found = read_artefact(path, problem)
+    if found.fitted is not None:
+        return found.fitted
+    shipped = [*problem.names, *pretrained_agents(problem.id)]
+    if found.filter not in shipped:
+        raise nearest(f"shipped filter (named by {path})", found.filter, shipped)
+    return find_competitor(problem, found.filter)
+
+
+def find_log_setup(problem: Problem, name: Any) -> LogSetup | None:
+    """Return how the log was read that the filter of a file was advised for; None for anything else."""
+    if not (isinstance(name, str | Path) and str(name).endswith(SUFFIX)):
+        return None
+    return read_artefact(Path(name), problem).log
+
+
+def assumed_parameters(env: str | None, names: Sequence[str]) -> dict[str, float]:
+    """Return the parameters under which a log without deviations is read as the one of an advised filter was; of the
+    first file among the names that says any.
+    """
+    for name in names:
+        if env is not None and name.endswith(SUFFIX):
+            log = find_log_setup(import_problem(env), name)
+            if log is not None and log.assumed:
+                return log.assumed
+    return {}
 
 
 def is_learned(problem: Problem, name: str) -> bool:

@@ -11,7 +11,7 @@ from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
 from filtergym.baselines.advice import advise, share_out
 from filtergym.baselines.fitted_filters import own_family, read_fitted
-from filtergym.baselines.fitting import fit, profile_parameters, with_noise_scale
+from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
@@ -177,7 +177,7 @@ def test_fit_finds_what_made_the_log_and_its_intervals_are_those_of_the_profile(
     best = fit(found, tunable)
     assert best.spread < 1e-3
     assert best.at_limit == ()
-    profiles = profile_parameters(found, tunable, best)
+    best, profiles = fit_profiles(found, tunable, best)
     intervals = {name: each.interval for name, each in profiles.items()}
     for name, true in {"log10_acceleration": math.log10(0.8), "log10_noise_scale": math.log10(2.0)}.items():
         assert intervals[name].low < true < intervals[name].high  # of this seed; coverage is a command
@@ -203,14 +203,14 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
     recording = read(write_log(tmp_path, acceleration=0.0, count=160))
     found, tunable = likelihood_of(recording, "constant-velocity", noise=True)
     best = fit(found, tunable)
-    profiles = profile_parameters(found, tunable, best)
+    best, profiles = fit_profiles(found, tunable, best)
     intervals = {name: each.interval for name, each in profiles.items()}
     assert intervals["log10_acceleration"].open_low
     assert not intervals["log10_acceleration"].open_high
     assert not intervals["log10_noise_scale"].open_low
     assert not intervals["log10_noise_scale"].open_high
     found, tunable = likelihood_of(read(write_log(tmp_path, count=160, seed=1)), "imm-turn")
-    profiles = profile_parameters(found, tunable, fit(found, tunable))
+    _, profiles = fit_profiles(found, tunable, fit(found, tunable))
     intervals = {name: each.interval for name, each in profiles.items()}
     assert any(interval.open_low and interval.open_high for interval in intervals.values())
 
@@ -358,6 +358,10 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
         "Take true, as it is shipped: nothing that was fitted predicts better beyond chance ("
     )
     assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
+    for high, sure in ((-0.1, True), (0.1, False)):
+        fitted = found.fitted._replace(relative_error=Estimate(-0.2, -0.3, high))
+        said = next(iter(advice_lines(found._replace(fitted=fitted), [])))
+        assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
 
 def test_the_best_in_hindsight_is_named_beside(advice):

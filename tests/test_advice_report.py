@@ -47,7 +47,7 @@ def advice(tmp_path_factory):
         patch.setattr(
             advice_module, "families_of", lambda _, log: {n: log_families(log)[n] for n in FAMILIES}
         )
-        return advise(PROBLEM, read_recording(path, PROBLEM.id), shipped, every_profile=True)
+        return advise(PROBLEM, read_recording(path, PROBLEM.id), shipped)
 
 
 def page_of(advice):

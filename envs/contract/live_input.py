@@ -27,10 +27,15 @@ class Feed:
     Args:
         regular: whether every measurement comes, one sampling interval after the one before.
         second_sensor: whether a measurement has the fields that only recordings hold.
+        deviations: of measurements that come without, in the names and units of the columns of a log.
+        scan_interval: s; where more time passes between two measurements, scans between have missed the target; None:
+            the time between is one step.
     """
 
     regular: bool = False
     second_sensor: bool = False
+    deviations: tuple[tuple[str, float], ...] = ()
+    scan_interval: float | None = None
     truth: ClassVar[None] = None
     has_whole_truth: ClassVar[bool] = False
 
@@ -81,6 +86,8 @@ class LiveInput:
 
     counter: ClassVar[str] = "number"
     """Array of the measurement that counts measurements."""
+    fuses: ClassVar[bool] = False
+    """Whether measurements may come at the same time."""
     values: Mapping[str, str]
     start_values: Mapping[str, str]
 
@@ -203,6 +210,14 @@ class LiveInput:
             "time": time,
             "count": given[self.counter],
         }
+
+    def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
+        """Initial mean and covariance from the first two measurements, each with its ``time``.
+
+        Raises:
+            ValueError: if two measurements start no track here, or one lacks what it takes.
+        """
+        raise ValueError(f"a track of {self.task.id} does not start from two measurements: call start")
 
     def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
         """Numbers that stand for what was not received; zeros."""

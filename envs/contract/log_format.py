@@ -41,6 +41,10 @@ class TrackLog(NamedTuple):
     typical: Mapping[str, float] = {}
     """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
     nobody has set them."""
+    deviations: Mapping[str, float] = {}
+    """Typical deviations of what was measured, in the names and units of the columns that state them, or would."""
+    deviations_from: str = ""
+    """Who says so, in words."""
 
 
 class Predicted(NamedTuple):

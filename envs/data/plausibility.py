@@ -193,6 +193,14 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray((values[1:-1] - line) / numpy.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
 
 
+def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
+    """Deviation of the noise of values ``(n, k)`` at times ``(n,)``, n at least 3, from the median distance to the line
+    through their neighbours; at least what 64-bit numbers of their size can tell.
+    """
+    scatter = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, values))))
+    return max(scatter, 1e-9 * float(numpy.abs(values).max(initial=0.0)), 1e-6)
+
+
 def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str]:
     """Return the notes on columns of a table that nobody reads.
 
@@ -236,7 +244,9 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
         ValueError: for the first episode that cannot be true.
     """
     world: Any = task.world  # a RecordedWorld
-    moving = task.log_format is not None and task.log_format.targets_move
+    # Latitude and longitude have a known unit, and their receiver may stand.
+    known_unit = "latitude" in recording.columns
+    moving = task.log_format is not None and task.log_format.targets_move and not known_unit
     seen, sigma = world.all_observations()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
@@ -256,7 +266,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
                 position, deviation = seen[measured, own].T[there], _length(sigma[measured, own].T[there])
             known = len(measured) > 0 and there.sum() >= 3
             if known:
-                _check_scale(time[there], position, deviation, speeds, moving)
+                _check_scale(time[there], position, deviation, speeds, moving, known_unit)
             if truth is not None and rows >= 3:
                 _check_truth(time, truth, [component.name for component in task.components])
             if not known:
@@ -311,10 +321,11 @@ def _check_scale(
     sigma: numpy.ndarray,
     speeds: tuple[float, float],
     moving: bool,
+    known_unit: bool,
 ) -> None:
     """Check that measured positions are metres, by their speed and by their noise."""
     check_speed(time, position, speeds, float(numpy.median(sigma)), moving)
-    if len(time) < FEWEST:
+    if len(time) < FEWEST or known_unit:
         return
     # From end to end: from one to the next a speed may be all noise.
     speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))

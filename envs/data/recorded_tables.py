@@ -260,8 +260,11 @@ def read_columns(
     # All that begin with truth_, because components follow from the parameters.
     read, names, notes = read_table(path, ColumnNames(known, TRUTH))
     names = [name.lower() for name in names]
+    original: dict[str, str] = {}
     if log_format.plane:
+        before = names
         read, names = _rename_aliases(read, names)
+        original = {new: old for old, new in zip(before, names, strict=True) if new != old}
     time_name = next((name for name in TIME if name in read), None)
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
@@ -297,7 +300,7 @@ def read_columns(
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _side_by_side(path, cls, keywords, parts, names, notes)
+    return _side_by_side(path, cls, keywords, parts, names, notes, {**original, "time": time_name})
 
 
 def _add_truth(
@@ -378,8 +381,11 @@ def _side_by_side(
     parts: list[tuple[Columns, TrackLog]],
     names: list[str],
     said: Iterable[str],
+    original: Mapping[str, str],
 ) -> Recording:
-    """Put the recordings of a file, whose columns have these names, side by side; ``said`` was told of its reading."""
+    """Put the recordings of a file, whose columns have these names, side by side; ``said`` was told of its reading, and
+    ``original`` gives what some columns are called in the file.
+    """
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)
@@ -415,6 +421,9 @@ def _side_by_side(
                 log_time=_take_rows(own.log_time, found.rows)[None],
                 started=numpy.array([found.start - own.time[0]]),
                 typical={name: value for name, value in found.typical.items() if name not in keywords},
+                columns={name: original.get(name, name) for name in own.table if not name.startswith(TRUTH)},
+                deviations=found.deviations,
+                deviations_from=found.deviations_from,
             )
         )
     return side_by_side(recordings, notes=tuple(limit_notes(notes)))

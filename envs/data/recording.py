@@ -65,6 +65,9 @@ class Recording:
             the log has no row. None: there is no other time than ``seconds``.
         started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
         typical: parameters that follow from what the log states of its errors, where nobody names them.
+        columns: names in the log of the columns that were read, by what they are called here.
+        deviations: typical deviations of what was measured, see :class:`.TrackLog`.
+        deviations_from: who says so.
 
     Raises:
         ValueError: for arrays that do not fit each other, or are not finite where they must be.
@@ -85,6 +88,9 @@ class Recording:
     log_time: numpy.ndarray | None = None
     started: Any = None
     typical: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, str] = field(default_factory=dict)
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    deviations_from: str = ""
 
     def __post_init__(self) -> None:
         episodes, _ = self.seconds.shape

@@ -7,7 +7,7 @@ import numpy
 
 from ...filters import polar
 from ..contract.live_input import LiveInput, Memory
-from .logs import COLUMNS
+from .logs import COLUMNS, two_plot_start
 from .world import Measurement, Odometry
 
 SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
@@ -18,6 +18,7 @@ class PlotInput(LiveInput):
     """A plot, ``x`` and ``y`` or ``range`` and ``azimuth``, or none where the scan missed the target."""
 
     counter = "scan"
+    fuses = True
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return columns of a log; of a second sensor speed and heading at the start, too."""
@@ -70,12 +71,41 @@ class PlotInput(LiveInput):
         distance, azimuth = self.read(values, "range"), numpy.radians(self.read(values, "azimuth"))
         return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)])
 
+    def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
+        """Start a track as a log's starts: the second plot, and the difference of both over the time between them."""
+        plots = [{name: value for name, value in plot.items() if name != "time"} for plot in (first, second)]
+        position = numpy.stack([self._position(plot) for plot in plots])
+        lasted = float(second["time"]) - float(first["time"])
+        if not numpy.isfinite(position).all() or not 0.0 < lasted < numpy.inf:
+            raise ValueError(
+                f"a track starts from two plots, the second later, got {first!r:.200} and {second!r:.200}"
+            )
+        variance = numpy.stack([self._variance(p, plot) for p, plot in zip(position, plots, strict=True)])
+        begun = two_plot_start(
+            numpy.moveaxis(position, -1, 0), numpy.moveaxis(variance, -1, 0), numpy.array([[lasted]])
+        )
+        return {name: numpy.moveaxis(values, 0, -1) for name, values in begun.items()}
+
     def _variance(self, position: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        p = self.parameters
-        stated = numpy.stack([self.read(values, "sigma_x"), self.read(values, "sigma_y")])
-        distance, bearing = self.read(values, "range_sigma"), self.read(values, "azimuth_sigma")
-        distance = numpy.where(numpy.isfinite(distance), distance, p.range_sigma)
-        bearing = numpy.where(numpy.isfinite(bearing), bearing, p.bearing_sigma)
+        """Variances of a plot: as stated with it, else as the file of the filter says, else the radar's."""
+        p, usual = self.parameters, dict(self.task.recording.deviations)
+        stated = numpy.stack([self._deviation(values, "sigma_x"), self._deviation(values, "sigma_y")])
+        distance, bearing = self._deviation(values, "range_sigma"), self._deviation(values, "azimuth_sigma")
+        if "sigma_x" in usual:  # unless the plot itself states those of a radar
+            default = numpy.array([[usual["sigma_x"]], [usual["sigma_y"]]])
+            stated = numpy.where(numpy.isfinite(stated) | numpy.isfinite(distance), stated, default)
+        distance = numpy.where(numpy.isfinite(distance), distance, usual.get("range_sigma", p.range_sigma))
+        bearing = numpy.where(numpy.isfinite(bearing), bearing, usual.get("azimuth_sigma", p.bearing_sigma))
         with numpy.errstate(invalid="ignore"):
             polar_variance = polar.cartesian_variances(position, distance, numpy.radians(bearing))
         return numpy.where(numpy.isfinite(stated), stated**2, polar_variance)
+
+    def _deviation(self, values: Mapping[str, Any], name: str) -> numpy.ndarray:
+        """Return a deviation, ``(N,)``, NaN where none is stated."""
+        found = self.read(values, name)
+        if (found <= 0.0).any():
+            raise ValueError(
+                f"{name} is a standard deviation and must be positive, or None where nothing states it, got "
+                f"{float(found[found <= 0.0][0]):g}"
+            )
+        return found

@@ -14,7 +14,7 @@ import numpy
 from ...filters import polar
 from ..contract.live_input import Feed
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..data.plausibility import check_bearings
+from ..data.plausibility import check_bearings, scatter_of
 from ..data.recorded_tables import Columns
 from ..data.recording import Recording
 from .parameters import ManeuveringTargetParameters
@@ -27,7 +27,7 @@ COLUMNS = {
     "latitude": "degrees, in place of x and y",
     "longitude": "degrees, likewise",
     "altitude": "m above the ellipsoid, beside them; optional",
-    "sigma_x": "m, standard deviation of x; optional",
+    "sigma_x": "m, standard deviation of x; optional, default: the parameter range_sigma, else how positions scatter",
     "sigma_y": "m, likewise",
     "range_sigma": "m, standard deviation of the range; optional, default: the parameter",
     "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
@@ -67,7 +67,9 @@ def read_log(columns: Columns) -> TrackLog:
     if numpy.isfinite(position[~there]).any():
         row = int(numpy.flatnonzero(numpy.isfinite(position).any(axis=1) & ~there)[0])
         raise ValueError(f"row {row} has one coordinate of two")
-    variance = _variances(columns, position, there)
+    assumed = _assume_deviation(columns, position[there], columns.time[there])
+    variance = _variances(columns, position, there, assumed)
+    said_deviations, deviations_from = _deviations_of(columns, there, assumed)
     stale = _find_stale(columns, position, numpy.sqrt(variance))
     there &= ~stale
     farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
@@ -89,7 +91,7 @@ def read_log(columns: Columns) -> TrackLog:
     if "sampling_interval" not in columns.given:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
-    nominal = columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma) ** 2
+    nominal = (assumed or columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma)) ** 2
     said = {
         "scan": numpy.arange(1.0, len(rows) + 1.0),
         "position": numpy.where(seen[:, None], position[rows], 0.0),
@@ -106,7 +108,9 @@ def read_log(columns: Columns) -> TrackLog:
         float(columns.time[first]),
         time,
         (*_stale_notes(stale), *_gap_notes(rows)),
-        _typical_sigma(columns, there),
+        {"range_sigma": said_deviations["sigma_x"]} if assumed else _typical_sigma(columns, there),
+        said_deviations,
+        deviations_from,
     )
 
 
@@ -247,11 +251,60 @@ def _positions(columns: Columns) -> numpy.ndarray:
     return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
 
 
-def _variances(columns: Columns, position: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
-    """Variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot."""
+def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.ndarray) -> float:
+    """Deviation of x and y where nothing states it, m; zero where something does, or a radar has measured them.
+
+    It is what ``--set range_sigma`` says, else how positions scatter about the line through their neighbours, which
+    motion only makes larger: who fits a filter fits it, too.
+
+    Args:
+        columns: of one track.
+        position: of its plots, m, ``(n, 2)``.
+        time: s, likewise.
+    """
+    if (
+        not columns.has("x")
+        or columns.origin is not None
+        or columns.has("sigma_x")
+        or columns.has("range_sigma")
+    ):
+        return 0.0
+    if "range_sigma" in columns.given:
+        return float(columns.given["range_sigma"])
+    return float(f"{scatter_of(time, position):.3g}") if len(time) >= 3 else 0.0
+
+
+def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tuple[dict[str, float], str]:
+    """Typical deviations, as columns would state them, and who says so."""
+    pairs = ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma")
+    for pair in pairs:
+        if columns.has(*pair):
+            medians = {name: float(f"{numpy.nanmedian(columns[name][there]):.6g}") for name in pair}
+            return medians, f"columns {pair[0]} and {pair[1]}"
+    if columns.origin is not None:
+        assumed = float(columns.given["range_sigma"])
+    if assumed:
+        named = "range_sigma" in columns.given
+        who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
+        return dict.fromkeys(pairs[0], assumed), f"no column states deviations of x and y, assumed {who}"
+    names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
+    values = {
+        column: float(columns.given.get(name, getattr(ManeuveringTargetParameters, name)))
+        for column, name in names.items()
+    }
+    return values, "no column states deviations, assumed as of the environment's radar"
+
+
+def _variances(
+    columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
+) -> numpy.ndarray:
+    """Variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot. ``assumed`` is a deviation of both, m."""
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
         variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
+        return variance
+    if assumed:
+        variance[there] = assumed**2
         return variance
     if columns.origin is not None:
         # No radar stands at the first position, by whose distance errors could be told.

@@ -7,14 +7,21 @@ import typer
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
-from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
+from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_advised
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
 from ..evaluation.files import writable_file, write_text
 from ..names import find_competitor
-from ..reports.advice import advice_lines, advice_table, further_sentences, parameter_lines
+from ..reports.advice import (
+    advice_lines,
+    advice_table,
+    further_sentences,
+    held_out_numbers,
+    parameter_lines,
+    reading_lines,
+)
 from ..reports.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
@@ -59,7 +66,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     if name not in families:
         console.print(OWN)
         return
-    write_fitted(out, problem, name, fitted, intervals, command_line())
+    write_advised(out, problem, name, found, fitted, intervals, command_line())
     console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
 
 
@@ -75,9 +82,7 @@ def advise_on_log(
     ] = "filtergym/ManeuveringTarget-v0",
     out: Annotated[
         Path | None,
-        typer.Option(
-            help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
-        ),
+        typer.Option(help=f"File for the advised filter, *{SUFFIX}; evaluate, online and export take it."),
     ] = None,
     report: Annotated[
         Path | None,
@@ -101,6 +106,9 @@ def advise_on_log(
     speeds: Annotated[
         str, typer.Option(help="Speeds that are possible, m/s, from the lowest to the highest.")
     ] = "0.01,1000",
+    agents: Annotated[
+        bool, typer.Option("--agents", help="Compare the shipped learned agents, too; it takes longer.")
+    ] = False,
 ) -> None:
     """Fit every family of filters to a log, and say which one to take, with which numbers.
 
@@ -124,11 +132,20 @@ def advise_on_log(
     )
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
-    shipped = {name: find_competitor(problem, name) for name in causal_names(problem, found)}
-    learned = [name for name in pretrained_agents(problem.id) if name in shipped]
+    for line in reading_lines(found):
+        console.print(line, highlight=False, soft_wrap=True)
+    known = pretrained_agents(problem.id)
+    names = [name for name in causal_names(problem, found) if agents or name not in known]
+    shipped = {name: find_competitor(problem, name) for name in names}
+    learned = [name for name in known if name in shipped]
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)
+
+        def progress(what: str, share: float) -> None:
+            bar.update(line, completed=share)
+            bar.say(what)
+
         advice = advise(
             problem,
             found,
@@ -136,21 +153,28 @@ def advise_on_log(
             own,
             noise=noise,
             seed=seed,
-            every_profile=report is not None,
-            progress=lambda what, share: bar.update(line, description=what, completed=share),
+            progress=progress,
             **keywords,
         )
-    for note in found.notes:
-        console.print(note, highlight=False, soft_wrap=True)
     console.print(advice_table(advice, learned))
     departures = list(departure_lines(problem, found, learned, keywords))
     for sentence in [*advice_lines(advice, learned), *departures]:
         console.print(sentence, highlight=False, soft_wrap=True)
-    if out is not None and advice.fitted.name in own:
+    name = advice.advised.name
+    if out is not None and name in own:
         console.print(OWN)
     elif out is not None:
-        name = advice.fitted.name
-        write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
+        fit = advice.fits[name] if advice.advised.fitted else None
+        write_advised(
+            out,
+            problem,
+            name,
+            found,
+            fit,
+            advice.intervals if fit is not None else {},
+            command_line(),
+            held_out=held_out_numbers(advice),
+        )
         console.print(
             f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
         )

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..baselines.fitted_filters import LogSetup
 from ..compiler.c_source import (
     DOUBLE,
     FLOAT,
@@ -42,9 +43,12 @@ from .traced_filter import (
 
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
 """Under which the text compiles without a warning."""
+MOST_OPTIMISED = 10_000
+"""Operations of an update, at most, that the compiler optimises when it tries the text: of 57,000 that takes it ten
+seconds."""
 WORST = {"double": 1e-3, "float": 0.1}
 """Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
-TAKEN = ("rows", "vectors", "test", "math", "float", "stdio", "stdlib", "string", "time")
+TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
 """Names that a filter's files must not have: those of the others."""
 EPISODES, MEASUREMENTS = 8, 200
 """That are compared before anything is written, at most."""
@@ -68,7 +72,7 @@ class Figures(NamedTuple):
     scratch_bytes: int
     """On the stack, beside the state."""
     difference: float
-    """Largest one to the competitor itself, in its standard deviations, as NumPy runs the programs."""
+    """Largest one to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
     replaced: tuple[float, ...]
     """Constants that float does not have."""
     test: str = ""
@@ -224,16 +228,50 @@ class Writer:
                 f"{state.name} after{start};",
                 f"{state.name} *const next = &after;",
                 *body,
+                *self._guard(),
                 "*state = after;",
+                self._taken(),
             ]
-        elif "next" in " ".join(body):
-            body = [f"{state.name} *const next = state;", *body]
+        else:
+            if "next" in " ".join(body):
+                body = [f"{state.name} *const next = state;", *body]
+            body.append(self._taken())
         if traced.network is not None:
             zero = literal(0.0, self.scalar)
             answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
             body = [f"{real} shown[{traced.shown}];", answers, *body]
+        interval = next((place for place in given.values() if place == "interval"), None)
+        if interval is not None:
+            inside = body
+            body = [
+                f"if (!(measurement->interval >= {literal(0.0, self.scalar)})) return {own.upper()}_REFUSED;",
+                "{",
+                *inside,
+                "}",
+            ]
         parameters = self._parameters("state", "measurement", "estimate")
-        return f"{source.functions}\n{function_text('void', f'{own}_update', parameters, body)}", source
+        return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
+
+    def _guard(self) -> list[str]:
+        """Statements that leave the state alone where the estimate is no finite number."""
+        zero = literal(0.0, self.scalar)
+        rows = [
+            row for row, member in enumerate(self.traced.estimate) if member.name in ("mean", "covariance")
+        ]
+        places = self.structs["estimate"].places
+        terms = " + ".join(f"{zero} * estimate->{places[row]}" for row in rows)
+        return [
+            "/* Zero times what is not finite is not zero. */",
+            f"if (!({terms} == {zero})) return {self.name.upper()}_REJECTED;",
+        ]
+
+    def _taken(self) -> str:
+        """Statement that returns whether there was a measurement."""
+        own = self.name.upper()
+        if "available" not in self.structs["measurement"].places.values():
+            return f"return {own}_TAKEN;"
+        zero = literal(0.0, self.scalar)
+        return f"return measurement->available > {zero} ? {own}_TAKEN : {own}_MISSED;"
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -263,7 +301,8 @@ class Writer:
             "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
             "update": (
                 "Takes in a measurement: predicts to its time, and updates. What was not received is said by the "
-                "measurement itself, as in the environment.",
+                "measurement itself, as in the environment. Returns what became of it; the state stays as it was where "
+                "a measurement is rejected or refused, and the estimate is then of no use.",
                 ("state", "measurement", "estimate"),
             ),
         }
@@ -282,9 +321,20 @@ class Writer:
                 memory,
             ),
         ]
+        statuses = ("TAKEN", "MISSED", "REJECTED", "REFUSED")
+        text.append(
+            comment(
+                "What became of a measurement: taken in; none was received; rejected, since the estimate would be no "
+                "number; refused, since its interval is negative or none."
+            )
+            + "\nenum { "
+            + ", ".join(f"{own.upper()}_{name} = {i}" for i, name in enumerate(statuses))
+            + " };\n"
+        )
         for name, (words, parts) in functions.items():
             arguments = ", ".join(f"{p.type}{p.name}" for p in self._parameters(*parts))
-            text.append(f"{comment(words)}\nvoid {own}_{name}({arguments});\n")
+            answer = "int" if name == "update" else "void"
+            text.append(f"{comment(words)}\n{answer} {own}_{name}({arguments});\n")
         text.append(f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n")
         return "\n".join(text)
 
@@ -345,6 +395,59 @@ class Writer:
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
             told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
+        )
+
+    def log_program(self, log: LogSetup) -> str:
+        """Text of a program that reads a log as it was read when the filter was advised; empty where it was no table of
+        plots.
+        """
+        polar = {"range", "azimuth"} <= {*log.columns}
+        if not polar and ("x" not in log.columns or "latitude" in log.columns):
+            return ""
+        names = ["range", "azimuth"] if polar else ["x", "y"]
+        deviations = (
+            ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
+        )
+        columns = [log.columns.get(name, name).lower() for name in ("time", *names, *deviations)]
+        real, C = self.scalar.name, len(self.components)
+        values = {
+            "scan": "scan", "position_0": "p[0]", "position_1": "p[1]", "variance_0": "v[0]", "variance_1": "v[1]",
+            "available": "available", "interval": "interval", "elapsed": "elapsed",
+        }  # fmt: skip
+        struct = self.structs["measurement"]
+        if not {*struct.columns.values()} <= {*values}:
+            return ""
+        fill = [
+            f"m.{struct.places[row]} = ({real}){values[struct.columns[row]]};"
+            for row in sorted(struct.places)
+        ]
+        begin = self.structs["initial"]
+        initial = {"mean_0": "p[0]", "mean_1": "p[1]", "mean_2": "(p[0] - p0[0]) / lasted"}
+        initial["mean_3"] = "(p[1] - p0[1]) / lasted"
+        for i in range(2):
+            initial[f"covariance_{i}_{i}"] = f"v[{i}]"
+            initial[f"covariance_{i}_{i + 2}"] = initial[f"covariance_{i + 2}_{i}"] = f"v[{i}] / lasted"
+            initial[f"covariance_{i + 2}_{i + 2}"] = f"(v0[{i}] + v[{i}]) / (lasted * lasted)"
+        start = [
+            f"initial.{begin.places[row]} = ({real})({initial.get(begin.columns[row], '0.0')});"
+            for row in sorted(begin.places)
+        ]
+        shown = [identifier(name) for name, _ in self.components]
+        header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
+        return _LOG.format(
+            own=self.name,
+            columns=", ".join(_string(name) for name in columns),
+            header=_string(",".join(header)),
+            polar=int(polar),
+            stated_polar=int(deviations[0] == "range_sigma"),
+            first=literal(log.deviations[deviations[0]]),
+            second=literal(log.deviations[deviations[1]]),
+            interval=literal(log.interval),
+            fill="\n    ".join(fill),
+            start="\n                ".join(start),
+            upper=self.name.upper(),
+            C=C,
+            digits=17 if self.scalar is DOUBLE else 9,
         )
 
     def test(self) -> str:
@@ -419,7 +522,7 @@ static int numbers(const char *text, double *row) {{
     for (;;) {{
         char *end;
         double value = strtod(text, &end);
-        if (end == text) value = NAN;
+        if (end == text) value = (double)NAN;
         if (count < COLUMNS) row[count] = value;
         ++count;
         while (*end != ',' && *end != '\\0' && *end != '\\n' && *end != '\\r') ++end;
@@ -469,6 +572,160 @@ int main(int argc, char **argv) {{
         printf("%ld,%ld", track, ++measurement);{told}
         for (i = 0; i < {C}; ++i) printf(",%.{digits}g", (double)estimate.mean{mean});
         for (i = 0; i < {C}; ++i) printf(",%.{digits}g", sqrt((double)estimate.covariance{covariance}));
+        putchar('\\n');
+    }}
+    if (file != stdin) fclose(file);
+    return 0;
+}}
+"""
+_LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an
+   estimate for each row: the track starts from the first two plots, and scans without a row have missed the target. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "{own}.h"
+
+#define INTERVAL {interval} /* s */
+#define DEGREE (3.14159265358979323846 / 180.0)
+
+/* Time, two coordinates, and their deviations, which a log may lack. */
+static const char *const names[5] = {{{columns}}};
+static const double usual[2] = {{{first}, {second}}};
+static int place[5] = {{-1, -1, -1, -1, -1}};
+static char line[65536];
+
+static {own}_state state;
+static double p0[2], v0[2], last, last_plot, scan;
+
+/* Number in a column of a row; NaN where there is none. */
+static double number(const char *row, int column) {{
+    char *end;
+    double value;
+    if (column < 0) return (double)NAN;
+    for (; column > 0; --column) {{
+        row = strchr(row, ',');
+        if (row == NULL) return (double)NAN;
+        ++row;
+    }}
+    value = strtod(row, &end);
+    return end == row ? (double)NAN : value;
+}}
+
+/* Finds the columns in the first line; names are read without regard to case. */
+static void find_columns(char *row) {{
+    int column = 0;
+    char *word = row;
+    for (;; ++column) {{
+        size_t length = strcspn(word, ",\\r\\n"), i;
+        const char after = word[length];
+        int k;
+        word[length] = '\\0';
+        for (i = 0; i < length; ++i)
+            if (word[i] >= 'A' && word[i] <= 'Z') word[i] = (char)(word[i] - 'A' + 'a');
+        for (k = 0; k < 5; ++k)
+            if (strcmp(word, names[k]) == 0) place[k] = column;
+        if (after != ',') return;
+        word += length + 1;
+    }}
+}}
+
+/* Position and variances of a row, in metres east and north; returns whether there is a plot. */
+static int read_plot(const char *row, double *p, double *v) {{
+    const double a = number(row, place[1]), b = number(row, place[2]);
+    double s = number(row, place[3]), r = number(row, place[4]);
+    if (!(a - a == 0.0 && b - b == 0.0)) return 0;
+    if (!(s > 0.0)) s = usual[0];
+    if (!(r > 0.0)) r = usual[1];
+    p[0] = {polar} ? a * sin(b * DEGREE) : a;
+    p[1] = {polar} ? a * cos(b * DEGREE) : b;
+    v[0] = s * s;
+    v[1] = r * r;
+    if ({stated_polar}) {{
+        /* Range and azimuth, rotated into east and north; the diagonal of the covariance. */
+        const double square = p[0] * p[0] + p[1] * p[1];
+        const double along = square > 0.0 ? p[0] * p[0] / square : 0.5;
+        const double across = square * (r * DEGREE) * (r * DEGREE);
+        v[0] = along * s * s + (1.0 - along) * across;
+        v[1] = (1.0 - along) * s * s + along * across;
+    }}
+    return 1;
+}}
+
+static int step(double at, double available, const double *p, const double *v, {own}_estimate *estimate) {{
+    {own}_measurement m;
+    const double interval = at - last, elapsed = at - last_plot;
+    int status;
+    scan += 1.0;
+    (void)interval;
+    (void)elapsed;
+    (void)available;
+    (void)p;
+    (void)v;
+    {fill}
+    status = {own}_update(&state, &m, estimate);
+    if (status == {upper}_REFUSED) return status;
+    last = at;
+    if (available > 0.0) last_plot = at;
+    return status;
+}}
+
+int main(int argc, char **argv) {{
+    static const char *const words[4] = {{"taken", "missed", "rejected", "refused"}};
+    static const double none[2] = {{0.0, 0.0}}, one[2] = {{1.0, 1.0}};
+    long plots = 0;
+    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
+    if (file == NULL) {{
+        fprintf(stderr, "cannot read %s\\n", argv[1]);
+        return 2;
+    }}
+    if (fgets(line, (int)sizeof line, file) != NULL) find_columns(line);
+    if (place[0] < 0 || place[1] < 0 || place[2] < 0) {{
+        fprintf(stderr, "the first line must name %s, %s and %s, separated by commas\\n", names[0], names[1], names[2]);
+        return 2;
+    }}
+    puts({header});
+    while (fgets(line, (int)sizeof line, file) != NULL) {{
+        double p[2] = {{0.0, 0.0}}, v[2] = {{1.0, 1.0}};
+        const double at = number(line, place[0]);
+        const int there = read_plot(line, p, v);
+        {own}_estimate estimate;
+        double scans, k;
+        int i, status;
+        if (!(at - at == 0.0)) continue;
+        if (plots < 2) {{
+            if (!there) continue;
+            if (plots == 1) {{
+                const double lasted = at - last;
+                {own}_initial initial;
+                if (!(lasted > 0.0)) continue;
+                {start}
+                {own}_start(&state, &initial);
+            }}
+            ++plots;
+            memcpy(p0, p, sizeof p0);
+            memcpy(v0, v, sizeof v0);
+            last = last_plot = at;
+            continue;
+        }}
+        scans = floor((at - last) / INTERVAL + 0.5);
+        if (scans > 1.0 && scans <= 1001.0) {{
+            const double begun = last;
+            for (k = 1.0; k < scans; k += 1.0) (void)step(begun + (at - begun) * k / scans, 0.0, none, one, &estimate);
+        }}
+        status = step(at, there ? 1.0 : 0.0, p, v, &estimate);
+        printf("%.17g,%s", at, words[status]);
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", (double)estimate.mean[i]);
+            else
+                printf(",");
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", sqrt((double)estimate.covariance[i][i]));
+            else
+                printf(",");
         putchar('\\n');
     }}
     if (file != stdin) fclose(file);
@@ -549,11 +806,16 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
     writer = Writer(request.name, traced, scalar, replayed.components)
     writer.about = _about(request, writer, precision, command)
     figures = Figures(*writer.sizes, difference, writer.replaced)
-    test = compile_and_test(writer, replayed)
+    large = figures.operations > MOST_OPTIMISED
+    test = compile_and_test(writer, replayed, flags=(*FLAGS, "-O0") if large else FLAGS)
+    if test and large:
+        test += ", compiled without optimisation"
     figures = figures._replace(test=test)
     folder.mkdir(parents=True, exist_ok=True)
     with whole_files(folder) as waiting:
-        for file, text in files_of(writer, replayed, _notes(figures, replayed, precision)).items():
+        texts = files_of(writer, replayed, _notes(figures, replayed, precision))
+        program = "" if request.log is None else writer.log_program(request.log)
+        for file, text in {**texts, **({"log.c": program} if program else {})}.items():
             (waiting / file).write_text(text, encoding="ascii")
     return figures
 
@@ -586,6 +848,14 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
         f"    cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test",
         "Estimates from a table of measurements:",
         f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
+        *(
+            [
+                "Estimates from a log of your own:",
+                f"    cc -std=c99 -O2 log.c {own}.c -lm -o log && ./log mine.csv",
+            ]
+            if request.log is not None and writer.log_program(request.log)
+            else []
+        ),
         "",
     ]
 
@@ -596,7 +866,7 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
         f"{figures.operations:,} operations an update; bytes: {figures.state_bytes:,} of state"
         + (f", {figures.constant_bytes:,} of weights" if figures.constant_bytes else "")
         + f", about {figures.scratch_bytes:,} of stack.",
-        f"Largest difference to the competitor in {E} episodes of {T} measurements, as NumPy computes in {precision}: "
+        f"Largest difference to the competitor in {E} episodes of {T} measurements, computed in {precision}: "
         f"{figures.difference:.1e} of the standard deviations that it reports.",
     ]
     if figures.test:
@@ -628,7 +898,13 @@ def compile_and_test(
     if compiler is None:
         return ""
     with tempfile.TemporaryDirectory() as place:
-        for file, text in files_of(writer, replayed).items():
+        files = {
+            f"{writer.name}.h": writer.header(),
+            f"{writer.name}.c": writer.source(),
+            "rows.h": writer.rows(),
+        }
+        files |= {"vectors.h": writer.vectors(replayed), "test.c": writer.test()}
+        for file, text in files.items():
             (Path(place) / file).write_text(text, encoding="ascii")
         program = [compiler, *flags, "test.c", f"{writer.name}.c", "-lm", "-o", "test"]
         for words in (program, [str(Path(place) / "test")]):

@@ -5,9 +5,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..baselines.fitted_filters import SUFFIX
+from ..baselines.fitted_filters import SUFFIX, LogSetup
 from ..baselines.problem import Problem
-from ..names import find_competitor
+from ..names import find_competitor, find_log_setup
 
 
 class ExportRequest(NamedTuple):
@@ -22,6 +22,8 @@ class ExportRequest(NamedTuple):
     """Whose parameters it gets, and whose episodes it is compared on, of the test split; a recording, too."""
     keywords: Mapping[str, Any] = MappingProxyType({})
     """Parameters of the task."""
+    log: LogSetup | None = None
+    """How the log was read that it was advised for."""
 
 
 def request_export(
@@ -39,8 +41,15 @@ def request_export(
     Raises:
         ValueError: for an unknown name.
     """
+    log = find_log_setup(problem, name)
+    read = log.parameters if log is not None and scenario is None else {}
     return ExportRequest(
-        problem, _own_name(problem, name), find_competitor(problem, name, trust), scenario, keywords
+        problem,
+        _own_name(problem, name),
+        find_competitor(problem, name, trust),
+        scenario,
+        {**read, **keywords},
+        log,
     )
 
 

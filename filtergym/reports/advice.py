@@ -5,13 +5,26 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy
 from rich.table import Table
 
 from ..baselines.advice import APART, Advice, Competitor
-from ..baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, STARTS, Fit, Interval
+from ..baselines.fitting import (
+    DROP,
+    IDENTIFIABLE,
+    NOISE_SCALE,
+    OUTLIER_SHARE,
+    STARTS,
+    WIDE,
+    Fit,
+    Interval,
+)
 from ..baselines.table import Tunable
+from ..envs.data.recording import Recording
 from ..evaluation.bootstrap import Estimate
 
+MOST_OUTLIERS = 12
+"""Named in a sentence."""
 MOST_ROWS = 12
 LEAST_CORRELATION = 0.1
 """Of successive prediction errors, from which on it is spoken of."""
@@ -88,6 +101,47 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
         yield Row(one, _label(advice, one), cells)
 
 
+def reading_lines(recording: Recording) -> Iterator[str]:
+    """Say what was read, before anything is fitted: how much, of which errors, and what is noteworthy."""
+    seconds = recording.seconds
+    steps = numpy.diff(seconds, axis=1)
+    missed = ""
+    if "available" in recording.measurements:
+        there = numpy.arange(seconds.shape[1]) < recording.rows[:, None]
+        count = int((recording.measurements["available"][there] == 0.0).sum())
+        missed = f", {count:,} of them missed" if count else ""
+    yield (
+        f"{recording.name}: read {int(recording.rows.sum()):,} measurements after the start of "
+        f"{len(recording.names)} track{'s' * (len(recording.names) > 1)}{missed}, {numpy.nanmedian(steps):.3g} s apart"
+        f"{', with truth' if recording.truth is not None else ''}."
+    )
+    if recording.deviations:
+        units = {"azimuth_sigma": "degrees"}
+        listed = ", ".join(f"{n} {v:.3g} {units.get(n, 'm')}" for n, v in recording.deviations.items())
+        source = recording.deviations_from
+        if "no column" in source:
+            yield f"Errors: {source}: {listed}. Their scale is fitted."
+        else:
+            yield f"Errors as stated: {listed} (median of {source})."
+    yield from (note for note in recording.notes if "no column" not in note)
+
+
+def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
+    """Return what the judged measurements say of the advised filter; None where it is not known."""
+    one = advice.advised
+    numbers = {
+        "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
+        "rmse_of_estimates": one.error,
+        "rmse_of_predictions": one.prediction,
+        "nis": one.nis,
+        "relative_error": one.relative_error.value,
+        "relative_error_low": one.relative_error.low,
+        "relative_error_high": one.relative_error.high,
+    }
+    rounded = {key: None if math.isnan(value) else float(f"{value:.6g}") for key, value in numbers.items()}
+    return {**rounded, "relative_to": advice.rival}
+
+
 def _label(advice: Advice, one: Competitor) -> str:
     """Name of a filter, and what it is here."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
@@ -131,6 +185,8 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
     yield from _hindsight(advice)
     yield from _fits(advice)
+    yield from _dearer(advice)
+    yield from _outliers(advice)
     if not advice.tunables[advice.fitted.name].anchored:
         yield from _noise(advice)
     yield from _anchor(advice)
@@ -284,6 +340,40 @@ def _fits(advice: Advice) -> Iterator[str]:
         yield (
             f"Left out: {', '.join(advice.diverging)}, fitted, {lose} the track in the whole recording: {diverge}."
         )
+
+
+def _dearer(advice: Advice) -> Iterator[str]:
+    """What a family of more computation would bring."""
+    if advice.dearer is not None:
+        name, gain = advice.dearer
+        yield (
+            f"{advice.fitted.name} is the simplest of the fitted ones that are as likely within chance: {name} would "
+            f"bring {_interval(gain, '+.3f')} nats per measurement and takes more computation."
+        )
+
+
+def _outliers(advice: Advice) -> Iterator[str]:
+    """Name the measurements that are taken for outliers, by row and time."""
+    found, recording = advice.outliers, advice.recording
+    count = int(found.sum())
+    if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
+        return
+    share = 10.0 ** advice.fits[advice.fitted.name].values[OUTLIER_SHARE]
+    text = (
+        f"{advice.fitted.name} takes {100.0 * share:.1f} % of the measurements for outliers, with errors {WIDE:g} "
+        "times as large"
+    )
+    if not count:
+        yield f"{text}; in this log it names none for sure."
+        return
+    places = []
+    for episode, k in numpy.argwhere(found)[:MOST_OUTLIERS]:
+        track = f"{recording.names[episode]}: " if len(recording.names) > 1 else ""
+        time = recording.seconds[episode, k] if recording.log_time is None else recording.log_time[episode, k]
+        written = time if isinstance(time, str) else f"{float(time):.10g}"
+        places.append(f"{track}{k + 1} (time {written})")
+    more = f" and {count - len(places)} more" if count > len(places) else ""
+    yield f"{text}: {count} here, measurements after the start {', '.join(places)}{more}."
 
 
 def _noise(advice: Advice) -> Iterator[str]:
