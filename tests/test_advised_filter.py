@@ -33,7 +33,7 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
     time = T * np.arange(n) + jitter * T * g.uniform(-1.0, 1.0, n)
     course = 0.4 + 0.01 * np.arange(n)
     step = speed * T * np.stack([np.sin(course), np.cos(course)], axis=1)
-    truth = [20000.0, 10000.0, *np.cumsum(step, axis=0)]
+    truth = np.array([20e3, 10e3]) + np.cumsum(step, axis=0)
     plots = truth + sigma * g.standard_normal(truth.shape)
     wild = (g.random(n) < outliers) & (np.arange(n) > 3)
     plots[wild] += 30.0 * sigma

@@ -575,8 +575,8 @@ int main(int argc, char **argv) {{
     return 0;
 }}
 """
-_LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an estimate for
-   each row: the track starts from the first two plots, and scans without a row have missed the target. */
+_LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an
+   estimate for each row: the track starts from the first two plots, and scans without a row have missed the target. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
