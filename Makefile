@@ -4,6 +4,8 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTHON ?= python3
 # Processes of `make benchmark`; each takes up to half a GB.
 JOBS ?= 2
+# Of each reader of `make fuzz`.
+FUZZ_SECONDS ?= 600
 VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation baselines agents papers tests benchmarks
@@ -29,7 +31,7 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,ins,adapters
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test claims test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -42,6 +44,11 @@ claims: $(VENV)/.dev  ## test what is said of results: tables, rankings, limits,
 
 test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+fuzz: $(VENV)/.dev  ## every reader of foreign files, coverage-guided, so many seconds each; for the night
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt atheris
+	for reader in $$($(BIN)/python tests/fuzz_readers.py); do \
+	  OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz_readers.py $$reader $(FUZZ_SECONDS) || exit 1; done
 
 coverage: $(VENV)/.dev  ## run them all, and show the lines that no test reaches
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term

@@ -42,7 +42,14 @@ from ..envs.engine.reward import REWARDS
 from ..envs.engine.scenario_choice import find_mixture, find_scenario
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.competitors import kind_of
-from ..evaluation.files import find_folder, settle_folder, whole_folder, writable_folder, write_text
+from ..evaluation.files import (
+    claim_folder,
+    find_folder,
+    settle_folder,
+    whole_folder,
+    writable_folder,
+    write_text,
+)
 from ..evaluation.rollout import run_competitor
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import read_json, restore
@@ -512,6 +519,8 @@ def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False)
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
+    if resume and folder.is_dir():
+        claim_folder(folder)  # before anything in it is put in order
     run = resume_run(folder, asked, same) if resume else asked
     writable_folder(folder)
     run.command = " ".join(
@@ -784,6 +793,7 @@ class Bookkeeping:
         log: Callable[[int, Mapping[str, float]], None] = lambda steps, values: None,
         began: float | None = None,
     ) -> None:
+        claim_folder(session.folder)
         self.began = time.monotonic() if began is None else began
         self.run, self.stop, self.log = run, stop, log
         self.folder, self.interval = session.folder, session.steps_between_validations(run)

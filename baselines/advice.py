@@ -366,7 +366,7 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit
     """Return which measurements of a recording a fitted filter takes for outliers, ``(E, T)``; none where it knows no
     outliers.
     """
-    is_outlier = numpy.zeros(recording.seconds.shape, dtype=bool)
+    is_outlier: numpy.ndarray = numpy.zeros(recording.seconds.shape, dtype=bool)
     if OUTLIER_SHARE not in found.values:
         return is_outlier
     template, like = measure_once(type(task)(task.parameters), recording.measurements)

@@ -115,7 +115,9 @@ class TunedValues:
         try:
             return check_values(values, self.tunable[policy])
         except ValueError as error:
-            raise ValueError(f"{place}: policy {policy!r}: {error}: tune it again, or remove the file") from error
+            raise ValueError(
+                f"{place}: policy {policy!r}: {error}: tune it again, or remove the file"
+            ) from error
 
     def competitor(self, policy: str) -> TunedPolicy:
         """Return what makes a policy or estimator with its stored values.

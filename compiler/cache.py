@@ -20,6 +20,8 @@ from pathlib import Path
 
 LIMIT = 256 * 2**20
 """Bytes that the folder may hold."""
+SLACK = 2**23
+"""Bytes that a process may write before it looks again how many the folder holds, and the first time it writes."""
 SUFFIX = ".code"
 """Of entries; nothing else in the folder is touched."""
 SWITCH = "FILTERGYM_COMPILER_CACHE"
@@ -89,7 +91,10 @@ def keep(name: str, code: bytes) -> None:
         except OSError:
             os.unlink(partial)
             raise
-        _bound(place)
+        _UNCHECKED[place] = _UNCHECKED.get(place, LIMIT) + len(code)
+        if _UNCHECKED[place] > SLACK:
+            _bound(place)
+            _UNCHECKED[place] = 0
 
 
 class _Untrusted(Exception):  # noqa: N818  (no error of a user's: why an entry is not used)
@@ -165,6 +170,10 @@ def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
         yield handle
     finally:
         os.close(handle)
+
+
+_UNCHECKED: dict[Path, int] = {}
+"""Bytes written into a folder since its size was looked at."""
 
 
 def _bound(place: Path) -> None:

@@ -6,6 +6,7 @@ than the length of a function. What crosses a cut lies in a scratch array on the
 of the constants, then two integers for each argument, address and stride.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -41,6 +42,7 @@ class _Part:
         self.lines: list[str] = []
         self.known: set[int] = set()
         self._arguments: dict[int, tuple[str, str]] = {}
+        self._first_rows: dict[int, str] = {}
         self._names = 0
         self.constants = self._entry("ptr", 0)
 
@@ -55,9 +57,10 @@ class _Part:
     def place(self, argument: int, row: int) -> str:
         """Address of the block's numbers in a row of an argument."""
         address, stride = self.argument(argument)
+        if argument not in self._first_rows:
+            self._first_rows[argument] = self.new(f"getelementptr double, ptr {address}, i64 %lane")
         start = self.new(f"mul i64 {stride}, {row}")
-        start = self.new(f"add i64 {start}, %lane")
-        return self.new(f"getelementptr double, ptr {address}, i64 {start}")
+        return self.new(f"getelementptr double, ptr {self._first_rows[argument]}, i64 {start}")
 
     def argument(self, argument: int) -> tuple[str, str]:
         """Address and stride of an argument."""
@@ -111,13 +114,10 @@ class _Part:
             elif operation == "entry":
                 row, product = arguments
                 address = self.scratch(self.places.products[product] + row)
-                self.new(f"load {self.numbers}, ptr {address}, align {self.block.alignment}", f"%v{step}")
+                self.new(f"load {self.numbers}, ptr {address}", f"%v{step}")
             else:
                 kind = self.truths if logical else self.numbers
-                self.new(
-                    f"load {kind}, ptr {self.scratch(self.places.slots[step])}, align {self.block.alignment}",
-                    f"%v{step}",
-                )
+                self.new(f"load {kind}, ptr {self.scratch(self.places.slots[step])}", f"%v{step}")
         return f"%v{step}"
 
     def step(self, index: int) -> None:
@@ -206,11 +206,13 @@ class _Part:
         for place, step in enumerate(vector):
             value = self.value(step)
             address = self.scratch(self.places.vector + place)
-            self.lines.append(f"store {self.numbers} {value}, ptr {address}, align {self.block.alignment}")
+            self.lines.append(f"store {self.numbers} {value}, ptr {address}")
         matrix = self.new(f"getelementptr double, ptr {self.constants}, i64 {table}")
         given, found = self.scratch(self.places.vector), self.scratch(self.places.products[index])
         sizes = f"i64 {len(vector)}, i64 {-(-rows // BAND)}"
-        self.lines.append(f"call void @product(ptr {matrix}, ptr {given}, ptr {found}, {sizes})")
+        self.lines.append(
+            f"call void @{product_symbol(self.block)}(ptr {matrix}, ptr {given}, ptr {found}, {sizes})"
+        )
 
     def store(self, argument: int, row: int, step: int) -> None:
         """Write a result."""
@@ -244,13 +246,13 @@ class _Part:
 
     def scratch(self, place: int) -> str:
         """Address of a place in the scratch array."""
-        return self.new(f"getelementptr {self.numbers}, ptr %scratch, i64 {place}")
+        return self.new(f"getelementptr i8, ptr %scratch, i64 {place * self.block.alignment}")
 
     def hand_on(self, step: int) -> None:
         """Put a value into the scratch array."""
         kind = self.truths if self.program.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
-        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align {self.block.alignment}")
+        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
 
 
 def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block, part: int) -> str:
@@ -282,8 +284,6 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library, block: 
                 own.hand_on(statement)
         header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
         text += [f"define internal void @part{number}({header}) {{", *own.lines, "ret void", "}"]
-    if vectors:
-        text += _product_function(block)
     text += _entry(block, len(parts), max(1, places.vector + max(vectors, default=0)))
     return "\n".join([*text, "!0 = !{}"])
 
@@ -307,13 +307,28 @@ def _entry(block: Block, parts: int, slots: int) -> Iterator[str]:
     yield "}"
 
 
-def _product_function(block: Block) -> Iterator[str]:
-    """The product of a matrix of constants with a vector of lane values: bands of rows side by side, each row's terms
-    added one after the other.
+def product_symbol(block: Block) -> str:
+    """Name of the function that programs call for the product of a matrix."""
+    return f"filtergym_product_{block.lanes}"
+
+
+@functools.cache
+def product_text(block: Block) -> str:
+    """Text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of constants with a
+    vector of lane values: bands of rows side by side, each row's terms added one after the other.
+
+    It is code of its own, and always optimised: programs spend their time in it.
+
+    Args:
+        block: lanes of the vector.
     """
+    return "\n".join(_product_lines(block))
+
+
+def _product_lines(block: Block) -> Iterator[str]:
     sums = range(BAND)
-    yield "define internal void @product(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
-    yield "                              ptr noalias %result, i64 %columns, i64 %bands) {"
+    yield "define void @program(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
+    yield "                     ptr noalias %result, i64 %columns, i64 %bands) {"
     yield "entry:"
     yield "br label %band"
     yield "band:"
@@ -355,6 +370,8 @@ def _product_function(block: Block) -> Iterator[str]:
 def _declarations(program: Program, library: Library, block: Block) -> Iterator[str]:
     """Intrinsics, and functions of a block made of the library's."""
     used = {step.operation for step in program.steps}
+    if "product" in used:
+        yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
     yield f"declare {block.numbers} {block.gather}({block.addresses}, i32, {block.truths}, {block.numbers})"
     yield f"declare {block.numbers} {block.intrinsic('fma')}({', '.join([block.numbers] * 3)})"
     for name in sorted(set(_INTRINSIC.values())):

@@ -1,6 +1,5 @@
 """Functions of nested tuples of arrays, compiled for each structure of their arguments."""
 
-import ctypes
 import functools
 import math
 import os
@@ -13,7 +12,7 @@ import numpy
 from . import namespace
 from .block import LANES
 from .library import Library
-from .native import Code, native
+from .native import Code, address_of_code, native
 from .program import Graph, Program, Result, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
@@ -221,7 +220,7 @@ class Call:
     @property
     def native_address(self) -> int:
         """Address of the code of now."""
-        return ctypes.cast(self.native, ctypes.c_void_p).value or 0  # type: ignore[arg-type]
+        return address_of_code(self.native)
 
     def __call__(self, first: int, last: int) -> None:
         """Run from one lane to another."""

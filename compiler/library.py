@@ -1,4 +1,4 @@
-"""Which library computes exponentials and their like, eight lanes at a time or one by one.
+"""Which library computes exponentials and their like, some lanes at a time or one by one.
 
 On Linux glibc brings vector functions, with errors up to four units in the last place; where they are missing, the
 scalar functions of the C library stand in, and every platform has those.

@@ -182,8 +182,11 @@ def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None
     array = numpy.asarray(values, dtype=dtype)
     if array.dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {array.dtype} cannot be traced")
-    constant = _OPEN.get().constant
-    nodes = [constant(value) for value in (array if array.dtype == bool else array.astype(float64)).ravel()]
+    graph = _OPEN.get()
+    if array.dtype == bool:
+        nodes = [graph.constant(value) for value in array.ravel()]
+    else:
+        nodes = graph.constants(array.astype(float64).ravel())
     return Traced(numpy.array(nodes, dtype=numpy.int64).reshape(array.shape), array.dtype)
 
 

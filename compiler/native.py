@@ -1,17 +1,19 @@
 """Programs as code of the processor at hand."""
 
+import contextvars
 import ctypes
 import functools
 import importlib.util
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 from . import cache
 from .block import LANES, block_for, block_of
-from .emission import emit
+from .emission import emit, product_symbol, product_text
 from .library import Library, fastest
 from .program import LOCK, Program
 
@@ -82,9 +84,15 @@ class Setting(NamedTuple):
     """Of LLVM's optimisation of code."""
 
 
-def quick_setting(features: str) -> Setting:
-    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register."""
-    return Setting(block_for(features).lanes, 100, 0)
+def quick_setting(features: str, has_loops: bool) -> Setting:
+    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register; with loops those of
+    the fastest code, as the product of a matrix takes twice as long in half of a block.
+
+    Args:
+        features: of the processor.
+        has_loops: whether the program multiplies with matrices.
+    """
+    return Setting(LANES if has_loops else block_for(features).lanes, 150, 0)
 
 
 OPTIMISED = Setting(LANES, 200, 1)
@@ -100,6 +108,29 @@ Native = Callable[[int, int, int], None]
 """Called with the address of the table of arguments, and with the lanes from where to where."""
 NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 """The same for ctypes."""
+PRODUCT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, ctypes.c_int64)
+"""Of the product of a matrix, see :func:`~.emission.product_text`."""
+
+
+def address_of_code(code: Any) -> int:
+    """Address of a native function."""
+    return ctypes.cast(code, ctypes.c_void_p).value or 0
+
+
+_EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=False)
+"""Whether programs are optimised before they have run long."""
+
+
+@contextmanager
+def optimised_code() -> Iterator[None]:
+    """Let every program that runs inside be optimised at once: times then depend neither on a cache nor on how long
+    it has run.
+    """
+    token = _EAGER.set(True)
+    try:
+        yield
+    finally:
+        _EAGER.reset(token)
 
 
 class Code:
@@ -126,7 +157,7 @@ class Code:
     def expect(self, lanes: int) -> None:
         """Prepare to run over so many lanes: make better code where it has become worth its time."""
         self._lanes += lanes
-        if self._optimise is not None and self._lanes > HOT:
+        if self._optimise is not None and (self._lanes > HOT or _EAGER.get()):
             optimise, self._optimise = self._optimise, None
             self.run = optimise()
 
@@ -145,7 +176,8 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
         steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
-        quick = quick_setting(features)
+        has_loops = any(step.operation == "product" for step in program.steps)
+        quick = quick_setting(features, has_loops)
         made_of = repr((steps, results, list(lane_first), symbols)), _own_text()
         key = _key(*made_of, repr(quick))
         if key not in _CODES:
@@ -155,12 +187,15 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
             def code(setting: Setting, key: str) -> Native:
                 with LOCK:
                     block, part = block_of(setting.lanes), setting.part
+                    if has_loops:
+                        product = native_text(product_text(block), PRODUCT)
+                        binding.add_symbol(product_symbol(block), address_of_code(product))
                     return _load(
                         key, lambda: emit(program, lane_first, library, block, part), NATIVE, setting.level
                     )
 
             better = _key(*made_of, repr(OPTIMISED))
-            if cache.holds(better):
+            if cache.holds(better) or (_EAGER.get() and len(steps) < LONG):
                 _CODES[key] = Code(code(OPTIMISED, better))
             else:
                 optimise = functools.partial(code, OPTIMISED, better) if len(steps) < LONG else None

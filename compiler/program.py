@@ -126,9 +126,18 @@ class Graph:
         """Number or truth value that is known."""
         if isinstance(value, bool | numpy.bool_):
             return self._intern(("constant", bool(value)), "constant", (), bool(value), True)
-        number = numpy.float64(value)
+        return self.constants(numpy.array([value], dtype=numpy.float64))[0]
+
+    def constants(self, values: numpy.ndarray) -> list[int]:
+        """Numbers that are known, float64 ``(n,)``."""
+        found, made = self._found, []
         # By its bits: -0.0 is not 0.0, and NaN is itself.
-        return self._intern(("constant", number.tobytes()), "constant", (), float(number), False)
+        for bits, value in zip(values.view(numpy.int64).tolist(), values.tolist(), strict=True):
+            node = found.get(bits)
+            if node is None:
+                node = self._intern(bits, "constant", (), value, False)
+            made.append(node)
+        return made
 
     def take(self, table: numpy.ndarray, index: int) -> int:
         """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
@@ -227,6 +236,7 @@ class Graph:
         """
         seen: set[int] = set()
         order: list[int] = []
+        operations, arguments = self.operations, self.arguments
         for root in wanted:
             waiting = [root]
             while waiting:
@@ -235,8 +245,13 @@ class Graph:
                     order.append(~node)
                 elif node not in seen:
                     seen.add(node)
+                    name = operations[node]
+                    if name == "input" or name == "constant":
+                        order.append(node)
+                        continue
                     waiting.append(~node)
-                    waiting.extend(reversed(self.parts(node)))
+                    parts = self.parts(node) if name in OTHERS else arguments[node]
+                    waiting.extend(parts[::-1])
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:

@@ -1,14 +1,29 @@
 """Files and folders that are whole or as they were: written beside their place, then moved into it.
 
-Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place.
+Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place. Two
+processes that write the same are told apart by locks, which end with their process; where the system has none
+(Windows), they are not.
 """
 
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+UNFINISHED = ".unfinished-"
+"""Begins the name of a folder whose files wait until all of them are complete."""
+LOCK = ".lock"
+"""In such a folder: locked as long as its writer is alive."""
+YOUNG = 60.0
+"""s, within which a folder may not have its lock yet."""
 
 
 @contextmanager
@@ -46,6 +61,57 @@ def _make_folder(path: Path) -> Iterator[None]:
         raise
 
 
+def _lock(handle: int) -> bool:
+    """Lock an open file or folder, if nobody else has; the lock ends when it is closed, or with the process."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+_CLAIMED: dict[str, int] = {}
+"""Folders that this process writes, and what holds their locks."""
+
+
+def claim_folder(folder: Path) -> None:
+    """Make a folder this process's own until it ends: no other process may write a run or a benchmark there.
+
+    Raises:
+        ValueError: if another process has claimed it, or it cannot be made.
+    """
+    name = os.path.realpath(folder)
+    if name in _CLAIMED or fcntl is None:
+        return
+    with _explain_refusals(f"to folder {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(name, os.O_RDONLY)
+    if not _lock(handle):
+        os.close(handle)
+        raise ValueError(f"another process writes to {folder}: wait until it ends, or choose another folder")
+    _CLAIMED[name] = handle
+
+
+def _sweep_unfinished(folder: Path) -> None:
+    """Remove unfinished folders whose writers are dead."""
+    for place in folder.glob(f"{UNFINISHED}*"):
+        with suppress(OSError):
+            if not (place / LOCK).exists():
+                if time.time() - place.stat().st_mtime > YOUNG:
+                    shutil.rmtree(place)
+            elif fcntl is not None:
+                handle = os.open(place / LOCK, os.O_RDWR)
+                try:
+                    if _lock(handle):
+                        shutil.rmtree(place)
+                finally:
+                    os.close(handle)
+
+
 def writable_file(path: Path) -> Path:
     """Check that a file can be written, before any long work begins; its folder is not made yet.
 
@@ -56,9 +122,10 @@ def writable_file(path: Path) -> Path:
         if path.exists() and not path.is_file():
             raise ValueError(f"cannot write file {path}: a folder or device has that name")
         writable_folder(path.parent)
-        if path.parent.exists():
-            _partial(path).touch()
-            _partial(path).unlink()
+        if path.parent.exists():  # the name, too: of another one, since a writer may be at work
+            handle, other = tempfile.mkstemp(dir=path.parent, prefix=_partial(path).name[:-8])
+            os.close(handle)
+            os.unlink(other)
     return path
 
 
@@ -76,12 +143,60 @@ def whole_file(path: Path) -> Iterator[Path]:
         ValueError: if it cannot be written.
     """
     partial = _partial(writable_file(path))
-    with _explain_refusals(f"file {path}"), _make_folder(path.parent):
+    with _explain_refusals(f"file {path}"), _make_folder(path.parent), _hold_alone(partial):
         try:
             yield partial
             partial.replace(os.path.realpath(path))
         finally:
             partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _hold_alone(partial: Path) -> Iterator[None]:
+    """Make a file that nobody else writes, and hold it.
+
+    Raises:
+        ValueError: if another process writes it.
+    """
+    handle = _open_locked(partial)
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _open_locked(partial: Path) -> int:
+    """Make a file that nobody else writes, and hold it.
+
+    Raises:
+        ValueError: if another process writes it.
+    """
+    while True:
+        handle = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not _lock(handle):
+                raise ValueError(
+                    f"another process writes {partial.name[1:-8]} now: wait until it ends, or write elsewhere"
+                )
+            # Between the two the other one may have moved it into its place.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle), os.stat(partial)):
+                    return handle
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+@contextmanager
+def _hold(path: Path) -> Iterator[Path]:
+    """Make a file and hold its lock."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        _lock(handle)
+        yield path
+    finally:
+        os.close(handle)
 
 
 @contextmanager
@@ -96,10 +211,12 @@ def whole_files(folder: Path) -> Iterator[Path]:
     with (
         _explain_refusals(f"to folder {folder}"),
         _make_folder(folder),
-        tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-", ignore_cleanup_errors=True) as waiting,
+        tempfile.TemporaryDirectory(dir=folder, prefix=UNFINISHED, ignore_cleanup_errors=True) as waiting,
+        _hold(Path(waiting) / LOCK) as lock,
     ):
+        _sweep_unfinished(folder)
         yield Path(waiting)
-        complete = [path for path in Path(waiting).rglob("*") if path.is_file()]
+        complete = [path for path in Path(waiting).rglob("*") if path.is_file() and path != lock]
         places = [folder / path.relative_to(waiting) for path in complete]
         for place in places:
             writable_file(place)

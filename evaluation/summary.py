@@ -142,14 +142,14 @@ def reduce_episodes(
     bootstrap = _resampling(asked.episodes)
     block = block_of(plan.models[asked.name].task.horizon)
 
-    def parts() -> Iterator[Part]:
-        for i in range(asked.first, asked.end, block):
-            piece = plan.piece(asked.name, i, min(block, asked.end - i), True)
-            run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds)
-            run = run.isel(policy=0)
-            yield Part(reduce_run(run, declare, bootstrap, i), _head(run))
+    def part(first: int) -> Part:
+        """Run a block of episodes and reduce it; nothing of what was measured in it outlives the call."""
+        piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
+        run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds).isel(policy=0)
+        return Part(reduce_run(run, declare, bootstrap, first), _head(run))
 
-    found = functools.reduce(Part.merge, parts())
+    parts = (part(first) for first in range(asked.first, asked.end, block))
+    found = functools.reduce(Part.merge, parts)
     if asked.experiment.timed and asked.first == 0:
         return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
     return found

@@ -16,9 +16,30 @@ if (
     ]  # the working directory, in which Python would look for every library that is still to come
 
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
-from .envs.engine.catalogue import register
+
+def _forget_half_imported() -> None:
+    """Forget, in a process that was forked, what another thread was importing: that thread is not here, and whoever
+    imports the same would wait for it without end. It is imported anew, or refused by a library that cannot be.
+    """
+    frame: Any = sys._getframe()
+    while frame is not None:  # the thread that forked is importing itself, and goes on with it
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return
+        frame = frame.f_back
+    getattr(importlib._bootstrap, "_module_locks", {}).clear()
+    for name, module in list(sys.modules.items()):
+        if getattr(getattr(module, "__spec__", None), "_initializing", False):
+            del sys.modules[name]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_half_imported)
+
+from .envs.engine.catalogue import register  # noqa: E402  (its import may be forked, too)
 
 if TYPE_CHECKING:
     from .baselines.table import Baselines

@@ -2,13 +2,15 @@
 
 import ast
 import functools
+import gc
 import importlib
 import inspect
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +22,7 @@ from rich.console import Console
 from . import __version__
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
+from .compiler.program import without_collection
 from .envs.contract.failures import own_line
 from .envs.engine.catalogue import modules_from
 
@@ -118,7 +121,12 @@ def import_command(command: Callable[..., None] | str) -> Callable[..., None]:
     if not isinstance(command, str):
         return command
     module, _, name = command.partition(":")
-    function: Callable[..., None] = getattr(importlib.import_module(f"{__package__}.commands.{module}"), name)
+    place = f"{__package__}.commands.{module}"
+    if place not in sys.modules:
+        with without_collection():  # a hundred thousand objects come, none of which is garbage
+            importlib.import_module(place)
+        gc.freeze()  # they stay to the end: nobody need look through them again
+    function: Callable[..., None] = getattr(sys.modules[place], name)
     return function
 
 
@@ -171,6 +179,8 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
     in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
     """
     debug = "--debug" in sys.argv
+    with suppress(ValueError):  # in a thread, where nobody may
+        signal.signal(signal.SIGTERM, _end)
     open_output()
     try:
         with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
@@ -187,6 +197,11 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
             text, code = f"Error: unexpected {type(error).__name__}: {error}{own_line(error)}; {REPORT}", 1
         _print_error(text, "red")
         sys.exit(code)
+
+
+def _end(number: int, _: Any) -> None:
+    """End as at an error: what is unfinished is taken away on the way out."""
+    sys.exit(128 + number)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

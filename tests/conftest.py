@@ -4,11 +4,14 @@ A test that asks for ``env_id`` runs once for every environment; one that asks f
 every control of every environment. A new environment is covered without an edit.
 """
 
+import ctypes
 import functools
 import gc
 import importlib
 import os
 import re
+import resource
+from pathlib import Path
 
 import gymnasium as gym
 import hypothesis
@@ -56,6 +59,28 @@ def pytest_collection_finish(session):
     """Spare the garbage collector what stays to the end, libraries and tests; it would look through it many times."""
     gc.collect()
     gc.freeze()
+
+
+LARGEST = 700
+"""Resident memory in MB beyond which a process forgets its traces before it takes the next file."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Forget what was traced for one file before the next, where that has grown large."""
+    if nextitem is None or nextitem.path == item.path or _resident() < LARGEST:
+        return
+    compiled._trace_once.cache_clear()
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:  # gives back to the system what the C library keeps
+        trim(0)
+
+
+def _resident():
+    """Resident memory of this process, MB; 0 where Linux does not tell it."""
+    status = Path("/proc/self/statm")
+    return int(status.read_text().split()[1]) * resource.getpagesize() // 2**20 if status.is_file() else 0
 
 
 def pytest_generate_tests(metafunc):

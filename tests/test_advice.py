@@ -358,6 +358,10 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
         "Take true, as it is shipped: nothing that was fitted predicts better beyond chance ("
     )
     assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
+    for high, sure in ((-0.1, True), (0.1, False)):
+        fitted = found.fitted._replace(relative_error=Estimate(-0.2, -0.3, high))
+        said = next(iter(advice_lines(found._replace(fitted=fitted), [])))
+        assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
 
 def test_the_best_in_hindsight_is_named_beside(advice):

@@ -636,7 +636,7 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     cells = {column.header: list(column.cells) for column in table.columns}
     assert cells["cost vs paper, %"][0] == with_interval(difference, 100.0, negligible=0.005)
     median = records["mine", "median_cost_ratio"].value
-    assert cells["median, %"][0] == f"{100.0 * (median - 1.0):+.1f}"
+    assert cells["median,\n%"][0] == f"{100.0 * (median - 1.0):+.1f}"
 
 
 def test_a_run_begins_at_the_first_action():

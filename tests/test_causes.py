@@ -243,6 +243,8 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
     truth, seen, *estimates = (line.get_xydata().T for line in figure.axes[0].get_lines())
     np.testing.assert_array_equal(truth, track["truth"].values[:2])
     np.testing.assert_array_equal(seen, track["seen"].values[:2])
+    labels = [axis.get_label_text() for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis)]
+    assert labels == ["position x, m", "position y, m"]
     # The competitor whose episodes they are is drawn last, on top of the others.
     np.testing.assert_array_equal(estimates[-1], track["estimate"].values[:2])
 

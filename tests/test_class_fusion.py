@@ -201,6 +201,21 @@ def test_information_per_decision():
     assert pairs == pytest.approx([1.21, 1.47, 0.66, 0.64], abs=0.0055)
 
 
+@pytest.mark.parametrize("measured", [1, 2])
+def test_taking_coloured_errors_away_is_a_linear_map(measured):
+    """Of the first components the coloured error is subtracted, which is the last components of the state."""
+    rng = numpy.random.default_rng(5)
+    size = 3 + measured
+    root = rng.normal(size=(size, size, 4))
+    mean, covariance = rng.normal(size=(size, 4)), numpy.einsum("ikb,jkb->ijb", root, root)
+    A = numpy.eye(3, size)
+    A[range(measured), range(3, size)] = -1.0
+    states, both = class_fusion.take_away_coloured_errors(mean, covariance, measured)
+    for b in range(4):
+        numpy.testing.assert_allclose(states[:, b], A @ mean[:, b], rtol=1e-12)
+        numpy.testing.assert_allclose(both[..., b], A @ covariance[..., b] @ A.T, rtol=1e-10, atol=1e-12)
+
+
 def test_decisions_follow_the_rows_of_an_asymmetric_confusion():
     rng = numpy.random.default_rng(2)
     confusion, composition = rng.dirichlet([1.0] * 4, 4), rng.dirichlet([1.0] * 4, 3)

@@ -212,6 +212,9 @@ def test_what_has_been_finished_is_said_with_the_time_that_is_left():
     clock.now = 8.0
     shown.update(task, advance=4)
     shown.say("ManeuveringTarget, random: 41 competitors over 500 episodes")
+    shown.update(task, description="fitting")
+    shown.update(task, description="fitting")
+    assert lines.pop() == "fitting (40 % done after 8 s, 12 s left)"
     assert lines == [
         "log.nc: 250 measurements",
         "ManeuveringTarget, random: 41 competitors over 500 episodes (40 % done after 8 s, 12 s left)",

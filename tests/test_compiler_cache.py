@@ -228,6 +228,7 @@ def test_a_full_disk_leaves_no_partial_file(place, loaded, monkeypatch):
 
 def test_the_folder_stays_below_its_limit_and_what_was_used_stays(place, monkeypatch):
     monkeypatch.setattr(cache, "LIMIT", 1000)
+    monkeypatch.setattr(cache, "SLACK", 0)  # look after every entry
     for age, name in enumerate(("c", "b", "a")):
         cache.keep(name, b"." * 268)  # 300 with its checksum
         os.utime(place / f"{name}{cache.SUFFIX}", (TIME - age, TIME - age))

@@ -87,7 +87,7 @@ def computed(recipe, arrays, setting, constants=()):
         return tuple(numbers), tuple(truths)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(native, "quick_setting", lambda _: setting)
+        patch.setattr(native, "quick_setting", lambda *_: setting)
         patch.setattr(native, "_CODES", {})  # made in another setting
         patch.setattr(functions, "FEWEST", 8)
         compiled = Function(function, Graph())
@@ -263,7 +263,7 @@ def test_code_has_the_same_bits_in_every_setting(monkeypatch, setting):
     x = np.random.default_rng(4).normal(scale=2.0, size=(3, 24))
 
     def run(setting):
-        monkeypatch.setattr(native, "quick_setting", lambda _: setting)
+        monkeypatch.setattr(native, "quick_setting", lambda *_: setting)
         monkeypatch.setattr(native, "_CODES", {})
         special = Specialised(all_functions, Graph(loops=True), [x], turned=True)
         assert "product" in [step.operation for step in special.program.steps]
@@ -279,7 +279,8 @@ def test_no_function_of_the_library_takes_more_lanes_than_a_block_has(features):
     lanes = [count for name, (_, count) in VARIANTS.items() if f"+{name}" in listed]
     assert max(lanes, default=1) <= block_for(features).lanes
     assert OPTIMISED.lanes % block_for(features).lanes == 0
-    assert quick_setting(features).lanes == block_for(features).lanes
+    assert quick_setting(features, False).lanes == block_for(features).lanes
+    assert quick_setting(features, True).lanes == OPTIMISED.lanes
 
 
 def chain(length):
@@ -308,9 +309,16 @@ def settings_used(monkeypatch, function, runs):
 def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
     monkeypatch.setattr(native, "HOT", 40)
     features = native.processor()[1]
-    first, better = quick_setting(features)[:2], OPTIMISED[:2]
+    first, better = quick_setting(features, False)[:2], OPTIMISED[:2]
     assert settings_used(monkeypatch, chain(5), runs=3) == [first]
     assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
+
+
+def test_what_is_timed_is_optimised_at_once(monkeypatch):
+    first, better = quick_setting(native.processor()[1], False)[:2], OPTIMISED[:2]
+    with native.optimised_code():
+        assert settings_used(monkeypatch, chain(7), runs=2) == [better]
+    assert settings_used(monkeypatch, chain(8), runs=2) == [first]
 
 
 def test_long_programs_stay_as_they_are(monkeypatch):

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.evaluation.bootstrap import Bootstrap, Estimate
-from filtergym.evaluation.metrics import chi_square_band, score
+from filtergym.evaluation.metrics import chi_square_band, chi_square_quantile, score
 from filtergym.filters import alpha_beta
 from scipy.stats import chi2
 
@@ -32,6 +32,10 @@ def test_quantiles_are_those_of_the_chi_square_distribution():
     for quantile, p in ((low, 0.025), (high, 0.975)):
         expected = chi2.ppf(p, runs * degrees[there]) / runs
         np.testing.assert_allclose(quantile[there], expected, rtol=1e-10)  # an iteration in both
+    assert chi_square_quantile(0.999, 4) == pytest.approx(chi2.ppf(0.999, 4), rel=1e-10)
+    np.testing.assert_allclose(
+        chi_square_quantile(0.9, degrees[:, 1]), chi2.ppf(0.9, degrees[:, 1]), rtol=1e-10
+    )
 
 
 def test_consistency_is_what_it_says(dataset, found):

@@ -11,7 +11,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine.catalogue import catalogue, register
-from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.engine.environment import TaskVectorEnv
 from filtergym.evaluation.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 from models import make_model
@@ -86,13 +86,6 @@ def test_bank_needs_nothing_but_the_measurements(env_id, control, short, random_
         np.testing.assert_array_equal(model.filter.covariance(alone), model.covariance(episode))
 
 
-def test_functions_of_a_bank_have_no_door_for_the_truth(env_id, control):
-    doors = {"self", "initial", "state", "measurement", "action"}
-    for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
-        function = getattr(type(make_model(env_id, control).filter), name)
-        assert set(inspect.signature(function).parameters) <= doors, name
-
-
 def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
     """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
     model = make_model(env_id, **short).with_filter(lambda other: NoFilter(other.task))
@@ -110,21 +103,33 @@ def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
         assert np.isfinite(model.cost(episode)).all()
 
 
-def test_episode_ends_by_truncation_at_the_horizon(env_id, control, short, random_actions):
-    env = gym.make(env_id, control=control, **short)
-    actions = random_actions(env.action_space, 5, 0)
-    assert not run(env, actions[:4])[2]
-    assert run(env, actions)[2]
-
-
-def test_spec_survives_json(env_id, control, short, random_actions):
+def test_spec_fields_ends_actions_and_doors(env_id, control, short, random_actions):
+    """One pass over an environment: it is made again from text, ends at its horizon, names what it shows."""
     env = gym.make(env_id, control=control, scenario="random", **short)
-    text = env.spec.to_json()
-    json.loads(text)
-    copy = gym.make(gym.envs.registration.EnvSpec.from_json(text))
+    copy = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     actions = random_actions(env.action_space, 5, 1)
-    for one, other in zip(run(env, actions), run(copy, actions), strict=True):
+    found = run(env, actions)
+    for one, other in zip(found, run(copy, actions), strict=True):
         np.testing.assert_array_equal(one, other)
+    assert found[2], "the fifth decision is the last"
+    assert not run(env, actions[:4])[2]
+
+    fields = env.unwrapped.observation_fields
+    assert len(fields) == env.observation_space.shape[0]
+    assert len({field.name for field in fields}) == len(fields)
+    assert all(field.name and field.unit and field.description for field in fields)
+
+    if isinstance(env.action_space, gym.spaces.Box):  # 0.1 is another number in float32
+        fine = np.full(env.action_space.shape, 0.3)
+        fine[0] = 0.1
+        exact, rounded = (run(env.unwrapped, [action])[0][1] for action in (fine, fine.astype(np.float32)))
+        assert (exact != rounded).any()
+        np.testing.assert_allclose(exact, rounded, rtol=1e-5, atol=1e-5)
+
+    doors = {"self", "initial", "state", "measurement", "action"}  # none of them is for the truth
+    for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
+        function = getattr(type(env.unwrapped.model.filter), name)
+        assert set(inspect.signature(function).parameters) <= doors, name
 
 
 def test_parameters_survive_json(env_id):
@@ -161,51 +166,12 @@ def test_spawned_processes(random_actions):
         there.close()
 
 
-def test_fields_describe_the_observation(env_id, control):
-    env = TaskEnv(env_id, control=control, backend="numpy")
-    fields = env.observation_fields
-    assert len(fields) == env.observation_space.shape[0]
-    assert len({field.name for field in fields}) == len(fields)
-    assert all(field.name and field.unit and field.description for field in fields)
-
-
-@pytest.mark.parametrize("scenario_index", range(12))
-def test_every_scenario_runs(env_id, scenario_index, random_actions):
-    scenarios = list(catalogue()[env_id].scenarios)
-    if scenario_index >= len(scenarios):
-        pytest.skip("there are fewer scenarios")
-    # Compiled ones equal these: test_compiled.py.
-    env = TaskEnv(env_id, scenario=scenarios[scenario_index], backend="numpy")
-    horizon = env.task.horizon
-    observation, _ = env.reset(seed=0)
-    for step in range(5):
-        observation, reward, *_ = env.step(random_actions(env.action_space, 1, step)[0])
-        assert np.isfinite(observation).all()
-        assert np.isfinite(reward)
-    for first, last in env.task.scenarios[scenarios[scenario_index]].windows.values():
-        assert 1 <= first <= last <= horizon
-
-
 def test_one_scenario_is_for_training(env_id):
     scenarios = catalogue()[env_id].scenarios
     assert scenarios["random"].training
     papers = [scenario for name, scenario in scenarios.items() if name.startswith("paper")]
     assert papers
     assert not any(scenario.training for scenario in papers)
-
-
-def test_float64_actions_lose_nothing(env_id, control, short):
-    env = TaskEnv(env_id, control=control, backend="numpy", **short)
-    if not isinstance(env.action_space, gym.spaces.Box):
-        pytest.skip("integers have no precision")
-    fine = np.full(env.action_space.shape, 0.3, dtype=np.float64)
-    fine[0] = 0.1
-    outcomes = []
-    for action in (fine, fine.astype(np.float32)):
-        env.reset(seed=0)
-        outcomes.append(env.step(action)[0])
-    assert (outcomes[0] != outcomes[1]).any(), "0.1 is another number in float32"
-    np.testing.assert_allclose(outcomes[0], outcomes[1], rtol=1e-5, atol=1e-5)
 
 
 def test_relative_reward_of_the_papers_algorithm_is_zero(env_id, short):
@@ -308,12 +274,19 @@ def test_policies_forget_at_the_start_of_an_episode(env_id):
 def test_stable_baselines3_evaluates_a_baseline(env_id, short):
     pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import DummyVecEnv
 
-    known = baselines_of(env_id)
-    policy_class = known.policies[known.score_paper]
+    policy_class = baselines_of(env_id).policies[baselines_of(env_id).score_paper]
     env = gym.make(env_id, control=policy_class.control, **short)
-    mean, deviation = evaluate_policy(policy_class(env.unwrapped.model), env, n_eval_episodes=3, warn=False)
-    assert np.isfinite([mean, deviation]).all()
+    policy, vector = policy_class(env.unwrapped.model), DummyVecEnv([lambda: env])
+    vector.seed(5)
+    found, _ = evaluate_policy(policy, vector, n_eval_episodes=1, return_episode_rewards=True, warn=False)
+    (observation, _), paid, state, ended = env.reset(seed=5), 0.0, None, False
+    while not ended:
+        action, state = policy.predict(observation, state, np.array([state is None]))
+        observation, reward, _, ended, _ = env.step(action)
+        paid += reward
+    assert found == pytest.approx([paid], rel=1e-6)  # rewards are float32 there
 
 
 def test_baselines_are_named_consistently(env_id):

@@ -150,14 +150,12 @@ def opened(name, control, scenario, episodes, **keywords):
 
 
 @pytest.mark.parametrize(("name", "control", "scenario", "keywords"), AS_MODELLED)
-@pytest.mark.claims
 def test_it_stays_shut_where_nothing_is_wrong(name, control, scenario, keywords):
     episodes = 8 if scenario == "matched" else 64
     assert opened(name, control, scenario, episodes, **keywords) < 0.06
 
 
 @pytest.mark.parametrize("name", WRONG)
-@pytest.mark.claims
 def test_alarms_hear_what_is_wrong(name):
     control, scenario, keywords = WRONG[name]
     assert opened(name, control, scenario, 16, **keywords) > 0.6

@@ -151,7 +151,6 @@ def attenuated_mean_square(K, drift, coloured, correlation_time, white_intensity
     return constant + colour + (white_intensity + K * K * receiver_intensity) / (2.0 * K)
 
 
-@pytest.mark.claims
 def test_best_constant_gain():
     model = (0.6, 0.4, 1.0, 0.04, 0.02)
     K = loosely_coupled.best_constant_gain(*model)

@@ -271,6 +271,7 @@ def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(model):
     compare(model, VariationalBayesPrediction(model.task, acceleration, tau), track)
 
 
+@pytest.mark.slow
 def test_untuned_values_are_those_in_force():
     known = baselines_of(ID)
     seeds = episode_seeds("train", 0, 8)

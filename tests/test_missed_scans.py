@@ -519,6 +519,7 @@ def test_bound_gains_nothing_where_the_target_is_missed():
 
 
 @pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
+@pytest.mark.slow
 def test_everything_competes(scenario):
     known = baselines_of(ID)
     competitors = [*known.policies, *known.estimators, *known.references, *known.bounds]

@@ -93,7 +93,8 @@ def test_work_goes_on_after_a_print_that_failed(run, tmp_path, monkeypatch):
     ]
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
     with closed_pipe() as output:
-        assert run("benchmark", "--out", "out", output=output) == (0, "")
+        code, errors = run("benchmark", "--out", "out", output=output)
+    assert (code, errors.count("1 competitor over 4 episodes")) == (0, len(errors.splitlines()))
     kept = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [result["scenario"] for result in kept["results"]] == ["paper", "random"]
     assert "<html" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

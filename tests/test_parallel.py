@@ -10,6 +10,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import weakref
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from filtergym.baselines.tuned_values import TunedValues
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation import code, parallel, summary
+from filtergym.evaluation.evaluate import run_piece
+from filtergym.evaluation.metrics import record_statistics
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.store import Store
 from filtergym.evaluation.summary import Summary, combine_summaries, summaries
@@ -106,6 +109,58 @@ def test_summaries_tell_what_the_evaluation_does(env_id, short):
         np.testing.assert_array_equal(result.track[name].values, whole.track[name].values, err_msg=name)
 
 
+def test_without_figures_there_are_the_same_records_and_no_curves():
+    experiment = problem_of(ENV).experiment(episodes=8)
+    found = {}
+    for curves in (True, False):
+        asked = evaluation_requests(problem_of(ENV), experiment, NAMES, curves=curves)
+        found[curves] = combine_summaries([one for _, one in sorted(summaries(asked, Workers()))])
+    assert found[True][0] == found[False][0]
+    assert found[True][1] is not None
+    assert found[False][1] is None
+    assert found[True][2].identical(found[False][2])
+
+
+def numbers_in(part):
+    """How many numbers are kept of some episodes."""
+    sums, samples = part.reduction.sums.values(), part.reduction.samples.values()
+    return (
+        sum(v.size for v in sums) + sum(v.size for pieces in samples for v in pieces) + part.head.nbytes // 8
+    )
+
+
+def test_of_an_episode_a_few_numbers_are_kept_and_of_a_block_nothing_else(env_id, short, monkeypatch):
+    """Memory grows by less than one measurement an episode, and the arrays of a block go before the next is run."""
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    problem = problem_of(env_id)
+    shorter = {} if env_id == ENV else short
+    kept, held = [], []
+    for episodes in (16, 32, 64):
+        experiment = problem.experiment(episodes=episodes, keywords=shorter)
+        [asked] = evaluation_requests(problem, experiment, problem.baselines.score_paper, curves=False)
+        blocks = []
+
+        def run(*given, blocks=blocks):
+            held.append(sum(block() is not None for block in blocks))
+            return run_piece(*given)
+
+        def declare(run, asked=asked, blocks=blocks):
+            values = run["error"].values
+            while values.base is not None:
+                values = values.base
+            blocks.append(weakref.ref(values))
+            yield from record_statistics(run, asked.episodes, asked.metrics)
+
+        monkeypatch.setattr(summary, "run_piece", run)
+        kept.append(numbers_in(summary.reduce_episodes(asked, declare, lambda _: None)))
+        assert len(blocks) == episodes // 8
+    assert held == [0] * len(held)
+    each = (kept[2] - kept[1]) / 32
+    assert each == (kept[1] - kept[0]) / 16
+    whole = evaluate(env_id, problem.baselines.score_paper, episodes=1, **shorter).nbytes / 8
+    assert 1 <= each < whole / 10
+
+
 def shuffled(run):
     """Let pieces of work come back in another order."""
 
@@ -167,6 +222,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     assert without_times(tmp_path / "one/results.json") == without_times(tmp_path / "two/results.json")
 
 
+@pytest.mark.slow
 def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatch):
     """What is done is not done again, unless something that it depends on has changed."""
     monkeypatch.chdir(tmp_path)
@@ -193,21 +249,6 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
     assert command(*words)[0] == 0
     assert done == ["imm", "known-turn", "known-turn"]
     assert without_times(tmp_path / "out/records.json") == whole
-
-
-def test_a_process_is_given_together_what_shares_a_model(monkeypatch):
-    """Every piece is in one batch, and no batch but a single piece goes beyond the limit."""
-    experiments = [problem_of(ENV).experiment(name, episodes=4) for name in ("paper", "random")]
-    asked = [
-        evaluation_requests(problem_of(ENV), one, ["imm"])[0]
-        for one in (*experiments, *experiments, experiments[0])
-    ]
-    pieces = list(enumerate(asked))
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0, 2, 4], [1, 3]]
-    monkeypatch.setattr(summary, "BATCH", 2 * asked[0].measurements)
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0, 2], [1, 3], [4]]
-    monkeypatch.setattr(summary, "BATCH", 1)
-    assert [[i for i, _ in batch] for batch in summary._batches(pieces)] == [[0], [1], [2], [3], [4]]
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):

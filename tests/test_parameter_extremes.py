@@ -115,6 +115,8 @@ def finding(env_id, keywords, kind, rng):
         wrong.extend(name for name, values in found.items() if not np.isfinite(values).all())
         if not wrong:
             sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 1e-300))
+            if not (np.einsum("nii->ni", P) > 0.0).all():
+                wrong.append("a variance of zero")
             lowest = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None, :]).min()
             if lowest < -1e-9:
                 wrong.append(f"correlations with an eigenvalue of {lowest:.2g}")
@@ -173,6 +175,8 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
             },
         ),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
+        ("LooselyCoupledNavigation", {"control": "mode", "white_intensity": 0.0}),
+        ("LooselyCoupledNavigation", {"control": "weights", "white_intensity": 1e-300}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
         ("TightlyCoupledNavigation", {"singer_sigma": 1e6}),

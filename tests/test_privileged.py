@@ -285,6 +285,7 @@ def test_a_policy_that_is_corrected_sees_the_observation_only():
     assert paid[0] == paid[1]
 
 
+@pytest.mark.slow
 def test_snippet_of_an_asymmetric_critic(capsys):
     pytest.importorskip("stable_baselines3")
     text = (Path(__file__).parent.parent / "docs" / "agents_learning.md").read_text(encoding="utf-8")

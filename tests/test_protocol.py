@@ -381,6 +381,7 @@ def test_vectors_render_before_reset_and_without_a_mode():
         assert env.render() is None
 
 
+@pytest.mark.slow
 def test_video_of_a_vector(tmp_path):
     pytest.importorskip("moviepy")
     from moviepy import VideoFileClip
@@ -463,6 +464,7 @@ def test_episodes_go_on_in_another_process(env_id, short, make, elsewhere):
     assert_all_equal(continued(env, actions[2:]), there)
 
 
+@pytest.mark.slow
 def test_specs_are_enough_for_spawned_processes():
     here = gym.make(ID, scenario=FLIGHT, dtype="float32", horizon=4)
     make = functools.partial(gym.make, here.spec)

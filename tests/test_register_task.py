@@ -176,6 +176,7 @@ def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
     assert code == 0, errors
 
 
+@pytest.mark.slow
 def test_the_command_line_finds_it_in_the_folder_where_it_is_started(package):
     out = run(
         "evaluate", ID, "--policy", "turns_package:Middle", "--policy", "random", "--episodes", "4", "--out", "out",

@@ -267,6 +267,7 @@ def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
         assert not any("nan" in cell for row in table.rows for cell in row)
 
 
+@pytest.mark.slow
 def test_verdicts_of_few_episodes(results: SimpleNamespace) -> None:
     verdicts = {
         claim.key: claim.verdict for claim in judge_claims(claims.CLAIMS, claims.quantities(results.of))

@@ -1,7 +1,8 @@
-"""Every scenario's parameters and windows, held as data: a distribution that changes has to be changed here, too.
+"""Parameters of scenarios and of competitors, held as data: a number that changes has to be changed here, too.
 
-``scenarios.json`` holds for every environment what its parameters are by default, and for every scenario those that
-differ, its windows and whether it is for training. To accept a change, run
+``scenarios.json`` holds for every environment what its parameters are by default, for every scenario those that differ,
+its windows and whether it is for training, and for every competitor that ships the parameters that it is made with. To
+accept a change, run
 
     python tests/test_scenario_table.py
 
@@ -10,10 +11,13 @@ and look at the difference. A change of what an episode is raises the task's ``i
 """
 
 import dataclasses
+import inspect
 import json
 from pathlib import Path
 
 import pytest
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.table import Variant
 from filtergym.envs.engine.catalogue import catalogue
 
 FILE = Path(__file__).parent / "scenarios.json"
@@ -27,13 +31,27 @@ def table(cls):
         own = dataclasses.asdict(cls.Parameters(**scenario.parameters))
         scenarios[name] = {
             "training": scenario.training,
-            "windows": scenario.windows,
+            "windows": dict(scenario.windows),
             "parameters": {key: value for key, value in own.items() if value != defaults[key]},
         }
-    return json.loads(json.dumps({"defaults": defaults, "scenarios": scenarios}, default=dict))
+    known = baselines_of(cls.id)
+    competitors = {
+        name: settings(maker)
+        for kind in (known.policies, known.estimators, known.smoothers, known.references, known.bounds)
+        for name, maker in kind.items()
+    }
+    parts = {"defaults": defaults, "scenarios": scenarios, "competitors": competitors}
+    return json.loads(json.dumps(parts, default=repr))
 
 
-@pytest.mark.parametrize("part", ["defaults", "scenarios"])
+def settings(maker):
+    """Parameters that a competitor is made with: those that its class has by default, and those of its variant."""
+    parameters = inspect.signature(maker.func if isinstance(maker, Variant) else maker).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+    return {**defaults, **(maker.keywords if isinstance(maker, Variant) else {})}
+
+
+@pytest.mark.parametrize("part", ["defaults", "scenarios", "competitors"])
 def test_scenarios_are_the_stored_ones(env_id, part):
     stored, found = json.loads(FILE.read_text())[env_id][part], table(catalogue()[env_id])[part]
     assert list(found) == list(stored)
@@ -51,11 +69,14 @@ def test_windows_lie_in_the_episode(env_id):
 
 if __name__ == "__main__":
     rows = [
-        f'"{env_id}": {{"defaults": {{\n'
-        + ",\n".join(f'"{key}": {json.dumps(value)}' for key, value in found["defaults"].items())
-        + '\n}, "scenarios": {\n'
-        + ",\n".join(f'"{key}": {json.dumps(value)}' for key, value in found["scenarios"].items())
-        + "\n}}"
+        f'"{env_id}": {{'
+        + ", ".join(
+            f'"{part}": {{\n'
+            + ",\n".join(f'"{key}": {json.dumps(value)}' for key, value in values.items())
+            + "\n}"
+            for part, values in found.items()
+        )
+        + "}"
         for env_id, found in ((env_id, table(cls)) for env_id, cls in catalogue().items())
     ]
     FILE.write_text("{\n" + ",\n".join(rows) + "\n}\n")

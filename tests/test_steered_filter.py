@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.compiler import namespace
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors import make_competitor
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import run_competitor, start_lanes
-from filtergym.evaluation.steered_filter import steer
+from filtergym.evaluation.steered_filter import steer, trace_policy
 
+from filtergym import evaluate
 from filtergym.names import find_competitor, import_problem
 
 pytest.importorskip("llvmlite")
@@ -80,3 +82,35 @@ def test_a_policy_that_draws_numbers_is_not_traced():
     model = make_model(problem.task, "gain", backend="compiled")
     with pytest.raises(NotTraceable):
         model.with_filter(Steer(maker, {}))
+
+
+BPTT = "filtergym/ManeuveringTarget-v0", "bptt"
+
+
+def test_the_layers_of_a_network_are_loops_that_sum_in_the_same_order(monkeypatch):
+    """The same bits as of a straight line, in a program that is shorter than the network has weights."""
+    problem = import_problem(BPTT[0])
+    maker = find_competitor(problem, BPTT[1])
+    found, steps = [], []
+    for large in (namespace.LARGE, 10**9):  # beyond the second no product is a loop
+        monkeypatch.setattr(namespace, "LARGE", large)
+        model = make_model(problem.task, maker.control, backend="compiled", horizon=HORIZON)
+        policy = make_competitor(maker, model)
+        steps.append(len(trace_policy(model, policy).program.steps))
+        model.programs._kept.clear()  # what was traced for the same parameters before
+        found.append(run_competitor(model, maker, "policy", SEEDS, estimates))
+    weights = sum(values.size for values in maker.arrays.values())
+    assert steps[0] < weights < steps[1]
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(values, found[1][name], err_msg=name)
+
+
+def test_an_agent_is_traced_once_for_all_that_an_evaluation_does_with_it(monkeypatch):
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)  # several pieces of few episodes
+    traced = []
+    monkeypatch.setattr(
+        "filtergym.evaluation.rollout.trace_policy",
+        lambda *given: traced.append(given) or trace_policy(*given),
+    )
+    evaluate(*BPTT, episodes=24, horizon=HORIZON - 1, timed=True)  # a horizon that nobody else has
+    assert len(traced) == 1

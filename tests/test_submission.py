@@ -459,6 +459,7 @@ def test_an_agent_carries_what_its_file_says_of_its_training(honest):
     assert (found.card.seeds, found.card.scenarios) == ((run["seed"],), (run["scenario"],))
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_run(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(MINE, encoding="utf-8")

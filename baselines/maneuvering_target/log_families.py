@@ -191,7 +191,9 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     }
     if recording is None or "odometry_displacement" in recording.measurements:
         families["dead-reckoning"] = _anchored_family(recording, T, r)
-    return {name: dataclasses.replace(family, units=UNITS, beyond=BEYOND) for name, family in families.items()}
+    return {
+        name: dataclasses.replace(family, units=UNITS, beyond=BEYOND) for name, family in families.items()
+    }
 
 
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:

@@ -20,7 +20,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple
 
 import numpy
 
@@ -274,7 +274,7 @@ def _explain_end(code: int, seconds: float) -> ValueError:
     return ValueError("its parser broke down over it: it is damaged")
 
 
-def _receive(answer: BinaryIO, memory: int) -> tuple[Any, list[numpy.ndarray]]:
+def _receive(answer: IO[bytes], memory: int) -> tuple[Any, list[numpy.ndarray]]:
     """Return the head of an answer and its arrays; None where it is not whole."""
     size = answer.read(8)
     if len(size) < 8 or int.from_bytes(size, "little") > memory:

@@ -375,7 +375,7 @@ class EpisodePicture:
         opened = self._figure is not None
         try:
             figure = self._draw(state)
-        except _NoWindow as error:
+        except _WindowError as error:
             self._go_on_unseen(str(error))
             return
         if not opened:
@@ -533,7 +533,7 @@ def _moving(axes: Axes) -> list[Artist]:
     )
 
 
-class _NoWindow(Exception):
+class _WindowError(Exception):
     """A window cannot be opened; says why, and what to check."""
 
 
@@ -563,7 +563,7 @@ def _window(title: str) -> Figure:
     try:
         figure = pyplot.figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
     except Exception as error:  # every toolkit has exceptions of its own for a missing display
-        raise _NoWindow(
+        raise _WindowError(
             f"the backend {matplotlib.get_backend()!r} cannot open a window ({error}); check DISPLAY and MPLBACKEND"
         ) from error
     if figure.canvas.manager is not None:

@@ -134,6 +134,27 @@ class EnvOptions:
         return self.observation == "asymmetric"
 
 
+class _OneThread:
+    """Lets one thread at a time into a block and refuses others; of a list, since a lock can be neither copied nor
+    pickled with an environment.
+    """
+
+    def __init__(self) -> None:
+        self._free = [True]
+
+    def __enter__(self) -> None:
+        """Enter, or raise gymnasium.error.Error if another thread is inside."""
+        try:
+            self._free.pop()
+        except IndexError:
+            raise gymnasium.error.Error(
+                "another thread steps or resets these environments at the same time: give each thread its own"
+            ) from None
+
+    def __exit__(self, *_: object) -> None:
+        self._free.append(True)
+
+
 class _EnvBase:
     """What both environments share: a task, its spaces, and the reward."""
 
@@ -531,6 +552,8 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         """Apply the action to the measurement just shown, then show the next one."""
         if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
+        if self.fleet.done[0]:
+            raise gymnasium.error.ResetNeeded("the episode has ended: call reset before the next step")
         array = check_action(self.action_space, action, None)
         info: dict[str, Any] = {}
         reward = self._step_lanes(array[None], info)
@@ -686,6 +709,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.single_action_space = self.model.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._in_use = _OneThread()
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)
 
@@ -719,6 +743,12 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 parameters that would change the spaces, and for seeds that are none.
             gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
+        with self._in_use:
+            return self._reset(seed, options)
+
+    def _reset(
+        self, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
         wanted = _check_options(options, self.reset_options)
         seeds = self._check_seeds(seed)
         mask = wanted.get("reset_mask")
@@ -791,7 +821,16 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.begin(self.fleet.only.state, lanes)
 
     def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
-        """Apply the actions to the measurements just shown, then show the next ones."""
+        """Apply the actions to the measurements just shown, then show the next ones.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset, and where an episode has ended and none begins anew.
+            gymnasium.error.Error: where another thread steps or resets the same environments.
+        """
+        with self._in_use:
+            return self._step(actions)
+
+    def _step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         waiting = self._finished

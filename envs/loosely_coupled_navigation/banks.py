@@ -442,6 +442,10 @@ class GainBank(KalmanBucyBank):
         return found
 
 
+LEAST_GROWTH = 1e-12
+"""Of a filter's variance between two measurements, of that of a measurement: with less it does not move any more."""
+
+
 class SchemeBank(KalmanBucyBank):
     """Controls ``mode`` and ``weights``: three filters run side by side without mixing; the action reports."""
 
@@ -449,7 +453,13 @@ class SchemeBank(KalmanBucyBank):
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
-        self.plain_growth = task.constant(self.parameters.plain_growth)[:, None, None]
+        p = self.parameters
+        if not p.plain_growth[0] > LEAST_GROWTH * p.receiver_variance:
+            raise ValueError(
+                f"white_intensity must be larger under control {control!r}, one of whose filters knows no other noise "
+                f"and would be certain of its position, got {p.white_intensity!r}"
+            )
+        self.plain_growth = task.constant(p.plain_growth)[:, None, None]
 
     @property
     def action_space(self) -> gymnasium.Space:

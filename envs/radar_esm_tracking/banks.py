@@ -3,8 +3,9 @@
 Equations and their numbers stand in ``filters/class_fusion.py``.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -74,6 +75,16 @@ class Filters(NamedTuple):
     """Those that this scan has started from, ``(M, N)``."""
 
 
+@functools.lru_cache(8)  # an evaluation makes the same bank for every competitor, on numbers and on symbols
+def _design_channels(
+    design_models: Callable[[RadarEsmTrackingParameters], tuple[class_fusion.Models, numpy.ndarray]],
+    parameters: RadarEsmTrackingParameters,
+) -> class_fusion.Channels:
+    """Gains and innovation statistics of the classes' filters for every scan of an episode."""
+    # One scan beyond the horizon is measured; lanes that wait for their reset stay at the last column.
+    return class_fusion.design_channels(*design_models(parameters), parameters.horizon + 1)
+
+
 class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
     """Every control: one Kalman filter for each class; with class transitions they mix on their weights."""
 
@@ -86,12 +97,10 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
         self.mixes = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
         self.class_transition = constant(p.class_transition)
-        models, start = task.design_models(p)
-        self.start_covariance = constant(start)[..., None]
-        # One scan beyond the horizon is measured; lanes that wait for their reset stay at the last column.
+        self.start_covariance = constant(task.design_models(p)[1])[..., None]
         self.last_scan = p.horizon + 1
         if not self.mixes:
-            channels = class_fusion.design_channels(models, start, self.last_scan)
+            channels = _design_channels(task.design_models, p)
             self.channels = class_fusion.Channels(*(constant(table) for table in channels))
         esm = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
         silence = numpy.ones((task.classes, 1))

@@ -1,5 +1,6 @@
 """The plants of UavAutopilot and the design of the loop: autopilot, nominal filter, theory."""
 
+import functools
 from typing import NamedTuple
 
 import numpy
@@ -92,8 +93,9 @@ class Design(NamedTuple):
     """Control of the true plant if its state were known; None where the weights determine none."""
 
 
+@functools.lru_cache(8)  # an evaluation makes the same task for every competitor, on numbers and on symbols
 def design(parameters: UavAutopilotParameters) -> Design:
-    """Design the loop.
+    """Design the loop; the arrays are shared by all who ask for the same parameters.
 
     Raises:
         ValueError: if the plant diverges at once, L does not stabilise it, or the sensors do not determine the state.

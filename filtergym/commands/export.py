@@ -153,4 +153,3 @@ def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
     path = out or folder / "agent.safetensors"
     run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
-

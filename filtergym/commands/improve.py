@@ -31,6 +31,7 @@ from .terminal import (
     complete_policy,
     console,
     pair,
+    print_table,
     progress_bar,
     whole_numbers,
 )
@@ -89,7 +90,7 @@ def tune_policy(
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
-    console.print(tuning_table(outcome, tunable[policy].start))
+    print_table(tuning_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 

@@ -16,6 +16,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record_experiment
 from ..evaluation.rollout import Progress
+from ..evaluation.threads import one_thread
 from ..names import assumed_parameters, find_competitor, is_learned
 from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
@@ -60,10 +61,12 @@ from .terminal import (
     import_environments,
     one_of,
     parse_settings,
+    print_table,
     progress_bar,
 )
 
 
+@one_thread()
 def evaluate_policies(
     environment: Annotated[
         str | None,
@@ -275,11 +278,12 @@ def write_offline(
     with progress_bar() as bar:
         line = bar.add_task("recording", total=plan.decisions)
         written = plan.write(out, namespace, lambda done: bar.update(line, advance=done))
-    console.print(datasets_table(written))
+    print_table(datasets_table(written))
     place = f", with MINARI_DATASETS_PATH={out}" if out is not None else ""
     console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
 
 
+@one_thread()
 def benchmark(
     full: Annotated[
         bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
@@ -324,9 +328,10 @@ def benchmark(
 
         def tell_result(result: Result) -> None:
             first = result.records[0]
-            names = {record.policy for record in result.records}
+            count = len({record.policy for record in result.records})
             bar.say(
-                f"{result.short}, {result.scenario}: {len(names)} competitors over {first.episodes:,} episodes"
+                f"{result.short}, {result.scenario}: {count} competitor{'s' * (count > 1)} over "
+                f"{first.episodes:,} episodes"
             )
             if details:
                 print_results(result.records, result.knows)

@@ -23,8 +23,16 @@ class ProgressDisplay(Protocol):
     def add_task(self, description: str, *, total: float | None) -> Any:
         """Begin to show a task; returns what :meth:`update` takes."""
 
-    def update(self, task: Any, *, advance: float | None = None, completed: float | None = None) -> None:
-        """Say how much more, or how much in all, is done."""
+    def update(
+        self,
+        task: Any,
+        /,
+        *,
+        advance: float | None = None,
+        completed: float | None = None,
+        description: str | None = None,
+    ) -> None:
+        """Say how much more, or how much in all, is done, and of what."""
 
     def say(self, text: str) -> None:
         """Say that something has been read, fitted or finished; a bar shows it by itself."""
@@ -65,9 +73,20 @@ class ProgressLines:
         self._begin(description, total or 0.0)
         return 0
 
-    def update(self, task: int, *, advance: float | None = None, completed: float | None = None) -> None:
-        """Say how much more, or how much in all, is done."""
+    def update(
+        self,
+        task: int,
+        /,
+        *,
+        advance: float | None = None,
+        completed: float | None = None,
+        description: str | None = None,
+    ) -> None:
+        """Say how much more, or how much in all, is done, and of what; what is new of these is a line at once."""
         self._done = self._done + (advance or 0.0) if completed is None else completed
+        if description is not None and description != self._description:
+            self._description = description
+            self.say(description)
         since = self._clock() - self._told_at
         if self._total <= 0.0 or since < FEWEST_SECONDS or self._done <= self._told:
             return

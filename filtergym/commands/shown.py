@@ -29,7 +29,8 @@ def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
 def print_outcome(results: Sequence[Result]) -> None:
     """Print a sentence for each environment, and what they rest on."""
     for sentence in outcome_sentences(results):
-        print_sentence(sentence.replace("`", ""))
+        plain = sentence.replace("`", "")
+        print_sentence(plain, bold=plain.index(":"))
     console.print()
     for sentence in protocol_sentences(results):
         print_sentence(sentence)

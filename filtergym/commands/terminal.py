@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ..reports.lines import fill
 from .progress import progress_bar as progress_bar
@@ -213,9 +214,11 @@ def output_width() -> int | None:
 console = Output(width=output_width(), markup=False, emoji=False)
 
 
-def print_sentence(sentence: str, width: int = PAGE_WIDTH) -> None:
-    """Print a sentence in lines of at most so many columns, no number apart from its unit."""
-    console.print(fill(sentence, min(console.width, width)), highlight=False, soft_wrap=True)
+def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:
+    """Print a sentence in lines of at most so many columns, no number apart from its unit, its first letters bold."""
+    text = Text(fill(sentence, min(console.width, width)))
+    text.stylize("bold", 0, bold)
+    console.print(text, soft_wrap=True)
 
 
 def print_table(table: Table, width: int = PAGE_WIDTH) -> None:

@@ -11,7 +11,7 @@ from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
 from ..baselines.problem import Problem
 from ..evaluation.parallel import Workers
 from ..reports import standing
-from .terminal import console, progress_bar
+from .terminal import console, print_table, progress_bar
 
 Trainer = Callable[[TrainingRun, Session], TrainingRun]
 """What trains a run."""
@@ -135,7 +135,7 @@ def _train_here(training: Training, trainer: Trainer) -> None:
         shown = replace(
             session,
             progress=lambda done: bar.update(line, completed=done),
-            report=lambda text: console.print(text, highlight=False),
+            report=lambda text: console.print(text, highlight=False, soft_wrap=True),
         )
         trainer(run, shown)
     _print_done(folder, run)
@@ -156,7 +156,7 @@ def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[P
             run = found[folder] = training_run.load_run(folder, session.trust)
             console.print(f"{folder}: seed {run.seed}")
             for text in lines:
-                console.print(text, highlight=False)
+                console.print(text, highlight=False, soft_wrap=True)
             _print_done(folder, run)
     return found
 
@@ -190,4 +190,4 @@ def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> N
         standing.agent_standing(run, agent, str(training.folder), opponents, trust)
         for training, run, agent in zip(opened, runs, agents, strict=True)
     ]
-    console.print(standing.standing_table(found, opponents, runs[0].scenario))
+    print_table(standing.standing_table(found, opponents, runs[0].scenario))

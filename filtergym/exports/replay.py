@@ -1,6 +1,8 @@
 """What an exported filter must answer: measurements of episodes, and what the competitor itself estimated of them."""
 
+import collections
 import copy
+import functools
 import math
 from itertools import islice
 from typing import Any, NamedTuple
@@ -8,8 +10,11 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..agents.learned_policy import LearnedPolicy
-from ..compiler.functions import leaves
-from ..compiler.interpretation import interpret
+from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
+from ..compiler.interpretation import first_steps, interpret
+from ..compiler.library import portable
+from ..compiler.native import AVAILABLE, native
+from ..compiler.program import Program
 from ..envs.contract.model import Episode, Model
 from ..envs.engine.backend import make_model
 from ..evaluation.competitors import kind_of
@@ -20,6 +25,7 @@ from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
     MEASUREMENT,
+    SHOWN,
     STATE,
     TracedFilter,
     trace_filter,
@@ -147,7 +153,8 @@ class _Network:
 
 
 def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
-    """Run the programs of a filter over episodes, step by step in NumPy.
+    """Run the programs of a filter over episodes, step by step: in double as compiled code that calls the functions of
+    the C library, where code can be compiled, else in NumPy.
 
     Args:
         traced: to run.
@@ -158,23 +165,82 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
         Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
+    compiled = AVAILABLE and dtype is numpy.float64
     network = None if traced.network is None else _Network(traced.network, dtype)
     state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
+    update = _CompiledUpdate(traced, E) if compiled else functools.partial(_interpret_update, traced, dtype)
     answers = []
     for measured in replayed.measurements:
-
-        def read(argument: int, row: int, measured: Any = measured, state: Any = state) -> Any:
-            if argument == ANSWER:
-                assert network is not None
-                # Where nothing is decided the answer that was held is not looked at.
-                return 0.0 if network.answer is None else network.answer[row]
-            return {STATE: state, MEASUREMENT: measured}[argument][row]
-
-        found = interpret(traced.update, read, dtype, network, traced.shown)
+        found = update({STATE: state, MEASUREMENT: measured}, network)
         state = found[traced.shown : traced.shown + len(traced.state)]
         rows = found[traced.shown + len(traced.state) :]
         answers.append(numpy.stack([numpy.broadcast_to(row, (E,)) for row in rows]).astype(float))
     return numpy.stack(answers)
+
+
+def _answered(network: _Network | None) -> Any:
+    """Rows of what a network has answered; where nothing is decided the answer that was held is not looked at."""
+    if network is None or network.answer is None:
+        return collections.defaultdict(float)
+    return network.answer
+
+
+def _interpret_update(
+    traced: TracedFilter, dtype: Any, given: dict[int, Any], network: _Network | None
+) -> list[numpy.ndarray]:
+    """Results of an update in NumPy."""
+
+    def read(argument: int, row: int) -> Any:
+        return (_answered(network) if argument == ANSWER else given[argument])[row]
+
+    return interpret(traced.update, read, dtype, network, traced.shown)
+
+
+class _CompiledUpdate:
+    """An update of E filters as compiled code.
+
+    Args:
+        traced: the filter.
+        E: how many.
+    """
+
+    def __init__(self, traced: TracedFilter, E: int) -> None:
+        code, shown = traced.update, traced.shown
+        self._whole, self._before = _Code(code, E), None
+        if shown:  # what a network is shown is computed before it is asked, and once more with its answer
+            steps = code.steps[: first_steps(code, shown)]
+            self._before = _Code(Program(steps, code.constants, code.results[:shown]), E)
+
+    def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
+        if network is not None and self._before is not None:
+            network(self._before(given))
+        return self._whole({**given, ANSWER: _answered(network)})
+
+
+class _Code:
+    """Compiled code of a program for E lanes, whose results are the rows of one array."""
+
+    def __init__(self, code: Program, E: int) -> None:
+        self.E = E
+        self._inputs = sorted({step.arguments for step in code.steps if step.operation == "input"})
+        rows = {argument: 1 + row for argument, row in self._inputs}  # the last one counts
+        width = round_up_lanes(E)
+        self._arrays = [empty_lanes((rows.get(argument, 1),), width) for argument in range(SHOWN + 1)]
+        results = [result._replace(argument=SHOWN + 1, row=i) for i, result in enumerate(code.results)]
+        self._arrays.append(empty_lanes((max(len(results), 1),), width))
+        self._constants, self._width = code.constants, width
+        self._run = native(code._replace(results=results), [False] * len(self._arrays), portable())
+
+    def __call__(self, given: dict[int, Any]) -> list[numpy.ndarray]:
+        for argument, row in self._inputs:
+            values = numpy.asarray(given[argument][row], dtype=float)
+            self._arrays[argument][row] = values if values.ndim == 0 else values[0]
+            self._arrays[argument][row, : self.E] = values
+        table = [address_of(self._constants)]
+        for array in self._arrays:
+            table += [address_of(array), array.strides[0] // array.itemsize]
+        self._run(address_of(numpy.array(table, dtype=numpy.int64)), 0, self._width)
+        return list(self._arrays[-1][:, : self.E].copy())
 
 
 def mean_rows(traced: TracedFilter) -> slice:

@@ -17,7 +17,7 @@ from ..envs.engine.catalogue import catalogue
 from ..evaluation.cause_split import CAUSE_METRICS, phrases_of
 from ..evaluation.competitors import RandomPolicy
 from ..evaluation.dataset import groups_of, notes_of
-from ..evaluation.files import writable_file
+from ..evaluation.files import claim_folder, writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress
@@ -305,6 +305,7 @@ def run_benchmark(
     settings = settings_of(options.command)
     store = Store(folder / UNFINISHED)
     writable_file(folder / RESULTS)
+    claim_folder(folder)
     callbacks = callbacks or Callbacks()
     tick = callbacks.started(sum(cell.measurements for cell in wanted))
     # What is asked for, and the cell that it belongs to.

@@ -18,7 +18,7 @@ from ..envs.contract.model import Episode, Model
 from ..evaluation.bootstrap import Bootstrap, Estimate
 from ..evaluation.competitors import RandomPolicy
 from ..filters.gaussian import log_density
-from .tables import consistency, with_interval
+from .tables import INCONSISTENT, consistency, plain_table, with_interval
 
 SCREENING_SECONDS = 1.5
 """Time for asking every classical competitor, on a few episodes, whether it may be the strongest."""
@@ -115,19 +115,17 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
     lines = [*agents, *opponents.found]
     episodes = len(lines[0].means["cost"])
     bootstrap = Bootstrap(episodes)
-    table = Table(
-        title=f"{opponents.problem.id}, scenario {scenario} ({episodes} episodes of the validation split; "
-        "95 % intervals)",
-        title_justify="left",
+    table = plain_table(
+        f"{opponents.problem.id}, scenario {scenario} ({episodes} episodes of the validation split; 95 % intervals)"
     )
     table.add_column("name", no_wrap=True)
     table.add_column("")
-    for title in ("cost", "cost vs paper, %", "median, %", "ANEES", "better than paper after"):
-        table.add_column(title, justify="right")
+    for title in ("cost", "cost vs paper, %", "median,\n%", "ANEES", "beat paper\nafter steps"):
+        table.add_column(title, justify="right", no_wrap=True)
     paper = next((line.means["cost"] for line in lines if line.role == "paper"), None)
     for line in lines:
         own = line.means["cost"]
-        row = [line.name, line.role, f"{own.mean():.4g}"]
+        row = [line.name, line.role.replace(" ", "\n"), f"{own.mean():.4g}"]
         if paper is None or line.role == "paper":
             row += ["-", "-"]
         else:
@@ -138,11 +136,11 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
             ]
         row.append(consistency(Estimate(float(line.means["anees"].mean()), 0.0, 0.0)))
         passed = line.beat_paper
-        row.append("-" if passed is None else f"{passed['steps']:,} steps, {passed['seconds']:.1f} s")
+        row.append("-" if passed is None else f"{passed['steps']:,}\n({passed['seconds']:.1f} s)")
         table.add_row(*row)
     table.caption = (
-        "median: of the cost of each episode against the paper's algorithm. ANEES: 1 if errors are as large as the "
-        "covariance says; !: off by more than a factor of two. Agents were chosen on these episodes."
+        "median compares the cost of each episode with that of the paper's algorithm. ANEES is 1 if errors are as "
+        f"large as the covariance says; {INCONSISTENT} marks one that is off by more than a factor of two. Agents were "
+        "chosen on these episodes."
     )
-    table.caption_justify = "left"
     return table

@@ -360,7 +360,10 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
 
 def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     """Return what a search has found beside the values that it started from."""
-    table = Table("value", "untuned", "tuned", title=f"{outcome.policy} on {outcome.scenario}")
+    table = plain_table(f"{outcome.policy} on {outcome.scenario}")
+    table.add_column("value")
+    for title in ("untuned", "tuned"):
+        table.add_column(title, justify="right")
     for name, value in outcome.values.items():
         table.add_row(name, f"{start[name]:g}", f"{value:g}")
     table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
@@ -369,7 +372,9 @@ def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
 
 def datasets_table(written: Iterable[DatasetSummary]) -> Table:
     """Return what data sets hold; those whose environments are the same can be combined."""
-    table = Table("data set", "environment")
+    table = plain_table()
+    table.add_column("data set", overflow="fold")
+    table.add_column("environment", overflow="fold")
     for title in ("episodes", "steps", "mean return"):
         table.add_column(title, justify="right")
     for entry in written:
