@@ -157,7 +157,7 @@ def test_measurements_of_one_time_are_fused(tmp_path):
 
 
 def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
-    """By dense matrices, step by step: the mixture's likelihood, and the update that is kept; rounding of 60 updates."""
+    """By dense matrices, step by step: the mixture's likelihood, and the update that is kept; rounding of 60 steps."""
     task = make_task(PROBLEM.task, None)
     share, g = 0.05, np.random.default_rng(1)
     estimator = RobustEstimator(ConstantVelocity(task, acceleration=2.0), scale_noise, share, np)
