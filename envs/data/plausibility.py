@@ -349,8 +349,8 @@ def _check_scale(
     stated = float(numpy.median(sigma)) / math.sqrt(position.shape[1])
     if noise > SMALLEST_STATED * stated:
         raise ValueError(
-            f"positions scatter by {noise:.3g} m where {stated:.2g} m are stated: are the deviations metres? else leave "
-            "them out, and they are fitted"
+            f"positions scatter by {noise:.3g} m where {stated:.2g} m are stated: are the deviations metres? else "
+            "leave them out, and they are fitted"
         )
     if 0.25 < 1e3 * noise / stated < 4.0 and speed < 1.0 <= 1e3 * speed <= speeds[1]:
         raise ValueError(
