@@ -2,17 +2,23 @@
 
 import csv
 import json
+import math
 import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filtergym.baselines.advice import find_outliers, fit_all
 from filtergym.baselines.fitted_filters import read_artefact, write_advised
-from filtergym.baselines.fitting import Fit
+from filtergym.baselines.fitting import OUTLIER_SHARE, WIDE, Fit, RobustEstimator
+from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.scenario_choice import read_recording
+from filtergym.envs.contract.filter import Initial
+from filtergym.envs.engine.scenario_choice import make_task, read_recording
+from filtergym.envs.maneuvering_target.logs import scale_noise
+from filtergym.envs.maneuvering_target.world import Measurement
 
 import filtergym
 from filtergym.exports.c_source import FLAGS, export_c
@@ -33,7 +39,7 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
     time = T * np.arange(n) + jitter * T * g.uniform(-1.0, 1.0, n)
     course = 0.4 + 0.01 * np.arange(n)
     step = speed * T * np.stack([np.sin(course), np.cos(course)], axis=1)
-    truth = [20000.0, 10000.0, *np.cumsum(step, axis=0)]
+    truth = np.array([20e3, 10e3]) + np.cumsum(step, axis=0)
     plots = truth + sigma * g.standard_normal(truth.shape)
     wild = (g.random(n) < outliers) & (np.arange(n) > 3)
     plots[wild] += 30.0 * sigma
@@ -148,6 +154,47 @@ def test_measurements_of_one_time_are_fused(tmp_path):
     expected = one.update(8.0, x=210.0, y=-5.0, sigma_x=half, sigma_y=half)
     np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
+    """By dense matrices, step by step: the mixture's likelihood, and the update that is kept; rounding of 60 steps."""
+    task = make_task(PROBLEM.task, None)
+    share, g = 0.05, np.random.default_rng(1)
+    estimator = RobustEstimator(ConstantVelocity(task, acceleration=2.0), scale_noise, share, np)
+    m, P, T = np.array([0.0, 0.0, 50.0, 10.0]), np.diag([1e4, 1e4, 400.0, 400.0]), 4.0
+    memory = estimator.start(Initial(m[:, None], P[:, :, None]), 1)
+    F, H = np.eye(4) + T * np.eye(4, k=2), np.eye(2, 4)
+    G = np.concatenate([0.5 * T**2 * np.eye(2), T * np.eye(2)])
+    kept = []
+    for k in range(1, 61):
+        z = np.array([200.0, 40.0]) * k + 50.0 * g.standard_normal(2) + 3000.0 * (k % 20 == 7)
+        m, P = F @ m, F @ P @ F.T + 4.0 * G @ G.T
+        both = []
+        for weight, scale in ((1.0 - share, 1.0), (share, WIDE)):
+            S = H @ P @ H.T + scale**2 * 2500.0 * np.eye(2)
+            nu, K = z - H @ m, P @ H.T @ np.linalg.inv(S)
+            density = -0.5 * (nu @ np.linalg.solve(S, nu) + math.log(np.linalg.det(2.0 * math.pi * S)))
+            both.append((math.log(weight) + density, m + K @ nu, (np.eye(4) - K @ H) @ P))
+        kept.append(int(both[1][0] > both[0][0]))
+        _, m, P = both[kept[-1]]
+        one = np.ones(1)
+        plot = Measurement(k * one, z[:, None], np.full((2, 1), 2500.0), one, T * one, T * one)
+        mean, covariance, memory, found = estimator.update(plot, memory)
+        np.testing.assert_allclose(mean[:, 0], m, rtol=1e-9)
+        np.testing.assert_allclose(covariance[:, :, 0], P, rtol=1e-8, atol=1e-8)
+        assert found.log_likelihood[0] == pytest.approx(np.logaddexp(both[0][0], both[1][0]), rel=1e-9)
+    assert [k for k, wide in enumerate(kept, 1) if wide] == [7, 27, 47]
+
+
+@pytest.mark.slow
+def test_outliers_are_found_where_there_are_some_and_only_there(tmp_path):
+    for outliers in (0.0, 0.05):
+        recording = read_recording(write_log(tmp_path / "log.csv", PLANE, outliers=outliers), ID)
+        tunable, found, _ = fit_all(PROBLEM, recording, log_families(recording)["constant-velocity"])
+        assert (OUTLIER_SHARE in found.values) == (outliers > 0.0)
+        named = find_outliers(make_task(PROBLEM.task, None), recording, tunable, found)
+        error = recording.measurements["position"][0] - recording.truth[0][:, :2]
+        np.testing.assert_array_equal(named[0], np.hypot(*error.T) > 600.0)
 
 
 def _saved(folder: Path, log: Path, outliers: bool = True) -> Path:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 HARDEST = 100.0
 """m/s^2; no target accelerates more: ten g."""
+SMALLEST_STATED = 1e6
+"""Times that positions scatter as stated, above which what is stated is none: motion between fixes is 1e4 at most."""
 FEWEST = 10
 """Values from which on noise is estimated."""
 MOST_NOTES = 10
@@ -74,6 +76,20 @@ def check_speed(
     if speed - 4.0 * sigma / step > highest:
         factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
         unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
+        over_two, over_eight = (
+            float(numpy.median(_length(position[k:] - position[:-k]))) if len(position) > 2 * k else math.inf
+            for k in (2, 8)
+        )
+        if over_two < 0.1 * speed * step:
+            raise ValueError(
+                f"median speed {speed:.4g} m/s from row to row, and much less from each row to the next but one: are "
+                "there two targets? Give each a name in the column recording"
+            )
+        if over_eight < 2.0 * speed * step:
+            raise ValueError(
+                f"positions jump by {speed * step:.3g} m from row to row and lead nowhere, where {sigma:.3g} m are "
+                "stated: this is noise and no track, or state its deviation"
+            )
         cause = (
             f"are the times {unit}?"
             if unit
@@ -331,6 +347,11 @@ def _check_scale(
     speed = float(_length(position[-1] - position[0]) / (time[-1] - time[0]))
     noise = 1.4826 * float(numpy.median(numpy.abs(_deviations(time, position))))
     stated = float(numpy.median(sigma)) / math.sqrt(position.shape[1])
+    if noise > SMALLEST_STATED * stated:
+        raise ValueError(
+            f"positions scatter by {noise:.3g} m where {stated:.2g} m are stated: are the deviations metres? else "
+            "leave them out, and they are fitted"
+        )
     if 0.25 < 1e3 * noise / stated < 4.0 and speed < 1.0 <= 1e3 * speed <= speeds[1]:
         raise ValueError(
             f"positions scatter by {noise:.2g} m where {stated:.3g} m are stated, at a speed of {speed:.2g} m/s: "

@@ -271,6 +271,8 @@ def read_columns(
             f"it has the columns {list_names(names) or 'none'}, and {cls.id} reads time and "
             f"{', '.join(log_format.columns)}"
         )
+    if not len(read):
+        raise ValueError("it has no rows below its columns, and a recording needs several")
     table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
     for name in table:
         table[name] = numbers(name, table[name])

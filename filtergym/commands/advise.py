@@ -7,8 +7,9 @@ import typer
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
-from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_advised
+from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
 from ..baselines.problem import Problem, problem_of
+from ..baselines.tuned_values import make_tuned_policy
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
@@ -36,6 +37,16 @@ from .terminal import (
 )
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
+
+
+def price_words(price: dict[str, int] | None) -> str:
+    """Say what an update of a filter costs in C; nothing where it is not known."""
+    if price is None:
+        return ""
+    return (
+        f" ({price['operations']:,} operations an update in C, {price['state_bytes']:,} bytes of state, about "
+        f"{price['stack_bytes']:,} of stack)"
+    )
 
 
 def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
@@ -164,7 +175,13 @@ def advise_on_log(
     if out is not None and name in own:
         console.print(OWN)
     elif out is not None:
+        from ..exports.c_source import price_of
+        from ..exports.request import ExportRequest
+
         fit = advice.fits[name] if advice.advised.fitted else None
+        maker = shipped[name] if fit is None else make_tuned_policy(name, advice.tunables[name], fit.values)
+        parameters = setup_of(problem, found).parameters
+        price = price_of(ExportRequest(problem, name, maker, keywords=parameters))
         write_advised(
             out,
             problem,
@@ -174,9 +191,11 @@ def advise_on_log(
             advice.intervals if fit is not None else {},
             command_line(),
             held_out=held_out_numbers(advice),
+            price=price,
         )
         console.print(
-            f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
+            f"{name} is saved{price_words(price)}: filtergym evaluate {problem.id} --policy {out} runs it",
+            soft_wrap=True,
         )
     if report is not None and make_page is not None:
         task = make_task(problem.task, found, **keywords)

@@ -820,6 +820,16 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
     return figures
 
 
+def price_of(request: ExportRequest) -> dict[str, int] | None:
+    """Return what an update costs in C: operations, and bytes of state and stack; None for what cannot be exported."""
+    try:
+        traced, replayed = replay(request, EPISODES, 2)
+    except ValueError:
+        return None
+    operations, state, weights, stack = Writer(request.name, traced, DOUBLE, replayed.components).sizes
+    return {"operations": operations, "state_bytes": state, "weight_bytes": weights, "stack_bytes": stack}
+
+
 def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dict[str, str]:
     """Return the text of every file by its name."""
     return {
