@@ -175,8 +175,6 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
             },
         ),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
-        ("LooselyCoupledNavigation", {"control": "mode", "white_intensity": 0.0}),
-        ("LooselyCoupledNavigation", {"control": "weights", "white_intensity": 1e-300}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
         ("TightlyCoupledNavigation", {"singer_sigma": 1e6}),
@@ -188,6 +186,13 @@ def test_what_no_filter_can_answer_is_refused(environment, parameters):
     with pytest.raises(ValueError, match=r"must") as caught:
         make_model(environment, **parameters)
     assert caught.type is ValueError, "not one of NumPy or SciPy, which names no parameter"
+
+
+@pytest.mark.parametrize(("control", "intensity"), [("mode", 0.0), ("weights", 1e-300)])
+def test_a_scheme_that_knows_no_noise_is_not_certain(control, intensity):
+    """Of LooselyCoupledNavigation, whose plain scheme knows the white noise alone."""
+    id, keywords = "filtergym/LooselyCoupledNavigation-v0", {"control": control, "white_intensity": intensity}
+    assert not finding(id, keywords, "log-likelihood", np.random.default_rng(0))
 
 
 def main(count, seed="0", *chosen):

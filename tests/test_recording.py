@@ -430,7 +430,15 @@ def test_range_and_azimuth_are_east_and_north(tmp_path):
     one = read_recording(table(tmp_path / "polar.csv", **polar), TARGET)
     other = read_recording(table(tmp_path / "plots.csv", **PLOTS), TARGET)
     np.testing.assert_allclose(one.measurements["position"], other.measurements["position"], rtol=1e-12)
-    np.testing.assert_allclose(one.measurements["variance"], other.measurements["variance"], rtol=1e-12)
+    x, y = one.measurements["position"][0].T
+    away, across = (
+        100.0 / np.hypot(x, y),
+        np.radians(0.5),
+    )  # the environment's radar, along the beam and across
+    of_radar = np.stack([(away * x) ** 2 + (across * y) ** 2, (away * y) ** 2 + (across * x) ** 2], axis=-1)
+    np.testing.assert_allclose(one.measurements["variance"][0], of_radar, rtol=1e-12)
+    # Nobody says that a radar has measured x and y: they have the deviation with which they scatter.
+    assert np.unique(other.measurements["variance"]).tolist() == [other.parameters["range_sigma"] ** 2]
     sigmas = {"range_sigma": [30.0] * 5, "azimuth_sigma": [0.5] * 5}
     named = read_recording(table(tmp_path / "own.csv", **polar, **sigmas), TARGET)
     as_parameters = read_recording(tmp_path / "polar.csv", TARGET, range_sigma=30.0, bearing_sigma=0.5)
@@ -527,7 +535,9 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
     time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
     x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
-    found = read_log(Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {}))
+    found = read_log(
+        Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {"range_sigma": 100.0})
+    )
     said = found.measurements
     assert set(said) == set(fields)
     assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]

@@ -58,7 +58,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -151,6 +151,10 @@ $(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation
 $(DONE)/online: $(DONE)/ship-ManeuveringTarget
 	$(BIN)/python benchmarks/online.py > build/online.txt
 	$(table) build/online.txt --name online_time --command "python benchmarks/online.py"
+	$(finish)
+
+$(DONE)/cold:
+	$(BIN)/python benchmarks/cold.py --record
 	$(finish)
 
 $(DONE)/paper-%:

@@ -443,7 +443,8 @@ class GainBank(KalmanBucyBank):
 
 
 LEAST_GROWTH = 1e-12
-"""Of a filter's variance between two measurements, of that of a measurement: with less it does not move any more."""
+"""Of a scheme's variance between two measurements, over that of a measurement: with less its variance is lost in
+rounding, and it reports to be certain."""
 
 
 class SchemeBank(KalmanBucyBank):
@@ -453,13 +454,9 @@ class SchemeBank(KalmanBucyBank):
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
-        p = self.parameters
-        if not p.plain_growth[0] > LEAST_GROWTH * p.receiver_variance:
-            raise ValueError(
-                f"white_intensity must be larger under control {control!r}, one of whose filters knows no other noise "
-                f"and would be certain of its position, got {p.white_intensity!r}"
-            )
-        self.plain_growth = task.constant(p.plain_growth)[:, None, None]
+        least = LEAST_GROWTH * self.parameters.receiver_variance
+        growth = [max(each, least) for each in self.parameters.plain_growth]
+        self.plain_growth = task.constant(growth)[:, None, None]
 
     @property
     def action_space(self) -> gymnasium.Space:

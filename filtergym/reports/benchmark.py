@@ -21,6 +21,7 @@ from ..evaluation.files import claim_folder, writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress
+from ..evaluation.seeds import episode_seeds
 from ..evaluation.smoothers import is_open_loop
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import EvaluationRequest, Summary, combine_summaries, summaries
@@ -301,11 +302,11 @@ def run_benchmark(
     Returns:
         All results.
     """
+    episode_seeds(options.split, options.seed, 1)  # refuses a split that is none before anything is written
     wanted = cells(options.full, options.environments, options.split)
     settings = settings_of(options.command)
     store = Store(folder / UNFINISHED)
     writable_file(folder / RESULTS)
-    claim_folder(folder)
     callbacks = callbacks or Callbacks()
     tick = callbacks.started(sum(cell.measurements for cell in wanted))
     # What is asked for, and the cell that it belongs to.
@@ -316,6 +317,7 @@ def run_benchmark(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
     work = [work_of(wanted[i].problem, one) for one, i in asked]
+    claim_folder(folder)  # nothing is refused from here on
     results = _Results(wanted, callbacks)
     for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
         one, i = asked[k]
