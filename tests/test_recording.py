@@ -433,7 +433,7 @@ def test_range_and_azimuth_are_east_and_north(tmp_path):
     x, y = one.measurements["position"][0].T
     away, across = (
         100.0 / np.hypot(x, y),
-        np.radians(0.5),
+        np.radians(0.25),
     )  # the environment's radar, along the beam and across
     of_radar = np.stack([(away * x) ** 2 + (across * y) ** 2, (away * y) ** 2 + (across * x) ** 2], axis=-1)
     np.testing.assert_allclose(one.measurements["variance"][0], of_radar, rtol=1e-12)
