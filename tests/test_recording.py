@@ -431,14 +431,12 @@ def test_range_and_azimuth_are_east_and_north(tmp_path):
     other = read_recording(table(tmp_path / "plots.csv", **PLOTS), TARGET)
     np.testing.assert_allclose(one.measurements["position"], other.measurements["position"], rtol=1e-12)
     x, y = one.measurements["position"][0].T
-    away, across = (
-        100.0 / np.hypot(x, y),
-        np.radians(0.25),
-    )  # the environment's radar, along the beam and across
+    # The environment's radar: 100 m along the beam, 0.25 degrees across.
+    away, across = 100.0 / np.hypot(x, y), np.radians(0.25)
     of_radar = np.stack([(away * x) ** 2 + (across * y) ** 2, (away * y) ** 2 + (across * x) ** 2], axis=-1)
     np.testing.assert_allclose(one.measurements["variance"][0], of_radar, rtol=1e-12)
     # Nobody says that a radar has measured x and y: they have the deviation with which they scatter.
-    assert np.unique(other.measurements["variance"]).tolist() == [other.parameters["range_sigma"] ** 2]
+    assert np.unique(other.measurements["variance"]).tolist() == [other.typical["range_sigma"] ** 2]
     sigmas = {"range_sigma": [30.0] * 5, "azimuth_sigma": [0.5] * 5}
     named = read_recording(table(tmp_path / "own.csv", **polar, **sigmas), TARGET)
     as_parameters = read_recording(tmp_path / "polar.csv", TARGET, range_sigma=30.0, bearing_sigma=0.5)
