@@ -58,7 +58,8 @@ def check_command_line() -> None:
     evaluate = "evaluate filtergym/ManeuveringTarget-v0 --policy imm-tuned --policy ppo --episodes 2"
     for arguments, expected in (
         ("--version", filtergym.__version__),
-        ("list", "bptt"),
+        ("list", "filtergym/ManeuveringTarget-v0"),
+        ("list filtergym/ManeuveringTarget-v0", "bptt"),
         (evaluate, "imm-tuned"),
     ):
         ran = subprocess.run([command, *arguments.split()], capture_output=True, text=True, check=False)
