@@ -137,7 +137,7 @@ def write_record(rows: Sequence[Sequence[str]]) -> None:
         "command": "python benchmarks/cold.py --record",
         "made": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "versions": versions,
-        "note": "On two cores that others used, too: the seconds that pass are several times those of a machine alone.",
+        "note": "One process on one of two shared cores; processor seconds, with those of its children, and wall time.",
         "data": {"columns": COLUMNS, "rows": [by_name[name] for name in commands(False) if name in by_name]},
     }
     RECORD.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
