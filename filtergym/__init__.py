@@ -11,13 +11,11 @@ if (
     and (sys.orig_argv[-len(sys.argv)] == "filtergym" or sys.orig_argv[-len(sys.argv)].endswith("mfiltergym"))
     and not sys.flags.safe_path
 ):
-    del sys.path[
-        0
-    ]  # the working directory, in which Python would look for every library that is still to come
+    # The working directory, in which Python would look for every library that is still to come.
+    del sys.path[0]
 
 import importlib
 import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 
