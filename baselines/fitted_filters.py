@@ -233,20 +233,6 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     return LogSetup(**{key: log[key] for key in kinds})
 
 
-def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
-    """Return what makes a fitted filter; arguments and refusals as of :func:`read_artefact`.
-
-    Raises:
-        ValueError: if it names a shipped filter.
-    """
-    found = read_artefact(path, problem)
-    if found.fitted is None:
-        raise ValueError(
-            f"{path} names the shipped filter {found.filter!r}, which has no parameters of its own"
-        )
-    return found.fitted
-
-
 def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, float]) -> TunedPolicy:
     """Return what makes a filter of a family with values of a file."""
     families = families_of(problem)

@@ -77,7 +77,7 @@ def reading(reader: str, place: Path):
     from filtergym.agents.learned_policy import load_policy
     from filtergym.agents.settings import read_config
     from filtergym.agents.training_run import load_run
-    from filtergym.baselines.fitted_filters import read_fitted
+    from filtergym.baselines.fitted_filters import read_artefact
     from filtergym.baselines.problem import problem_of
 
     from filtergym import read_flights, read_recording
@@ -93,7 +93,7 @@ def reading(reader: str, place: Path):
         check_submission(problem, found, path)
 
     whole = {
-        "filter.json": lambda: read_fitted(path, problem),
+        "filter.json": lambda: read_artefact(path, problem),
         "safetensors": lambda: load_policy(problem.task, path),
         "submission": submission,
         "verification": lambda: read_verification(path),

@@ -10,7 +10,7 @@ import pytest
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
 from filtergym.baselines.advice import advise, share_out
-from filtergym.baselines.fitted_filters import own_family, read_fitted
+from filtergym.baselines.fitted_filters import own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
@@ -307,10 +307,10 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path, change, message):
     table = {"environment": ID, "filter": "constant-velocity", "values": {"log10_acceleration": 0.0}}
     path = tmp_path / "some.filter.json"
     path.write_text(json.dumps(table))
-    read_fitted(path, PROBLEM)
+    read_artefact(path, PROBLEM)
     path.write_text(json.dumps(table | change))
     with pytest.raises(ValueError, match=message):
-        read_fitted(path, PROBLEM)
+        read_artefact(path, PROBLEM)
 
 
 def test_too_few_measurements_are_refused(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pandas
 import pytest
 from filtergym.baselines.advice import advise
-from filtergym.baselines.fitted_filters import families_of, read_fitted, write_advised
+from filtergym.baselines.fitted_filters import families_of, read_artefact, write_advised
 from filtergym.baselines.maneuvering_target.anchored import DeadReckoning, regress_odometry
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
@@ -304,7 +304,7 @@ def test_its_file_runs_on_such_logs_alone(advice, tmp_path):
     write_advised(
         path, PROBLEM, name, advice.recording, advice.fits[name], advice.intervals, "filtergym advise"
     )
-    read_fitted(path, PROBLEM)
+    read_artefact(path, PROBLEM)
     recording, table = read(drive(count=200), tmp_path), pandas.read_csv(tmp_path / "drive.csv")
     found = evaluate(ID, [str(path)], recording, tracks=True)
     assert np.isfinite(found["log_likelihood"].values).all()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED, load_policy
 from filtergym.agents.settings import read_config
-from filtergym.baselines.fitted_filters import families_of, read_fitted
+from filtergym.baselines.fitted_filters import families_of, read_artefact
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data import foreign_files
 from filtergym.envs.data.foreign_files import (
@@ -298,12 +298,12 @@ def test_values_of_fitted_filters_keep_their_limits(value, tmp_path):
     table = {"environment": TARGET, "filter": "constant-velocity", "values": {"log10_acceleration": value}}
     path.write_text(json.dumps(table))
     with pytest.raises(ValueError, match=r"log10_acceleration must be from -15\.5 to 13\.5|no fitted filter"):
-        read_fitted(path, problem)
+        read_artefact(path, problem)
     table["values"] = {
         "log10_acceleration": sum(families_of(problem)["constant-velocity"].limits["log10_acceleration"]) / 2
     }
     path.write_text(json.dumps(table))
-    assert read_fitted(path, problem).kind == "estimator"
+    assert read_artefact(path, problem).fitted.kind == "estimator"
 
 
 @pytest.mark.parametrize(
