@@ -31,8 +31,8 @@ from ..envs.contract.parameters import check_integer
 from ..envs.engine.catalogue import nearest
 from ..envs.engine.environment import TaskVectorEnv
 from ..envs.engine.scenario_choice import find_mixture
-from ..evaluation.competitors import Policy
-from ..evaluation.seeds import episode_seeds
+from ..evaluation.competitors.kinds import Policy
+from ..evaluation.running.seeds import episode_seeds
 from ..filters.array_namespace import host_array
 from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, as_trained

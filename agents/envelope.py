@@ -18,10 +18,10 @@ from ..envs.contract.task import Task
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import parameter_names
 from ..envs.engine.scenario_choice import find_mixture, make_task
-from ..evaluation.competitors import Policy, make_competitor
-from ..evaluation.rollout import start_lanes
-from ..evaluation.seeds import episode_seeds
-from ..evaluation.stepping import SteppingPolicy
+from ..evaluation.competitors.kinds import Policy, make_competitor
+from ..evaluation.competitors.stepping import SteppingPolicy
+from ..evaluation.running.rollout import start_lanes
+from ..evaluation.running.seeds import episode_seeds
 
 EPISODES = 512
 """Of the training distribution that are flown: of few, an episode of the same distribution would often lie outside."""

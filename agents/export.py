@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from ..evaluation.files import whole_files, writable_file
+from ..evaluation.storage.files import whole_files, writable_file
 from .envelope import training_range
 from .learned_policy import load_policy, write_arrays, write_envelope
 from .named_policies import load_zipped_model

@@ -25,7 +25,7 @@ from ..envs.contract.failures import explain_errors
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
-from ..evaluation.competitors import (
+from ..evaluation.competitors.kinds import (
     ConstantPolicy,
     Kind,
     Likelihood,
@@ -37,8 +37,8 @@ from ..evaluation.competitors import (
     make_competitor,
     says_traceable,
 )
-from ..evaluation.evaluate import control_of
-from ..evaluation.metrics import mean_cost
+from ..evaluation.running.evaluate import control_of
+from ..evaluation.running.metrics import mean_cost
 from .envelope import EnvelopeAlarm, TrainingRange, training_range
 from .learned_estimator import EstimatorMaker, LearnedEstimator
 from .residual import ResidualPolicy, policy_to_correct

@@ -14,8 +14,8 @@ from ..envs.contract.filter import Input
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
-from ..evaluation.competitors import Kind, Likelihood, Policy
-from ..evaluation.steered_filter import Steered, steer
+from ..evaluation.competitors.kinds import Kind, Likelihood, Policy
+from ..evaluation.competitors.steered_filter import Steered, steer
 
 
 class LearnedEstimator:

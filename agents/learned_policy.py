@@ -20,9 +20,9 @@ from ..envs.contract.model import Model
 from ..envs.contract.task import Task
 from ..envs.data.foreign_files import parse_json, read_content
 from ..envs.engine.catalogue import short_name, task_class
-from ..evaluation.competitors import Policy
-from ..evaluation.files import whole_file
-from ..evaluation.stored import fits
+from ..evaluation.competitors.kinds import Policy
+from ..evaluation.storage.files import whole_file
+from ..evaluation.storage.stored import fits
 from .gate import as_trained
 from .learned_estimator import EstimatorMaker
 from .training_run import TrainingRun

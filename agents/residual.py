@@ -13,7 +13,7 @@ import numpy
 from ..baselines.problem import Problem
 from ..envs.contract.model import Model
 from ..envs.engine.environment import TaskEnv
-from ..evaluation.competitors import Policy, expose_spaces, kind_of, make_competitor, says_traceable
+from ..evaluation.competitors.kinds import Policy, expose_spaces, kind_of, make_competitor, says_traceable
 
 
 def check_residual(model: Model, policy: Any) -> None:

@@ -28,7 +28,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from ..envs.contract.model import Model
-from ..evaluation.seeds import episode_seeds
+from ..evaluation.running.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, PolicyMaker, as_trained

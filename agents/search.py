@@ -29,8 +29,8 @@ from optuna.trial import TrialState
 
 from ..baselines.problem import Problem
 from ..envs.contract.parameters import check_integer
-from ..evaluation.code import code_digest
-from ..evaluation.files import writable_folder, write_text
+from ..evaluation.storage.code import code_digest
+from ..evaluation.storage.files import writable_folder, write_text
 from .settings import merge_settings, read_section
 from .training_run import (
     FILES,

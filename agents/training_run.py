@@ -40,9 +40,11 @@ from ..envs.engine.catalogue import (
 from ..envs.engine.environment import DTYPES
 from ..envs.engine.reward import REWARDS
 from ..envs.engine.scenario_choice import find_mixture, find_scenario
-from ..evaluation.bootstrap import Bootstrap
-from ..evaluation.competitors import kind_of
-from ..evaluation.files import (
+from ..evaluation.competitors.kinds import kind_of
+from ..evaluation.running.rollout import run_competitor
+from ..evaluation.running.seeds import episode_seeds
+from ..evaluation.statistics.bootstrap import Bootstrap
+from ..evaluation.storage.files import (
     claim_folder,
     find_folder,
     settle_folder,
@@ -50,9 +52,7 @@ from ..evaluation.files import (
     writable_folder,
     write_text,
 )
-from ..evaluation.rollout import run_competitor
-from ..evaluation.seeds import episode_seeds
-from ..evaluation.stored import read_json, restore
+from ..evaluation.storage.stored import read_json, restore
 from .gate import Gate
 from .residual import policy_to_correct
 from .settings import (

@@ -20,9 +20,9 @@ import xarray
 from ..envs.contract.task import Task
 from ..envs.data.recording import Recording, fill_arrays, measure_once
 from ..envs.engine.scenario_choice import make_task
-from ..evaluation.bootstrap import Estimate
-from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
-from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
+from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
+from ..evaluation.statistics.bootstrap import Estimate
+from ..evaluation.statistics.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (

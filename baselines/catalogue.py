@@ -11,7 +11,7 @@ from types import ModuleType
 
 from ..envs.contract.task import Task
 from ..envs.engine.catalogue import folders, nearest
-from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
+from ..evaluation.competitors.kinds import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
 
 USER_BASELINES: dict[str, Baselines] = {}

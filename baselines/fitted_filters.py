@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..evaluation.files import write_text
-from ..evaluation.stored import fits, read_json
+from ..evaluation.storage.files import write_text
+from ..evaluation.storage.stored import fits, read_json
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..evaluation.competitors import Likelihood
-from ..evaluation.likelihood import WindowLikelihood
+from ..evaluation.competitors.kinds import Likelihood
+from ..evaluation.competitors.likelihood import WindowLikelihood
 from ..filters.array_namespace import select_nested
 from .table import Tunable
 

@@ -15,7 +15,7 @@ def evaluate(
 
     Args:
         id: environment id.
-        competitors: a name, or names; or by name what :func:`.evaluation.evaluate.run_experiment` takes, or a name.
+        competitors: a name, or names; or by name what :func:`.evaluate.run_experiment` takes, or a name.
         *arguments: of :meth:`.Problem.evaluate`.
         **keywords: likewise.
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..envs.contract.task import Task
 from ..envs.engine.catalogue import import_task, importable_name, nearest, short_name, task_class
-from ..evaluation.evaluate import OPTIONS, Experiment, run_experiment
-from ..evaluation.parallel import Workers
-from ..evaluation.rollout import Progress
+from ..evaluation.running.evaluate import OPTIONS, Experiment, run_experiment
+from ..evaluation.running.parallel import Workers
+from ..evaluation.running.rollout import Progress
 from .catalogue import baselines_of, package_of
 from .table import Baselines
 from .tuned_values import TunedValues, table_path
@@ -105,7 +105,7 @@ class Problem:
         """Return an experiment on it, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            *arguments: what follows the task in :class:`.evaluation.evaluate.Experiment`.
+            *arguments: what follows the task in :class:`.evaluate.Experiment`.
             **fields: likewise.
         """
         known = self.baselines
@@ -123,11 +123,11 @@ class Problem:
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            competitors: by their names, as of :func:`.evaluation.evaluate.run_experiment`.
+            competitors: by their names, as of :func:`.evaluate.run_experiment`.
             *arguments: of :meth:`experiment`.
-            progress: as of :func:`.evaluation.evaluate.run_experiment`.
+            progress: as of :func:`.evaluate.run_experiment`.
             workers: likewise.
-            **keywords: of :meth:`experiment` what :data:`.evaluation.evaluate.OPTIONS` names; parameters of the task.
+            **keywords: of :meth:`experiment` what :data:`.evaluate.OPTIONS` names; parameters of the task.
         """
         options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
         experiment = self.experiment(*arguments, **options, keywords=keywords)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy
 
 from ..envs.contract.model import Model
-from ..evaluation.competitors import ConstantPolicy, Policy
+from ..evaluation.competitors.kinds import ConstantPolicy, Policy
 from .alarm import Alarm
 
 if TYPE_CHECKING:
     from ..envs.data.recording import Recording
 
 if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
-    from ..evaluation.own_metrics import OwnMetrics
+    from ..evaluation.running.own_metrics import OwnMetrics
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.engine.catalogue import nearest, short_name
-from ..evaluation.competitors import Kind
-from ..evaluation.files import write_text
-from ..evaluation.stored import fits, read_json
+from ..evaluation.competitors.kinds import Kind
+from ..evaluation.storage.files import write_text
+from ..evaluation.storage.stored import fits, read_json
 from .table import Tunable
 
 FOLDER = Path("tuned")

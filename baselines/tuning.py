@@ -18,11 +18,11 @@ from ..envs.contract.task import Scenario
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest, short_name
 from ..envs.engine.scenario_choice import find_scenario, make_task
-from ..evaluation.competitors import kind_of
-from ..evaluation.parallel import Workers, check_workers
-from ..evaluation.rollout import Progress, run_competitor
-from ..evaluation.seeds import episode_seeds
-from ..evaluation.store import Store, Work
+from ..evaluation.competitors.kinds import kind_of
+from ..evaluation.running.parallel import Workers, check_workers
+from ..evaluation.running.rollout import Progress, run_competitor
+from ..evaluation.running.seeds import episode_seeds
+from ..evaluation.storage.store import Store, Work
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import Tuned, round_value

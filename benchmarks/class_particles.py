@@ -22,8 +22,8 @@ import numpy
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.radar_esm_tracking.exact_bayes import TRAINING, ExactBayes
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters.class_fusion import bearing_difference
 
 ID = "filtergym/RadarEsmTracking-v0"

@@ -11,7 +11,7 @@ import dataclasses
 from pathlib import Path
 
 from filtergym.envs.data.recording import Recording
-from filtergym.evaluation.metrics import Record
+from filtergym.evaluation.running.metrics import Record
 from filtergym.papers.grid import markdown_table
 
 import filtergym

@@ -16,12 +16,12 @@ import numpy
 from filtergym.agents.gate import GatedMaker, is_gateable
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.metrics import mean_cost
+from filtergym.evaluation.running.metrics import mean_cost
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.reports.tables.terminal_tables.ranking import HARM
 from stresses import STRESSES
 
 from filtergym.names import GATED, find_competitor
-from filtergym.reports.ranking import HARM
 
 LOST = 10.0
 """Cost over the paper's from which on a track is lost."""

@@ -26,8 +26,8 @@ from filtergym.envs.contract.schedules import Steps, within
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.envs.loosely_coupled_navigation.world import Truth
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import receiver_faults
 from filtergym.filters.loosely_coupled import AugmentedCovariance
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 from filtergym.filters.small_matrices import product, transpose
 

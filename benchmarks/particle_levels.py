@@ -27,8 +27,8 @@ from filtergym.envs.contract.schedules import Steps
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.uav_autopilot.level_bank import VAGUE
 from filtergym.envs.uav_autopilot.task import TASK
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 
 
 class Particles:

@@ -49,20 +49,26 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.engine.catalogue import catalogue, short_name
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
-from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
-from filtergym.evaluation.files import write_text
-from filtergym.evaluation.own_metrics import MetricInputs, OwnMetrics
-from filtergym.evaluation.seeds import episode_seeds
-from filtergym.evaluation.store import Store, Work
-from filtergym.evaluation.summary import EvaluationRequest, Part, _resampling, combine_summaries, summarise
+from filtergym.evaluation.running.curves import DISTRIBUTION_LIMIT
+from filtergym.evaluation.running.own_metrics import MetricInputs, OwnMetrics
+from filtergym.evaluation.running.seeds import episode_seeds
+from filtergym.evaluation.running.summary import (
+    EvaluationRequest,
+    Part,
+    _resampling,
+    combine_summaries,
+    summarise,
+)
+from filtergym.evaluation.statistics.statistic.bootstrap import RESAMPLES, Bootstrap, block_of
+from filtergym.evaluation.storage.files import write_text
+from filtergym.evaluation.storage.store import Store, Work
+from filtergym.reports.tables.terminal_tables.benchmark import benchmark_policies, cells
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from filtergym.names import evaluation_requests
-from filtergym.reports.benchmark import benchmark_policies, cells
 
 EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
 MEASUREMENTS = 100_000
@@ -107,7 +113,9 @@ def algorithms(id: str) -> list[str]:
 def start_seconds() -> dict[str, float]:
     """What every process does before its first piece of work."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = "import filtergym.evaluation.summary, filtergym.agents.bptt, filtergym.agents.sb3_training"
+    words = (
+        "import filtergym.evaluation.running.summary, filtergym.agents.bptt, filtergym.agents.sb3_training"
+    )
     subprocess.run([sys.executable, "-c", words], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     imports = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

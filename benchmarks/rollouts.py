@@ -13,7 +13,7 @@ import time
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from filtergym.evaluation.evaluate import Experiment, plan_of, run_piece
+from filtergym.evaluation.running.evaluate import Experiment, plan_of, run_piece
 
 from filtergym.names import find_competitor, import_problem
 

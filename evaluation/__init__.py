@@ -1,1 +1,4 @@
-"""Rollouts, metrics, intervals, seeds and figures: takes objects and knows no names."""
+"""How competitors are run and what their episodes come to: takes objects and knows no names.
+
+Its rooms, in this order: ``storage``, ``statistics``, ``competitors``, ``running``, ``figures``.
+"""

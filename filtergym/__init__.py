@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from .envs.data.recording import Recording
     from .envs.data.trajectory import Trajectory
     from .envs.engine.scenario_choice import read_recording
-    from .evaluation.competitors import FunctionPolicy, Likelihood
+    from .evaluation.competitors.kinds import FunctionPolicy, Likelihood
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
     from .own_models import state_space

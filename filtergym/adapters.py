@@ -7,11 +7,11 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from .evaluation.adapters import SingleTrackEstimator
+from .evaluation.competitors.adapters import SingleTrackEstimator
 
 if TYPE_CHECKING:
-    from .evaluation.adapters import FilterpyEstimator
-    from .evaluation.stone_soup import StoneSoupEstimator
+    from .evaluation.competitors.adapters import FilterpyEstimator
+    from .evaluation.competitors.stone_soup import StoneSoupEstimator
 
 __all__ = ["FilterpyEstimator", "SingleTrackEstimator", "StoneSoupEstimator"]
 

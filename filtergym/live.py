@@ -8,10 +8,10 @@ from .agents.envelope import WatchedPolicy, training_range
 from .envs.contract.live_input import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
-from .evaluation.competitors import kind_of, make_competitor
-from .evaluation.evaluate import control_of
-from .evaluation.online import OnlineFilter
-from .evaluation.stepping import SteppingPolicy
+from .evaluation.competitors.kinds import kind_of, make_competitor
+from .evaluation.competitors.online import OnlineFilter
+from .evaluation.competitors.stepping import SteppingPolicy
+from .evaluation.running.evaluate import control_of
 from .names import find_competitor, find_log_setup, import_problem, with_normalisation
 
 

@@ -16,14 +16,14 @@ from .envs.data.recording import Recording
 from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
 from .envs.engine.environment import TaskEnv, TaskVectorEnv
-from .evaluation import metrics
-from .evaluation.competitors import check_competitor, kind_of, make_competitor
-from .evaluation.evaluate import Experiment, check_observation, control_of
-from .evaluation.metrics import Record
-from .evaluation.recording import record_experiment
-from .evaluation.rollout import Progress
-from .evaluation.stepping import SteppingPolicy
-from .evaluation.summary import EvaluationRequest
+from .evaluation.competitors.kinds import check_competitor, kind_of, make_competitor
+from .evaluation.competitors.stepping import SteppingPolicy
+from .evaluation.running import metrics
+from .evaluation.running.evaluate import Experiment, check_observation, control_of
+from .evaluation.running.metrics import Record
+from .evaluation.running.recording import record_experiment
+from .evaluation.running.rollout import Progress
+from .evaluation.running.summary import EvaluationRequest
 
 GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
@@ -134,8 +134,8 @@ def evaluate(
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: a name, names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
-            (:class:`~filtergym.evaluation.competitors.Policy`), or with ``start`` and ``update``
-            (:class:`~filtergym.evaluation.competitors.Estimator`); see :func:`competitor` for what a name can be. A
+            (:class:`.kinds.Policy`), or with ``start`` and ``update``
+            (:class:`.kinds.Estimator`); see :func:`competitor` for what a name can be. A
             model of Stable-Baselines3 is shown observations as its ``VecNormalize`` normalises them, if it holds one.
         scenario: name of a scenario, path of flights or of a recording, or a trajectory; default: the environment's
             training distribution.
@@ -146,11 +146,11 @@ def evaluate(
         progress: called with the number of measurements done, now and then.
         trust: load models' zips, which can execute code.
         **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes``, ``strict``
-            of :class:`.evaluation.evaluate.Experiment`, and ``workers`` of :func:`.evaluation.evaluate.run_experiment`.
+            of :class:`.evaluate.Experiment`, and ``workers`` of :func:`.evaluate.run_experiment`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
-        :func:`.evaluation.evaluate.run_experiment`.
+        :func:`.evaluate.run_experiment`.
 
     Raises:
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
@@ -234,7 +234,7 @@ def evaluation_requests(
     trust: bool = False,
     curves: bool = True,
 ) -> list[EvaluationRequest]:
-    """Return what :func:`.evaluation.summary.summaries` makes of an experiment, for each competitor.
+    """Return what :func:`.evaluation.running.summary.summaries` makes of an experiment, for each competitor.
 
     Args:
         problem: whose competitors these are.
@@ -371,6 +371,6 @@ def _model_of(env: Any) -> Any:
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
     """Every metric of every policy with its interval, the environment's own among them.
 
-    See :func:`.evaluation.metrics.tidy_records`.
+    See :func:`.evaluation.running.metrics.tidy_records`.
     """
     return metrics.tidy_records(dataset, problem_of(dataset.attrs["environment"]).baselines.metrics)

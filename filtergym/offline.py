@@ -22,12 +22,12 @@ from .agents.training_run import training_scenarios
 from .baselines.problem import Problem, import_problem
 from .envs.engine.catalogue import check_names
 from .envs.engine.scenario_choice import find_scenario
-from .evaluation.evaluate import Experiment
-from .evaluation.files import whole_files
-from .evaluation.rollout import Progress
-from .evaluation.seeds import episode_seeds
-from .evaluation.stepping import SteppingPolicy
-from .evaluation.transitions import Transitions, transitions_of
+from .evaluation.competitors.stepping import SteppingPolicy
+from .evaluation.running.evaluate import Experiment
+from .evaluation.running.rollout import Progress
+from .evaluation.running.seeds import episode_seeds
+from .evaluation.running.transitions import Transitions, transitions_of
+from .evaluation.storage.files import whole_files
 from .names import find_competitor, find_policy
 
 CHUNK = 256

@@ -20,7 +20,7 @@ from .envs.linear.state_space import (
     StateSpaceParameters,
     state_space_attributes,
 )
-from .evaluation.seeds import episode_seeds
+from .evaluation.running.seeds import episode_seeds
 
 Function = Callable[[Any], Any] | Sequence[Sequence[float]] | numpy.ndarray
 """A function of the state ``(n,)`` that returns a list of numbers, or a matrix."""

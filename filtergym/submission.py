@@ -32,14 +32,14 @@ from .envs.contract.failures import own_line
 from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import import_user_module, nearest
 from .envs.engine.scenario_choice import find_mixture
-from .evaluation.competitors import RANKED, check_competitor, kind_of
-from .evaluation.files import whole_file
-from .evaluation.parallel import Workers
-from .evaluation.rollout import Progress
-from .evaluation.summary import EvaluationRequest, combine_summaries, summaries
+from .evaluation.competitors.kinds import RANKED, check_competitor, kind_of
+from .evaluation.running.parallel import Workers
+from .evaluation.running.rollout import Progress
+from .evaluation.running.summary import EvaluationRequest, combine_summaries, summaries
+from .evaluation.storage.files import whole_file
 
 if TYPE_CHECKING:
-    from .evaluation.metrics import Record
+    from .evaluation.running.metrics import Record
 
 TOLERANCE = 1e-6
 """Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..evaluation.looks import LINES, styles
+from ..evaluation.figures.looks import LINES, styles
 from .quantities import band
 
 

@@ -14,8 +14,8 @@ import numpy
 import xarray
 
 from ..baselines.names import evaluate
-from ..evaluation.bootstrap import Bootstrap, percentile_interval
-from ..evaluation.rollout import rollout
+from ..evaluation.running.rollout import rollout
+from ..evaluation.statistics.bootstrap import Bootstrap, percentile_interval
 
 RESAMPLES = 500
 

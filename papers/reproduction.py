@@ -17,9 +17,9 @@ from typing import Any, Literal, NamedTuple
 
 from rich.table import Table
 
-from ..evaluation.files import whole_files, write_text
-from ..evaluation.parallel import Workers, check_workers
-from ..evaluation.print_layout import save
+from ..evaluation.figures.print_layout import save
+from ..evaluation.running.parallel import Workers, check_workers
+from ..evaluation.storage.files import whole_files, write_text
 from .grid import Grid, markdown_table
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]

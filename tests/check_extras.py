@@ -52,7 +52,7 @@ for name in ('filterpy_filters', 'stone_soup_kalman'):
     shutil.copy({str(ROOT / "docs" / "examples")!r} + f'/{{name}}.py', '.')"""
 RESULTS = f"""
 from made_results import results_of
-from filtergym.reports.results import settings_of, write_results
+from filtergym.reports.tables.results import settings_of, write_results
 from pathlib import Path
 results = [results_of({ID!r}, ['imm', 'adaptive'], None, 2, horizon=5)]
 write_results(Path('results.json'), results, settings_of('filtergym benchmark'))"""

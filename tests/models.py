@@ -6,8 +6,8 @@ import numpy as np
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import backend
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 
 DECISIONS = 5
 """Length of the short episodes, in decisions."""

@@ -10,7 +10,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import KalmanModel
 from filtergym.envs.contract.filter import Initial
-from filtergym.evaluation.rollout import rollout
+from filtergym.evaluation.running.rollout import rollout
 from filtergym.filters import kalman
 from models import make_model
 

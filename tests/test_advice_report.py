@@ -16,16 +16,17 @@ from filtergym.baselines.advice import advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
-from filtergym.evaluation.metrics import chi_square_band
+from filtergym.evaluation.running.metrics import chi_square_band
+from filtergym.reports.tables.terminal_tables.advice import further_sentences, verdict
 
 from filtergym.__main__ import main
-from filtergym.reports.advice import further_sentences, verdict
 
 pytest.importorskip("plotly")
 pytest.importorskip("jinja2")
 
-from filtergym.reports.advice_report import advice_html
-from filtergym.reports.results import settings_of
+from filtergym.reports.tables.terminal_tables.results import settings_of
+
+from filtergym.reports.pages.advice_report import advice_html
 
 PROBLEM = problem_of("filtergym/ManeuveringTarget-v0")
 FAMILIES = ("constant-velocity", "constant-acceleration")
@@ -155,7 +156,7 @@ def test_every_picture_is_drawn_and_nothing_complains(page, tmp_path, width):
 
 
 def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "filtergym.reports.html_report", None)
+    monkeypatch.setitem(sys.modules, "filtergym.reports.pages.html_report", None)
     monkeypatch.setattr(sys, "argv", ["filtergym", "advise", "missing.csv", "--report", "advice.html"])
     with pytest.raises(SystemExit) as end:
         main()

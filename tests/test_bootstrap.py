@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import xarray
-from filtergym.evaluation.bootstrap import Bootstrap, ratio
-from filtergym.evaluation.metrics import sums_of_present
-from filtergym.evaluation.statistics import ALL, Statistic, reduce_run
+from filtergym.evaluation.running.metrics import sums_of_present
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, ratio
+from filtergym.evaluation.statistics.statistic.statistic import ALL, Statistic, reduce_run
 from scipy import stats
 
 
@@ -73,7 +73,7 @@ def test_the_mean_of_what_is_present_pools_over_episodes():
 @pytest.mark.parametrize("clusters", [None, list("aabbbcddd")])
 def test_statistics_of_an_episode_are_reduced_together_block_by_block(monkeypatch, clusters):
     """Against loops over the resamples; one product a block serves all means, and its weights are made once."""
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 4)  # episodes
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 4)  # episodes
     rng = np.random.default_rng(0)
     bootstrap = Bootstrap(9, 20, clusters=clusters)
     values = {"number": rng.normal(size=9), "curve": rng.normal(size=(9, 3, 2)), "late": rng.normal(size=9)}

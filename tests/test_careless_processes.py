@@ -16,14 +16,14 @@ FORK = """
 import os, sys, threading, time
 import filtergym
 def load():
-    import filtergym.evaluation.evaluate, filtergym.agents.training_run
+    import filtergym.evaluation.running.evaluate, filtergym.agents.training_run
 thread = threading.Thread(target=load)
 thread.start()
 while not any(name.startswith("filtergym.evaluation") for name in list(sys.modules)):
     pass
 child = os.fork()
 if not child:
-    import filtergym.evaluation.evaluate, filtergym.agents.training_run
+    import filtergym.evaluation.running.evaluate, filtergym.agents.training_run
     os._exit(7)
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """

@@ -8,20 +8,30 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.cause_split import held_causes, opponent_of, phrases_of, reason_weight
-from filtergym.evaluation.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of
-from filtergym.evaluation.worst_episodes import describe_worst, main_causes, run_episodes, select_worst
-
-import filtergym
-from filtergym.reports.lines import fill
-from filtergym.reports.reasons import (
+from filtergym.evaluation.figures.curve_figures.worst_episodes import (
+    describe_worst,
+    main_causes,
+    run_episodes,
+    select_worst,
+)
+from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.statistic.cause_split import (
+    held_causes,
+    opponent_of,
+    phrases_of,
+    reason_weight,
+)
+from filtergym.reports.tables.terminal_tables.lines import fill
+from filtergym.reports.tables.terminal_tables.reasons import (
     explained_by_default,
     largest_reasons,
     reason_sentences,
     reasons_of,
 )
-from filtergym.reports.worst import find_worst, worst_figures
+from filtergym.reports.tables.terminal_tables.worst import find_worst, worst_figures
+
+import filtergym
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "kalman-imm-turn", "known-turn", "known-input-bound"]
@@ -117,8 +127,8 @@ def test_opponents():
 
 
 def test_a_summary_splits_what_a_whole_evaluation_does(records):
-    from filtergym.evaluation.parallel import Workers
-    from filtergym.evaluation.summary import combine_summaries, summaries
+    from filtergym.evaluation.running.parallel import Workers
+    from filtergym.evaluation.running.summary import combine_summaries, summaries
 
     from filtergym.names import evaluation_requests
 

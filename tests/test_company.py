@@ -6,7 +6,7 @@ import pytest
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
+from filtergym.evaluation.competitors.kinds.kinds import DRAWN_AT_ONCE, RandomPolicy
 from models import make_model
 
 from filtergym import evaluate
@@ -32,7 +32,7 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
         kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
         names = [name for kind in kinds for name in list(kind)[:1]]
     everyone = evaluate(env_id, names, episodes=13, **short)
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 12)  # and the last one alone
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 12)  # and the last one alone
     assert_same(evaluate(env_id, names, episodes=13, **short), everyone)
 
 
@@ -46,7 +46,7 @@ residual.control = "gain"
 
 def test_random_actions_are_every_episodes_own(monkeypatch):
     makers = {"random": "random", "residual": residual}
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     everyone = evaluate(ID, makers, episodes=17, horizon=10)
     assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
     policy = RandomPolicy(make_model(ID, "gain"))

@@ -17,7 +17,7 @@ from filtergym.envs.engine.compiled import CompiledModel
 from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
-from filtergym.evaluation.recording import NoFilter
+from filtergym.evaluation.running.recording import NoFilter
 from models import make_model
 from rounding import assert_same, flown_side_by_side
 

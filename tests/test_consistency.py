@@ -3,13 +3,13 @@
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.evaluation.bootstrap import Bootstrap, Estimate
-from filtergym.evaluation.metrics import chi_square_band, chi_square_quantile, score
+from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, Estimate
 from filtergym.filters import alpha_beta
+from filtergym.reports.tables.terminal_tables.ranking import ranking, ranking_sentence, who_is_best
 from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
-from filtergym.reports.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
 

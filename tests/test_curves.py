@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.curves import curves_of
-from filtergym.evaluation.dataset import windows_of
-from filtergym.evaluation.evaluate import action_names
+from filtergym.evaluation.running.curves import curves_of
+from filtergym.evaluation.running.evaluate import action_names
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.storage.dataset import windows_of
 from models import make_model
 from scipy.stats import chi2
 

@@ -7,8 +7,8 @@ import numpy
 import pytest
 from filtergym.baselines.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
 from filtergym.baselines.radar_esm_tracking.references import Ideal
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import class_fusion, emitter_association
 from models import make_model
 

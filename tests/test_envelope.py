@@ -12,8 +12,8 @@ from filtergym.agents.envelope import EnvelopeAlarm, TrainingRange, departure, t
 from filtergym.agents.learned_policy import load_policy, pretrained_path, write_envelope
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.evaluation.rollout import start_lanes
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import start_lanes
+from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 
 import filtergym

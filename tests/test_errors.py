@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 
 import filtergym

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.evaluation.dataset import notes_of
+from filtergym.evaluation.storage.dataset import notes_of
+from filtergym.reports.tables.terminal_tables.results import read_results
 from models import make_model
 
 import filtergym
 from filtergym.__main__ import main
-from filtergym.reports.results import read_results
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
@@ -197,7 +197,7 @@ def test_a_lost_episode_keeps_its_last_valid_answer_to_the_end(env_id, short, st
 
 
 def test_episodes_are_counted_over_all_chunks(monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     chunks = []
 
     class Late(Start):
@@ -240,7 +240,7 @@ def test_lost_episodes_stand_in_table_records_and_results(command, monkeypatch, 
     """Two of twenty, in two pieces of work; what others have finished is not lost."""
     monkeypatch.delitem(sys.modules, "losing", raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     Path("losing.py").write_text(LOSING)
     words = [
         "evaluate",
@@ -259,7 +259,7 @@ def test_lost_episodes_stand_in_table_records_and_results(command, monkeypatch, 
     told = "losing:Losing: 2 of 14 episodes lost: the covariance is not finite in episode 3 at measurement 1"
     # Every number kept, and summaries alone, in pieces: the same is told.
     for further in ((), ("--out", "out"), ("--out", "small", "--no-netcdf")):
-        monkeypatch.setattr("filtergym.evaluation.summary.TOGETHER", 8)
+        monkeypatch.setattr("filtergym.evaluation.running.summary.TOGETHER", 8)
         code, output, errors = command(*words, *further)
         assert code == 0, errors
         assert told in " ".join(output.split())

@@ -10,9 +10,9 @@ from filtergym.baselines.table import Variant
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
-from filtergym.evaluation.filters import put_in_loop
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.competitors.kinds.filters import put_in_loop
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters.linear_systems import van_loan
 from filtergym.filters.loosely_coupled import error_model
 from models import act, make_model, watch_hypotheses

@@ -19,7 +19,13 @@ from filtergym.agents.training_run import (
     resume_run,
 )
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.files import find_folder, settle_folder, whole_files, whole_folder, write_text
+from filtergym.evaluation.storage.files import (
+    find_folder,
+    settle_folder,
+    whole_files,
+    whole_folder,
+    write_text,
+)
 
 STEPS = ("open", "replace", "rename", "mkdir", "unlink", "rmdir")
 """Calls of the operating system that change the disk."""

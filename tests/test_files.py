@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from filtergym.evaluation.files import (
+from filtergym.evaluation.storage.files import (
     claim_folder,
     whole_file,
     whole_files,
@@ -89,7 +89,7 @@ def writer(tmp_path):
 
 FILES = """
 import sys, time, pathlib
-from filtergym.evaluation.files import whole_files
+from filtergym.evaluation.storage.files import whole_files
 with whole_files(pathlib.Path(sys.argv[1])) as waiting:
     (waiting / "half").write_text("half")
     print("here", flush=True)
@@ -97,7 +97,7 @@ with whole_files(pathlib.Path(sys.argv[1])) as waiting:
 """
 ONE_FILE = """
 import sys, time, pathlib
-from filtergym.evaluation.files import whole_file
+from filtergym.evaluation.storage.files import whole_file
 with whole_file(pathlib.Path(sys.argv[1]) / "table") as partial:
     partial.write_text("half")
     print("here", flush=True)
@@ -105,7 +105,7 @@ with whole_file(pathlib.Path(sys.argv[1]) / "table") as partial:
 """
 CLAIM = """
 import sys, time, pathlib
-from filtergym.evaluation.files import claim_folder
+from filtergym.evaluation.storage.files import claim_folder
 claim_folder(pathlib.Path(sys.argv[1]))
 print("here", flush=True)
 time.sleep(60)

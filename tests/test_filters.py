@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.competitors import Likelihood
-from filtergym.evaluation.dataset import FAULTS
-from filtergym.evaluation.filters import find_fault, is_lacking, put_in_loop
-from filtergym.evaluation.rollout import rollout, start_lanes
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.competitors.kinds.filters import find_fault, is_lacking, put_in_loop
+from filtergym.evaluation.competitors.kinds.kinds import Likelihood
+from filtergym.evaluation.running.rollout import rollout, start_lanes
+from filtergym.evaluation.running.seeds import episode_seeds
+from filtergym.evaluation.storage.dataset import FAULTS
 from filtergym.filters import packed_covariance
 from models import make_model
 from scipy.stats import multivariate_normal

@@ -21,7 +21,7 @@ from filtergym.envs.data.foreign_files import (
     quote_shortened,
     read_yaml,
 )
-from filtergym.evaluation.stored import read_json
+from filtergym.evaluation.storage.stored import read_json
 
 from filtergym import evaluate, read_flights, read_recording
 

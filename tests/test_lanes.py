@@ -14,7 +14,7 @@ from filtergym.envs.engine.compiled import share_world
 from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import OWN_PAY, reference
-from filtergym.evaluation.rollout import start_lanes
+from filtergym.evaluation.running.rollout import start_lanes
 from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -10,7 +10,7 @@ import pytest
 from filtergym.envs.data.flight_tables import seconds
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.evaluation.estimates import write_estimates
+from filtergym.evaluation.storage.estimates import write_estimates
 
 from filtergym import evaluate, read_recording, tidy_records
 

@@ -19,8 +19,8 @@ from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.schedules import within
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled, receiver_faults
 from filtergym.filters.linear_systems import van_loan
 from filtergym.papers.kalman_bucy_ins_gnss import experiment

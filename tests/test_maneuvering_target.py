@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.data.trajectory import Trajectory
-from filtergym.evaluation.dataset import windows_of
+from filtergym.evaluation.storage.dataset import windows_of
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from models import make_model

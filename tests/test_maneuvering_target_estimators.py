@@ -19,8 +19,8 @@ from filtergym.baselines.maneuvering_target.estimators import (
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, mean_cost
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 from models import make_model
 from scipy.stats import multivariate_normal

@@ -8,8 +8,8 @@ from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.dataset import notes_of
-from filtergym.evaluation.rollout import rollout
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.storage.dataset import notes_of
 from models import make_model
 
 from filtergym import evaluate, record

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors import kind_of
-from filtergym.evaluation.seeds import episode_seeds
-from filtergym.evaluation.transitions import member, transitions_of
+from filtergym.evaluation.competitors.kinds.kinds import kind_of
+from filtergym.evaluation.running.seeds import episode_seeds
+from filtergym.evaluation.running.transitions import member, transitions_of
 
 import filtergym
 from filtergym import Trajectory

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.evaluation.competitors import Policy
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.competitors.kinds.kinds import Policy
+from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 
 from filtergym import evaluate, tidy_records

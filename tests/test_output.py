@@ -13,7 +13,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym import evaluate
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console
-from filtergym.reports import benchmark
+from filtergym.reports.tables.terminal_tables import benchmark
 
 EVALUATE = ("evaluate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--episodes", 4)
 
@@ -117,7 +117,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
 
     monkeypatch.setattr("filtergym.commands.evaluation.run_experiment", unexpected)
     monkeypatch.setattr("filtergym.commands.evaluation.summaries", unexpected)
-    monkeypatch.setattr("filtergym.reports.benchmark.summaries", unexpected)
+    monkeypatch.setattr("filtergym.reports.tables.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
     for name in ("folder.png", "out/results.json", "values/ManeuveringTarget-v0.json"):

@@ -24,18 +24,19 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuned_values import TunedValues
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation import code, parallel, summary
-from filtergym.evaluation.evaluate import run_piece
-from filtergym.evaluation.metrics import record_statistics
-from filtergym.evaluation.parallel import Workers
-from filtergym.evaluation.store import Store
-from filtergym.evaluation.summary import Summary, combine_summaries, summaries
+from filtergym.evaluation.running import parallel, summary
+from filtergym.evaluation.running.evaluate import run_piece
+from filtergym.evaluation.running.metrics import record_statistics
+from filtergym.evaluation.running.parallel import Workers
+from filtergym.evaluation.running.summary import Summary, combine_summaries, summaries
+from filtergym.evaluation.storage import code
+from filtergym.evaluation.storage.store import Store
 from made_results import without_times
 
 import filtergym
 from filtergym import evaluate, tidy_records
 from filtergym.names import evaluation_requests
-from filtergym.reports import benchmark, work
+from filtergym.reports.tables.terminal_tables import benchmark, work
 
 ENV = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"
@@ -69,7 +70,9 @@ class Wrong:
 
 
 def test_an_evaluation_has_the_same_bits(two, monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)  # several pieces of few episodes
+    monkeypatch.setattr(
+        "filtergym.evaluation.statistics.bootstrap.BLOCK", 16
+    )  # several pieces of few episodes
     one = evaluate(ENV, NAMES, episodes=40, drawn_episodes=1)
     assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
 
@@ -97,7 +100,7 @@ def test_summaries_tell_what_the_evaluation_does(env_id, short):
     found = dict(summaries(asked, Workers()))
     records, curves, evaluation = combine_summaries([found[i] for i in range(len(names))])
     assert records == tidy_records(dataset)
-    expected = filtergym.evaluation.curves.curves_of(dataset)
+    expected = filtergym.evaluation.running.curves.curves_of(dataset)
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
@@ -131,7 +134,7 @@ def numbers_in(part):
 
 def test_of_an_episode_a_few_numbers_are_kept_and_of_a_block_nothing_else(env_id, short, monkeypatch):
     """Memory grows by less than one measurement an episode, and the arrays of a block go before the next is run."""
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     problem = problem_of(env_id)
     shorter = {} if env_id == ENV else short
     kept, held = [], []
@@ -175,8 +178,8 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     names = [known.score_paper, next(iter(known.references)), list(known.bounds)[-1]]
     shorter = {} if env_id == ENV else short
     dataset = evaluate(env_id, names, episodes=40, **shorter)
-    whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    whole, expected = tidy_records(dataset), filtergym.evaluation.running.curves.curves_of(dataset)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     monkeypatch.setattr(summary, "TOGETHER", 16)
     asked = evaluation_requests(
         problem_of(env_id), problem_of(env_id).experiment(episodes=40, keywords=shorter), names
@@ -202,11 +205,11 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
 
 
 def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTION_LIMIT", 3000)
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
+    monkeypatch.setattr("filtergym.evaluation.running.curves.DISTRIBUTION_LIMIT", 3000)
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 16)
     names = ["imm"]
-    curves = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=100))
-    few = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=30))
+    curves = filtergym.evaluation.running.curves.curves_of(evaluate(ENV, names, episodes=100))
+    few = filtergym.evaluation.running.curves.curves_of(evaluate(ENV, names, episodes=30))
     for name in ("error_exceeded", "action", "action_low"):
         np.testing.assert_array_equal(curves[name].values, few[name].values, err_msg=name)
     assert (curves["rmse"].values != few["rmse"].values).any()
@@ -377,7 +380,7 @@ def test_warnings_come_home_once(two):
 
 BEGINNER = """
 import time
-from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.running.parallel import Workers
 
 def work(seconds, tick):
     if seconds:
@@ -570,7 +573,7 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
 
 
 def test_units_of_a_reproduction_stand_in_their_places(two):
-    from filtergym.evaluation.threads import one_thread
+    from filtergym.evaluation.running.threads import one_thread
     from filtergym.papers.imm_alpha_beta.experiment import flown, squares_of
     from filtergym.papers.reproduction import compute_units, later
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.dataset import notes_of
+from filtergym.evaluation.storage.dataset import notes_of
 from test_recording import table
 
 from filtergym import evaluate, read_recording, record

@@ -9,8 +9,8 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.rollout import start_lanes
+from filtergym.evaluation.running.rollout import start_lanes
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
 from filtergym.papers.quantities import Quantity
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
 from models import make_model

@@ -19,8 +19,8 @@ from filtergym.envs.contract.task import Task
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
-from filtergym.evaluation.competitors import ConstantPolicy
-from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy
+from filtergym.evaluation.running.parallel import Workers
 from models import make_model
 
 import filtergym
@@ -28,7 +28,7 @@ import filtergym
 MODULE = '''
 import filtergym
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
-from filtergym.evaluation.competitors import ConstantPolicy
+from filtergym.evaluation.competitors.kinds import ConstantPolicy
 
 
 class Turns(ManeuveringTarget):

@@ -10,14 +10,10 @@ from types import SimpleNamespace
 import markupsafe
 import numpy as np
 import pytest
-from made_results import results_of
-
-from filtergym.reports.headline import headline_table
-from filtergym.reports.html_report import report_html
-from filtergym.reports.outcome import find_lead, outcome_sentences, protocol_sentences
-from filtergym.reports.ranking import best_of_origins, ranking, remarks
-from filtergym.reports.reasons import reason_sentences
-from filtergym.reports.results import (
+from filtergym.reports.tables.terminal_tables.headline import headline_table
+from filtergym.reports.tables.terminal_tables.ranking import best_of_origins, ranking, remarks
+from filtergym.reports.tables.terminal_tables.reasons import reason_sentences
+from filtergym.reports.tables.terminal_tables.results import (
     MOST_SHOWN,
     MOST_TIMES,
     Settings,
@@ -28,7 +24,15 @@ from filtergym.reports.results import (
     spread,
     write_results,
 )
-from filtergym.reports.tables import consistency_word, results_tables, with_interval
+from filtergym.reports.tables.terminal_tables.terminal_tables import (
+    consistency_word,
+    results_tables,
+    with_interval,
+)
+from made_results import results_of
+
+from filtergym.reports.pages.html_report import report_html
+from filtergym.reports.pages.outcome import find_lead, outcome_sentences, protocol_sentences
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "adaptive-rearm-tuned", "kalman-imm-tuned", "ppo", "known-turn", "known-input-bound"]

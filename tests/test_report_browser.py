@@ -5,7 +5,7 @@ import pytest
 from made_results import results_of
 from test_report import SETTINGS, hostile
 
-from filtergym.reports.html_report import report_html
+from filtergym.reports.pages.html_report import report_html
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())]
 FIGURES = ["ranking", "rmse", "exceeded", "difference", "consistency", "steering", "track", "worst"]

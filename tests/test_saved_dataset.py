@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.evaluation.dataset import (
+from filtergym.evaluation.storage.dataset import (
     group_of_each,
     groups_of,
     keywords_as_text,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from filtergym.baselines.maneuvering_target.semi_markov import SemiMarkov
 from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
 from models import make_model
 from scipy.stats import multivariate_normal

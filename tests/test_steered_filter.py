@@ -6,10 +6,10 @@ from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.compiler import namespace
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.competitors import make_competitor
-from filtergym.evaluation.evaluate import control_of
-from filtergym.evaluation.rollout import run_competitor, start_lanes
-from filtergym.evaluation.steered_filter import steer, trace_policy
+from filtergym.evaluation.competitors.kinds.kinds import make_competitor
+from filtergym.evaluation.competitors.kinds.steered_filter import steer, trace_policy
+from filtergym.evaluation.running.evaluate import control_of
+from filtergym.evaluation.running.rollout import run_competitor, start_lanes
 
 from filtergym import evaluate
 from filtergym.names import find_competitor, import_problem
@@ -106,10 +106,12 @@ def test_the_layers_of_a_network_are_loops_that_sum_in_the_same_order(monkeypatc
 
 
 def test_an_agent_is_traced_once_for_all_that_an_evaluation_does_with_it(monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)  # several pieces of few episodes
+    monkeypatch.setattr(
+        "filtergym.evaluation.statistics.bootstrap.BLOCK", 8
+    )  # several pieces of few episodes
     traced = []
     monkeypatch.setattr(
-        "filtergym.evaluation.rollout.trace_policy",
+        "filtergym.evaluation.running.rollout.trace_policy",
         lambda *given: traced.append(given) or trace_policy(*given),
     )
     evaluate(*BPTT, episodes=24, horizon=HORIZON - 1, timed=True)  # a horizon that nobody else has

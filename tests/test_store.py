@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 import xarray
-from filtergym.evaluation import store as module
-from filtergym.evaluation.store import Store, Work
+from filtergym.evaluation.storage import store as module
+from filtergym.evaluation.storage.store import Store, Work
 
 
 class Measured(NamedTuple):

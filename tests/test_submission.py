@@ -15,7 +15,7 @@ from board import board_markdown, read_entries
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.running.parallel import Workers
 
 from filtergym import submission as submissions
 from filtergym.submission import (

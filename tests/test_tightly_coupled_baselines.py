@@ -15,9 +15,9 @@ from filtergym.envs.contract.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
 from filtergym.filters import gnss_ins
 from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
 from filtergym.papers.quantities import Quantity

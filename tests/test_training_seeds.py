@@ -9,7 +9,7 @@ import pytest
 import training_seeds
 from filtergym.agents.learned_policy import ENVELOPE, PRETRAINED, read_header
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.store import Store
+from filtergym.evaluation.storage.store import Store
 from filtergym.papers.grid import markdown_table
 from records import read_record
 from safetensors.numpy import load_file
@@ -157,7 +157,7 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     other = study._replace(opponents=[], episodes=11)
     episode_means(other, "random", store=store)
     assert scored[5:] == ["agent", "agent", "imm"]
-    monkeypatch.setattr("filtergym.evaluation.store.code_digest", lambda: "of an edited package")
+    monkeypatch.setattr("filtergym.evaluation.storage.store.code_digest", lambda: "of an edited package")
     episode_means(other, "random", store=store)
     assert scored[8:] == ["agent", "agent", "imm"]
 

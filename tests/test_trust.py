@@ -143,7 +143,7 @@ def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, comma
     for name in ("middle_policy", "middle_environment"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     (tmp_path / "middle_policy.py").write_text(
-        "from filtergym.evaluation.competitors import ConstantPolicy\n"
+        "from filtergym.evaluation.competitors.kinds import ConstantPolicy\n"
         "class Middle(ConstantPolicy):\n    control, action = 'gain', (0.0,)\n"
     )
     (tmp_path / "middle_environment.py").write_text("1 / 0")
@@ -178,7 +178,7 @@ def test_a_file_of_ones_own_is_no_library(tmp_path):
         (tmp_path / f"{name}.py").write_text(f"open('sprung', 'a').write('{name} ')\nraise ImportError")
     (tmp_path / "sibling.py").write_text("ACTION = (0.0,)")
     (tmp_path / "middle.py").write_text(
-        "from filtergym.evaluation.competitors import ConstantPolicy\n"
+        "from filtergym.evaluation.competitors.kinds import ConstantPolicy\n"
         "from sibling import ACTION\n"
         "class Middle(ConstantPolicy):\n    control, action = 'gain', ACTION\n"
     )

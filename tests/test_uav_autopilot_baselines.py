@@ -17,11 +17,11 @@ from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.theory import stationary
 from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.envs.uav_autopilot.level_bank import Kind
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.metrics import Record
-from filtergym.evaluation.rollout import rollout
-from filtergym.evaluation.seeds import episode_seeds
-from filtergym.evaluation.statistics import reduce_run
+from filtergym.evaluation.running.metrics import Record
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.evaluation.running.seeds import episode_seeds
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.statistic.statistic import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
 from filtergym.papers.uav_autopilot_kalman import experiment
 from models import make_model

@@ -9,7 +9,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters.ordered_sums import ordered_sum
 from ..measurement_noise import MeasurementNoise
 from .augmented import AugmentedFilter, AugmentedMemory

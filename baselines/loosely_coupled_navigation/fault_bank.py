@@ -9,7 +9,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.fault_bank import FaultFilter, Memory
 from ...envs.loosely_coupled_navigation.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 
 
 class FaultBank(FaultFilter):

@@ -12,7 +12,7 @@ import numpy
 from ...envs.contract.model import Model
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
 from ...envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
-from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import select_nested
 from ..measurement_noise import MeasurementNoise

@@ -9,7 +9,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import kalman, noise_adaptation, predicted_covariance
 from .estimators import KalmanModel
 

@@ -10,7 +10,7 @@ from ...envs.contract.observation import Array
 from ...envs.data.recording import Recording
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import dead_reckoning
 from .estimators import DEGREE, KalmanModel
 

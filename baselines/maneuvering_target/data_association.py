@@ -9,7 +9,7 @@ from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement, Plots
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import data_association, kalman
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses

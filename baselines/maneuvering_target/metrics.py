@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from ...evaluation.bootstrap import Bootstrap
-from ...evaluation.dataset import groups_of, slices_of
-from ...evaluation.metrics import Measure, squared_errors
-from ...evaluation.own_metrics import MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import Measure, squared_errors
+from ...evaluation.running.own_metrics import MetricInputs, OwnMetrics
+from ...evaluation.statistics.bootstrap import Bootstrap
+from ...evaluation.storage.dataset import groups_of, slices_of
 
 if TYPE_CHECKING:
     import xarray

@@ -11,7 +11,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.maneuvering_target.banks import GainBank
-from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm

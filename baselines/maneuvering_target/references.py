@@ -6,7 +6,7 @@ from ...envs.contract.faults import GaussMarkov
 from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import bounds, kalman, polar
 from ...filters.small_matrices import apply
 from .estimators import KalmanModel

@@ -7,7 +7,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.semi_markov import SemiMarkovFilter, SemiMarkovTrack
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from .estimators import KalmanModel
 
 

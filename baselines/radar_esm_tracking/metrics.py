@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from ...evaluation.bootstrap import Bootstrap, Estimate
-from ...evaluation.dataset import slices_of, windows_of
-from ...evaluation.metrics import Measure, squared_errors
-from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import Measure, squared_errors
+from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.storage.dataset import slices_of, windows_of
 
 if TYPE_CHECKING:
     import xarray

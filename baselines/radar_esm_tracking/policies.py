@@ -12,7 +12,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
-from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable

@@ -8,7 +8,7 @@ from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 
 
 class HuberBank(HypothesisBank):

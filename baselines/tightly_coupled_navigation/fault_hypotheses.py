@@ -7,7 +7,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter, Hypotheses
 from ...envs.tightly_coupled_navigation.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 
 
 class FaultHypotheses(FaultFilter):

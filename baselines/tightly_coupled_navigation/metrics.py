@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
-from ...evaluation.bootstrap import Bootstrap, Estimate
-from ...evaluation.dataset import groups_of
-from ...evaluation.metrics import Measure, chi_square_quantile, squared_errors
-from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import Measure, chi_square_quantile, squared_errors
+from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.storage.dataset import groups_of
 
 if TYPE_CHECKING:
     import xarray

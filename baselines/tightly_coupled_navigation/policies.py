@@ -14,7 +14,7 @@ import numpy
 from ...envs.contract.model import Model
 from ...envs.tightly_coupled_navigation.fault_hypotheses import TRAINING, VAGUE, FaultPrior
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
-from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck

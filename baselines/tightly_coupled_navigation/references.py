@@ -10,7 +10,7 @@ from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.parameters import LINE, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement, Truth
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import extended_kalman, gnss_ins, range_errors
 from ...filters.ordered_sums import ordered_sum
 from ...filters.packed_covariance import diagonal, pack, unpack

@@ -12,7 +12,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
 from ...filters.ordered_sums import ordered_sum, weighted_sum

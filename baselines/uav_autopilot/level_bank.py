@@ -7,7 +7,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.level_bank import LevelFilter
 from ...envs.uav_autopilot.world import Measurement
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters.noise_levels import Hypotheses
 from .estimators import likelihood_of
 

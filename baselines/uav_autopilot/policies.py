@@ -13,7 +13,7 @@ import numpy
 from ...envs.contract.model import Model
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelPrior
-from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, Tunable, Variant, tunable
 from .alarm import AutopilotAlarm
 from .estimators import ESTIMATORS, GustInteractingMultipleModel

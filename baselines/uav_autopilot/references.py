@@ -9,7 +9,7 @@ from ...envs.contract.filter import Initial
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
-from ...evaluation.competitors import Likelihood
+from ...evaluation.competitors.kinds import Likelihood
 from ...filters import packed_covariance
 from .estimators import likelihood_of
 

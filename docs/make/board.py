@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.rollout import ProcessorTime
-from filtergym.evaluation.times import PYTHON_MARK, time_text
+from filtergym.evaluation.running.rollout import ProcessorTime
+from filtergym.evaluation.running.times import PYTHON_MARK, time_text
 from filtergym.papers.grid import markdown_table
+from filtergym.reports.tables.terminal_tables.ranking import HARM
 from records import short_name
 
-from filtergym.reports.ranking import HARM
 from filtergym.submission import (
     TIME,
     TOLERANCE,

@@ -4,8 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
-from filtergym.evaluation.looks import styles
-from filtergym.evaluation.print_layout import add_title, figure_with_axes, in_print, logarithmic
+from filtergym.evaluation.figures.curve_figures.looks import styles
+from filtergym.evaluation.figures.curve_figures.print_layout import (
+    add_title,
+    figure_with_axes,
+    in_print,
+    logarithmic,
+)
 
 
 @in_print

@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import catalogue, nearest
-from filtergym.evaluation.files import write_text
-from filtergym.evaluation.metrics import Record
-from filtergym.evaluation.stored import read_json
-
-from filtergym.reports.tables import main_components
+from filtergym.evaluation.running.metrics import Record
+from filtergym.evaluation.storage.files import write_text
+from filtergym.evaluation.storage.stored import read_json
+from filtergym.reports.tables.terminal_tables.terminal_tables import main_components
 
 FOLDER = Path(__file__).parent.parent / "records"
 BENCHMARK, SEEDS = "benchmark", "seeds"

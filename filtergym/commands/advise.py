@@ -13,9 +13,9 @@ from ..baselines.tuned_values import make_tuned_policy
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
-from ..evaluation.files import writable_file, write_text
+from ..evaluation.storage.files import writable_file, write_text
 from ..names import find_competitor
-from ..reports.advice import (
+from ..reports.tables.advice import (
     advice_lines,
     advice_table,
     further_sentences,
@@ -23,7 +23,7 @@ from ..reports.advice import (
     parameter_lines,
     reading_lines,
 )
-from ..reports.results import settings_of
+from ..reports.tables.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
 from .terminal import (

@@ -19,31 +19,31 @@ from ..envs.data.recording_files import is_recording
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest
 from ..envs.engine.scenario_choice import make_task, read_recording
-from ..evaluation.bootstrap import Estimate
-from ..evaluation.cause_split import phrases_of
-from ..evaluation.competitors import RandomPolicy
-from ..evaluation.curves import curves_of
-from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
-from ..evaluation.estimates import check_estimates, write_estimates
-from ..evaluation.evaluate import Experiment, run_experiment
-from ..evaluation.figures import evaluation_figures
-from ..evaluation.files import whole_files, writable_file, writable_folder, write_text
-from ..evaluation.metrics import flight_records, mean_cost
-from ..evaluation.parallel import Workers
-from ..evaluation.predictions import Predictions, mean_of
-from ..evaluation.print_layout import check_columns, check_formats, save
-from ..evaluation.store import UNFINISHED, Store
-from ..evaluation.summary import combine_summaries, summaries
+from ..evaluation.competitors.kinds import RandomPolicy
+from ..evaluation.figures.curve_figures import evaluation_figures
+from ..evaluation.figures.print_layout import check_columns, check_formats, save
+from ..evaluation.running.curves import curves_of
+from ..evaluation.running.evaluate import Experiment, run_experiment
+from ..evaluation.running.metrics import flight_records, mean_cost
+from ..evaluation.running.parallel import Workers
+from ..evaluation.running.summary import combine_summaries, summaries
+from ..evaluation.statistics.bootstrap import Estimate
+from ..evaluation.statistics.cause_split import phrases_of
+from ..evaluation.statistics.predictions import Predictions, mean_of
+from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
+from ..evaluation.storage.estimates import check_estimates, write_estimates
+from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
+from ..evaluation.storage.store import UNFINISHED, Store
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
-from ..reports.benchmark import result_of, without_smoothers_of_closed_loops
-from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
-from ..reports.reasons import explained_by_default, reason_sentences
-from ..reports.recording_tables import recording_tables
-from ..reports.records import write_records
-from ..reports.results import RESULTS, Result, WorstTrack, settings_of, write_results
-from ..reports.tables import flights_table, results_tables
-from ..reports.work import work_of
-from ..reports.worst import worst_figures
+from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
+from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
+from ..reports.tables.reasons import explained_by_default, reason_sentences
+from ..reports.tables.recording_tables import recording_tables
+from ..reports.tables.records import write_records
+from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
+from ..reports.tables.terminal_tables import flights_table, results_tables
+from ..reports.tables.work import work_of
+from ..reports.tables.worst import worst_figures
 from .shown import REPORT, make_report
 from .terminal import command_line, console, pair, print_sentence, print_table, progress_bar
 
@@ -235,7 +235,7 @@ class Outcome(NamedTuple):
 
         Args:
             names: that the user wants evaluated.
-            wanted: names that the user wants explained; none: see :func:`.reports.reasons.explained_by_default`.
+            wanted: names that the user wants explained; none: see :func:`.reports.tables.reasons.explained_by_default`.
         """
         return list(wanted) or explained_by_default(self.records, names, self.dataset.attrs["paper"])
 

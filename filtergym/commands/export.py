@@ -9,7 +9,7 @@ from ..agents.export import export_run
 from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import check_names, nearest
 from ..envs.engine.scenario_choice import read_recording
-from ..evaluation.files import writable_file, writable_folder
+from ..evaluation.storage.files import writable_file, writable_folder
 from .terminal import (
     Parameters,
     ScenarioName,

@@ -13,10 +13,10 @@ from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune
 from ..envs.engine.catalogue import nearest
 from ..envs.engine.scenario_choice import read_recording
-from ..evaluation.files import writable_file
-from ..evaluation.parallel import Workers
-from ..evaluation.store import UNFINISHED, Store
-from ..reports.tables import tuning_table
+from ..evaluation.running.parallel import Workers
+from ..evaluation.storage.files import writable_file
+from ..evaluation.storage.store import UNFINISHED, Store
+from ..reports.tables.terminal_tables import tuning_table
 from .advise import fit_to_recording
 from .terminal import (
     Backend,

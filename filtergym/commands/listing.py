@@ -6,7 +6,7 @@ import typer
 
 from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import catalogue
-from ..reports.listing import environment_lines, list_lines
+from ..reports.tables.listing import environment_lines, list_lines
 from .terminal import complete_environment, console, import_environments, print_sentence
 
 

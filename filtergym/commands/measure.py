@@ -10,21 +10,21 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names
-from ..evaluation.figures import evaluation_figures
-from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
-from ..evaluation.parallel import Workers
-from ..evaluation.print_layout import check_columns, check_formats, save
-from ..evaluation.recording import record_experiment
-from ..evaluation.rollout import Progress
-from ..evaluation.threads import one_thread
+from ..evaluation.figures.curve_figures import evaluation_figures
+from ..evaluation.figures.print_layout import check_columns, check_formats, save
+from ..evaluation.running.parallel import Workers
+from ..evaluation.running.recording import record_experiment
+from ..evaluation.running.rollout import Progress
+from ..evaluation.running.threads import one_thread
+from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..names import assumed_parameters, find_competitor, is_learned
 from ..offline import plan_datasets
-from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
-from ..reports.export import LATEX_WIDTH, latex_table, records_as_csv
-from ..reports.headline import headline_table
-from ..reports.results import RESULTS, Result, settings_of
-from ..reports.tables import datasets_table, results_tables
-from ..reports.worst import find_worst
+from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
+from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
+from ..reports.tables.headline import headline_table
+from ..reports.tables.results import RESULTS, Result, settings_of
+from ..reports.tables.terminal_tables import datasets_table, results_tables
+from ..reports.tables.worst import find_worst
 from .evaluation import (
     FileOptions,
     Outputs,
@@ -378,7 +378,7 @@ def animate(
 
     Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
     """
-    from ..evaluation.animation import episode_frames, write_animation
+    from ..evaluation.figures.animation import episode_frames, write_animation
 
     problem = problem_of(environment)
     writable_folder(out)

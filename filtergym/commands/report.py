@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from ..evaluation.files import writable_file, writable_folder
-from ..evaluation.parallel import Workers
-from ..evaluation.print_layout import check_formats
+from ..evaluation.figures.print_layout import check_formats
+from ..evaluation.running.parallel import Workers
+from ..evaluation.storage.files import writable_file, writable_folder
 from ..papers import paper_module, papers
-from ..reports.results import read_all_results
+from ..reports.tables.results import read_all_results
 from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
 from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
 

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ..evaluation.files import write_text
-from ..evaluation.metrics import Record
-from ..reports.headline import headline_table
-from ..reports.outcome import outcome_sentences, protocol_sentences
-from ..reports.ranking import remarks
-from ..reports.results import Result, Settings
-from ..reports.tables import results_tables
+from ..evaluation.running.metrics import Record
+from ..evaluation.storage.files import write_text
+from ..reports.pages.outcome import outcome_sentences, protocol_sentences
+from ..reports.tables.headline import headline_table
+from ..reports.tables.ranking import remarks
+from ..reports.tables.results import Result, Settings
+from ..reports.tables.terminal_tables import results_tables
 from .terminal import console, print_sentence, print_table
 
 REPORT = "report.html"
@@ -51,7 +51,7 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
         ValueError: if it takes packages that are not installed.
     """
     try:
-        from ..reports.html_report import report_html
+        from ..reports.pages.html_report import report_html
     except ImportError as error:
         raise ValueError(f"reports need more packages: pip install 'filtergym[report]' ({error})") from error
     return report_html
@@ -60,7 +60,7 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
 def advice_maker() -> Callable[..., str]:
     """Return what makes the report of an advice; refusals as of :func:`report_maker`."""
     report_maker()
-    from ..reports.advice_report import advice_html
+    from ..reports.pages.advice_report import advice_html
 
     return advice_html
 

@@ -7,8 +7,8 @@ import typer
 from rich.table import Table
 
 from ..baselines.problem import problem_of
-from ..evaluation.files import writable_file, write_text
-from ..evaluation.parallel import Workers
+from ..evaluation.running.parallel import Workers
+from ..evaluation.storage.files import writable_file, write_text
 from ..submission import (
     PROTOCOLS,
     TIME,

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..reports.lines import fill
+from ..reports.tables.lines import fill
 from .progress import progress_bar as progress_bar
 
 # --- what a shell completes; imports wait until it asks

@@ -9,8 +9,8 @@ from ..agents import training_run
 from ..agents.settings import THROUGH_THE_FILTER
 from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
 from ..baselines.problem import Problem
-from ..evaluation.parallel import Workers
-from ..reports import standing
+from ..evaluation.running.parallel import Workers
+from ..reports.tables import standing
 from .terminal import console, print_table, progress_bar
 
 Trainer = Callable[[TrainingRun, Session], TrainingRun]

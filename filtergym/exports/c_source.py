@@ -27,7 +27,7 @@ from ..compiler.c_source import (
     literal,
     write_program,
 )
-from ..evaluation.files import whole_files
+from ..evaluation.storage.files import whole_files
 from .c_network import memory_size, network_text
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest

@@ -15,7 +15,7 @@ from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import OBSERVATION_LIMIT, StoredPolicy
 from ..envs.contract.model import Model
 from ..envs.engine.backend import make_model
-from ..evaluation.files import whole_file
+from ..evaluation.storage.files import whole_file
 from .request import ExportRequest
 
 OPSET, IR_VERSION = 17, 8

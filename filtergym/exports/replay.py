@@ -17,10 +17,10 @@ from ..compiler.native import AVAILABLE, native
 from ..compiler.program import Program
 from ..envs.contract.model import Episode, Model
 from ..envs.engine.backend import make_model
-from ..evaluation.competitors import kind_of
-from ..evaluation.evaluate import control_of
-from ..evaluation.rollout import rollout, start_lanes
-from ..evaluation.seeds import episode_seeds
+from ..evaluation.competitors.kinds import kind_of
+from ..evaluation.running.evaluate import control_of
+from ..evaluation.running.rollout import rollout, start_lanes
+from ..evaluation.running.seeds import episode_seeds
 from .request import ExportRequest
 from .traced_filter import (
     ANSWER,

@@ -28,8 +28,8 @@ from ..compiler.program import Graph, Program, Result, program
 from ..envs.contract.filter import Input
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task
-from ..evaluation.competitors import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
-from ..evaluation.steered_filter import Decider, Decisions, Steered, SteeredFilter, steer
+from ..evaluation.competitors.kinds import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
+from ..evaluation.competitors.steered_filter import Decider, Decisions, Steered, SteeredFilter, steer
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""

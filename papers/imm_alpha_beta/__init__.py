@@ -9,7 +9,7 @@ Reading: the paper calls the improvement substantial without a number; here the 
 Reading: it gives no criterion for the best gains; here the RMS over the whole run.
 """
 
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 

@@ -9,9 +9,9 @@ from ...envs.contract.filter import Initial
 from ...envs.engine.backend import make_model
 from ...envs.engine.scenario_choice import make_task
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...evaluation.parallel import Workers
-from ...evaluation.rollout import start_lanes
-from ...evaluation.seeds import episode_seeds
+from ...evaluation.running.parallel import Workers
+from ...evaluation.running.rollout import start_lanes
+from ...evaluation.running.seeds import episode_seeds
 from ..quantities import evaluate_policy, means
 from ..reproduction import Progress, compute_units, later
 from .gain_schedules import best_schedule, maneuver_flight, mean_square_errors, ramp_schedule

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ...evaluation.looks import styles
+from ...evaluation.figures.looks import styles
 from ..panels import draw, finish, legend_outside, looks, panels, shade
 from ..quantities import means
 from .claims import HIGH_BOX, LOW_BOX, NEAR_MINIMUM, grid_errors

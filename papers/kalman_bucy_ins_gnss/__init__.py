@@ -8,7 +8,7 @@ Reading: "the systematic errors are compensated" is tested twice, as attenuation
 as removal (no mean error left).
 """
 
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 

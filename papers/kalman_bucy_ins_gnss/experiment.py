@@ -10,8 +10,8 @@ from ...baselines.problem import problem_of
 from ...envs.contract.model import Episode, Model
 from ...envs.engine.backend import make_model
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...evaluation.parallel import Workers
-from ...evaluation.seeds import episode_seeds
+from ...evaluation.running.parallel import Workers
+from ...evaluation.running.seeds import episode_seeds
 from ...filters import kalman_bucy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.linear_systems import steady_kalman_bucy, van_loan

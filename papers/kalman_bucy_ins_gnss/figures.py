@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy
 
-from ...evaluation.looks import styles
+from ...evaluation.figures.looks import styles
 from ...filters import kalman_bucy
 from ..panels import draw, finish, panels
 from .experiment import DRIFT, GAINS, INTENSITY, LONG, NAMES, PARAMETERS, A, Results, U, closed_form

@@ -12,7 +12,7 @@ are steered by that prediction (``aperture``).
 Reading: "without rates", "pseudoranges only": the standard deviation of what is left out is 10^6 of its unit.
 """
 
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 

@@ -12,10 +12,10 @@ from ...envs.contract.model import Episode, Model
 from ...envs.engine.backend import make_model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
-from ...evaluation.competitors import Policy
-from ...evaluation.filters import Estimated
-from ...evaluation.parallel import Workers
-from ...evaluation.seeds import episode_seeds
+from ...evaluation.competitors.filters import Estimated
+from ...evaluation.competitors.kinds import Policy
+from ...evaluation.running.parallel import Workers
+from ...evaluation.running.seeds import episode_seeds
 from ...filters import gnss_ins, imm
 from ..quantities import Quantity, means, quantity, record_run
 from ..reproduction import Progress, compute_units, later

@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
-from ...evaluation.looks import styles
+from ...evaluation.figures.looks import styles
 from ..panels import draw, finish, legend_outside, looks, panels, shade
 from ..quantities import means
 from .claims import BAND, COORDINATE_LOSS, matched_ratios

@@ -11,7 +11,7 @@ Reading: the "posterior" deviations of figures 2 to 4 belong to one run "corresp
 are most likely the filters' own; both those and the errors really made are drawn and told apart.
 """
 
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 

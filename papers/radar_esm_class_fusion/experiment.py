@@ -9,7 +9,7 @@ from ...baselines.radar_esm_tracking.metrics import SURE
 from ...envs.engine.scenario_choice import make_task
 from ...envs.radar_esm_tracking.parameters import RadarEsmTrackingParameters
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ...filters import class_fusion
 from ..quantities import Quantity, evaluate_policy, mean, means, quantity
 from ..reproduction import Progress, compute_units, later

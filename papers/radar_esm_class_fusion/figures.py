@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 
 from ...baselines.radar_esm_tracking.metrics import SURE
-from ...evaluation.looks import styles
+from ...evaluation.figures.looks import styles
 from ..panels import draw, finish, legend_outside, looks, panels
 from ..quantities import means
 from .experiment import CLASSES, COMPONENTS, INTERVAL, Results

@@ -8,7 +8,7 @@ Nodes: 1 the plant's input (control, command and white noise), 2 the observation
 innovation; all of the output coordinate. Energy spectrum: ``|DFT|^2 T / n`` averaged over runs, two-sided.
 """
 
-from ...evaluation.parallel import Workers
+from ...evaluation.running.parallel import Workers
 from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 

@@ -10,8 +10,8 @@ from ...baselines.uav_autopilot.policies import BASELINES
 from ...envs.contract.model import Episode, Model
 from ...envs.engine.backend import make_model
 from ...envs.uav_autopilot.task import UavAutopilot
-from ...evaluation.parallel import Workers
-from ...evaluation.seeds import episode_seeds
+from ...evaluation.running.parallel import Workers
+from ...evaluation.running.seeds import episode_seeds
 from ...filters import linear_systems
 from ..quantities import evaluate_policy, mean, record_run
 from ..reproduction import Progress, compute_units, later

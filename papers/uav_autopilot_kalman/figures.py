@@ -6,7 +6,7 @@ import numpy
 
 from ...baselines.uav_autopilot.theory import stationary
 from ...envs.uav_autopilot.task import UavAutopilot
-from ...evaluation.looks import COLOURS
+from ...evaluation.figures.looks import COLOURS
 from ..panels import finish, legend_outside, looks, panels
 from .experiment import (
     HORIZON,

@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING
 
 import numpy
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.dataset import slices_of
-from filtergym.evaluation.metrics import Measure
-from filtergym.evaluation.own_metrics import MetricInputs, OwnMetrics
+from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.storage.dataset import slices_of
+from filtergym.evaluation.running.metrics import Measure
+from filtergym.evaluation.running.own_metrics import MetricInputs, OwnMetrics
 
 if TYPE_CHECKING:
     import xarray

@@ -1,0 +1,506 @@
+"""A filter in a loop of one's own: measurements come one by one, and estimates go out.
+
+It is what competes in an evaluation, run by the same code: of the same measurements come the same bits.
+"""
+
+import copy
+import importlib.metadata
+import reprlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy
+
+from ...compiler.functions import map_arrays, round_up_lanes
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.parameters import check_integer
+from ...envs.data.recording import measure_examples
+from ...envs.engine.compiled import filter_stepper
+from ...filters.array_namespace import select_nested
+from ..storage.dataset import FAULTS
+from .filters import find_fault, put_in_loop
+from .kinds import Kind, check_competitor, make_competitor
+from .stepping import SteppingPolicy
+
+LEAST_INTERVAL = 1e-6
+"""Of the sampling interval: measurements that are closer in time are the same moment, written twice."""
+MOST_MISSED = 1000
+"""Scans without a measurement, after which a track is another one."""
+REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
+"""What a filter may report beside its estimate."""
+
+
+class Watch(Protocol):
+    """Says whether what a network is shown looks like its training."""
+
+    memory: Any
+    """What it has seen so far."""
+
+    def describe(self) -> list[str]:
+        """Return what is unusual, in words, for each track; empty where nothing is."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a filter says after a measurement; C components, and for N tracks side by side a last axis of N."""
+
+    time: Any
+    """s."""
+    names: tuple[str, ...]
+    """Of the components."""
+    units: tuple[str, ...]
+    """Of the components."""
+    mean: numpy.ndarray
+    """``(C,)``."""
+    covariance: numpy.ndarray
+    """``(C, C)``."""
+    nis: Any = None
+    """Normalised innovation squared of the measurement; NaN where none was received, None where the filter does not
+    say it; likewise what follows."""
+    nis_degrees: Any = None
+    """Numbers of the measurement that it counts: its mean, if the filter is consistent."""
+    log_likelihood: Any = None
+    """Log-density of the measurement as it was predicted, nats."""
+    mode_probability: Any = None
+    """Probabilities of the hypotheses, ``(M,)``."""
+    lost: Any = ""
+    """Why an estimator's answers are no estimates any more; a list for several tracks."""
+    departure: Any = ""
+    """What is unlike the training of a network inside; likewise."""
+
+    @property
+    def sigma(self) -> numpy.ndarray:
+        """Standard deviations that the filter states, ``(C,)``."""
+        return numpy.sqrt(numpy.einsum("ii...->i...", self.covariance))
+
+    def __getitem__(self, name: str) -> Any:
+        """Mean of a component, by its name."""
+        return self.mean[self.names.index(name)]
+
+    def __str__(self) -> str:
+        if self.mean.ndim > 1:
+            return f"<Estimate of {self.mean.shape[1]} tracks: {', '.join(self.names)}>"
+        each = zip(self.names, self.mean, self.sigma, self.units, strict=True)
+        return ", ".join(f"{name} {mean:.6g} ± {sigma:.2g} {unit}" for name, mean, sigma, unit in each)
+
+
+class OnlineState(NamedTuple):
+    """All that a running filter remembers; it can be pickled.
+
+    ``owner`` says whose it is: environment and its interface, filter, tracks, version of the package.
+    """
+
+    filter: Any
+    """Of the filter, arrays ``(..., N)``."""
+    input: Any
+    """Of the measurements before."""
+    policy: Any = None
+    """What a policy remembers."""
+    fresh: numpy.ndarray | None = None
+    """Which tracks have just begun, for the policy, ``(N,)``."""
+    measurements: int = 0
+    """So far."""
+    action: Any = None
+    """In force, where one holds for several measurements."""
+    total: Any = 0.0
+    """Sums of what is shown as a mean since the last decision."""
+    python: Any = None
+    """Memory of an estimator that runs in Python."""
+    watch: Any = None
+    """Memory of the watch."""
+    owner: tuple[str, ...] = ()
+    """Of which filter it is; no other goes on from it."""
+
+
+class OnlineFilter:
+    """A filter that takes measurements as they come.
+
+    Args:
+        model: task, a feed in its world's place, with the bank of the competitor's control.
+        competitor: policy or estimator, or what makes it.
+        kind: what it is.
+        name: of it, in errors.
+        tracks: how many are followed side by side.
+        watch: looks at what a network inside is shown; None where there is none.
+
+    Raises:
+        ValueError: for what cannot run ahead of the truth or of later measurements.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        competitor: Any,
+        kind: Kind,
+        name: str,
+        tracks: int = 1,
+        watch: Watch | None = None,
+    ) -> None:
+        if kind not in ("policy", "estimator"):
+            raise ValueError(
+                f"{name!r} is of kind {kind} and cannot run online: choose a policy or an estimator"
+            )
+        tracks = check_integer("tracks", tracks, 1)
+        self.name, self.tracks, self.watch = name, tracks, watch
+        self.task = model.task
+        initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
+        if self.task.recording.second_sensor:
+            measurement = self.task.world.add_recorded_fields(measurement)
+        self.input = self.task.live_input(self.task, initial, measurement, tracks)
+        self._policy: SteppingPolicy | None = None
+        if kind == "policy":
+            self._policy = SteppingPolicy(
+                model, check_competitor(name, make_competitor(competitor, model), kind)
+            )
+            self.model = model
+        else:
+            self.model = put_in_loop(model, competitor, kind, name, tracks)
+        self.names = tuple(component.name for component in self.task.components)
+        self.units = tuple(component.unit for component in self.task.components)
+        interval = self.task.decision_interval
+        averaged = [i for i, f in enumerate(self.model.fields) if f.over_interval == "mean"]
+        self._interval, self._averaged = interval, averaged if interval > 1 else []
+        self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
+        self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
+        of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
+        version = f"filtergym {importlib.metadata.version('filtergym')}"
+        self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
+        self._state: OnlineState | None = None
+        """Without the filter's, which the stepper holds."""
+
+    def __repr__(self) -> str:
+        takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
+        return f"<OnlineFilter {self.name!r} of {self.task.id}; update takes {takes}>"
+
+    def __reduce__(self) -> Any:
+        """Refuse copies: what a filter runs is machine code of this process."""
+        raise TypeError(
+            "a running filter cannot be copied or pickled: make another with filtergym.online, and let it restore what "
+            "save of this one returns"
+        )
+
+    # --- what a user calls
+
+    def start(
+        self, mean: Any = None, covariance: Any = None, time: Any = 0.0, *, tracks: Any = None, **values: Any
+    ) -> None:
+        """Start the track.
+
+        Args:
+            mean: initial estimate, ``(C,)``, or of several tracks ``(C, N)``.
+            covariance: of its error, ``(C, C)`` or ``(C, C, N)``.
+            time: s, a number or ``(N,)``.
+            tracks: numbers of those that start anew while the others go on; default: all.
+            **values: what else the environment is given at the start, see ``input.start_values``.
+
+        Raises:
+            ValueError: for what is missing, unknown, or of another shape.
+        """
+        self.input.check_names(values, self.input.start_values)
+        given = {**values, **{n: v for n, v in (("mean", mean), ("covariance", covariance)) if v is not None}}
+        initial, memory = self.input.start(self._times(time), given)
+        self._check_covariance(initial)
+        if tracks is not None:
+            self._check_restart()
+        state = self.model.start_filter(self._padded(initial))
+        begun = OnlineState(state, memory, fresh=numpy.ones(self.tracks, dtype=bool))
+        if tracks is not None:
+            begun = self._merge(begun, tracks)
+        elif self._policy is not None:
+            begun = begun._replace(policy=self._policy.begin(range(self.tracks)))
+        self._go_on(begun)
+
+    def start_from(self, first: dict[str, Any], second: dict[str, Any]) -> None:
+        """Start the track from its first two measurements, as that of a log starts.
+
+        Args:
+            first: its ``time`` and what the sensors say, as of :meth:`update`.
+            second: likewise.
+
+        Raises:
+            ValueError: for what is missing or unknown, or where two measurements start no track.
+        """
+        for measured in (first, second):
+            self.input.check_names(measured, {**self.input.values, "time": "s"})
+            if measured.get("time") is None:
+                raise ValueError("each of the two measurements needs its time")
+        self.start(**self.input.start_from(first, second), time=second["time"])
+
+    def update(self, time: Any = None, **values: Any) -> Estimate:
+        """Take a measurement in; one of the same time as the last is fused with it, where the sensors allow it.
+
+        Args:
+            time: s, a number or ``(N,)``; default: one sampling interval after the last.
+            **values: what the sensors say, by the names of ``input.values``; what did not come is None, NaN or left
+                out. Numbers, or arrays of one track; for several tracks with N last.
+
+        Returns:
+            The estimate at that time.
+
+        Raises:
+            ValueError: for what is missing, unknown or of another shape, or a time that does not increase.
+        """
+        before = self._running()
+        last = before.input["time"]
+        at = last + self._default_interval() if time is None else self._times(time)
+        together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
+        if not ((at > last).all() or together):
+            raise ValueError(
+                f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(time)}"
+            )
+        self.input.check_names(values, self.input.values)
+        if together:
+            return self._fuse(at, values)
+        self._check_interval(at - last, time)
+        for scan in self._missed_scans(last, at):
+            self._step(scan, {})
+        return self._step(at, values)
+
+    def _fuse(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
+        """Take in one more measurement of the same time."""
+        saved = self.save()
+        found = self._step(at, values)
+        if not (numpy.isfinite(found.mean).all() and numpy.isfinite(found.covariance).all()):
+            self.restore(saved)
+            raise ValueError(
+                f"{self.name!r} cannot take two measurements of one time, {_plain(at)} s: give the second a later one"
+            )
+        return found
+
+    def _missed_scans(self, last: numpy.ndarray, at: numpy.ndarray) -> list[numpy.ndarray]:
+        """Times of the scans between that missed the target, as a log that is read has them; none where the filter was
+        not advised for a log.
+        """
+        interval = getattr(self.task.recording, "scan_interval", None)
+        if interval is None:
+            return []
+        scans = int(max(numpy.rint((at - last) / interval).max(), 1))
+        if scans > MOST_MISSED:
+            raise ValueError(
+                f"{_plain(at - last)} s lie between two measurements, {scans - 1:,} scans of {interval:g} s: start the "
+                "track anew"
+            )
+        return [last + (at - last) * number / scans for number in range(1, scans)]
+
+    def _step(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
+        """Advance to a time and take in what came."""
+        before = self._running()
+        measurement, memory = self.input.measure(before.input, at, values)
+        after = before._replace(input=memory, measurements=before.measurements + 1)
+        stepper = self._stepper
+        stepper.predict(self._padded(measurement))
+        action = numpy.zeros(stepper.width, dtype=numpy.int64)
+        if self._policy is not None:
+            after, action = self._decide(after, stepper.observe())
+        stepper.update(action)
+        self._state = after
+        return self._estimate(at, stepper.report())
+
+    def predict(self, time: Any = None, **values: Any) -> Estimate:
+        """Estimate of a time at which nothing is received; the filter stays where it is.
+
+        Args:
+            time: as of :meth:`update`.
+            **values: what comes without a receiver, where the environment needs it.
+
+        Raises:
+            ValueError: as of :meth:`update`.
+        """
+        saved = self.save()
+        try:
+            return self.update(time, **values)
+        finally:
+            self.restore(saved)
+
+    def save(self) -> OnlineState:
+        """Return all that it remembers, to go on from it later, also in another process."""
+        state = self._running()
+        own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
+        return copy.deepcopy(
+            state._replace(
+                filter=self._stepper.state,
+                python=None if own is None else (own.memory, own.step),
+                watch=None if self.watch is None else self.watch.memory,
+                owner=self._owner,
+            )
+        )
+
+    def restore(self, state: OnlineState) -> None:
+        """Go on from what :meth:`save` has returned.
+
+        Raises:
+            ValueError: for anything else, and for what another filter has returned.
+        """
+        if not isinstance(state, OnlineState):
+            raise ValueError(f"restore takes what save has returned, got {reprlib.repr(state)}")
+        if state.owner != self._owner:
+            raise ValueError(
+                f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
+            )
+        state = copy.deepcopy(state)
+        if self.model.filter.in_python:
+            self.model.filter.own.memory, self.model.filter.own.step = state.python
+        if self.watch is not None:
+            self.watch.memory = state.watch
+        self._go_on(state)
+
+    def _go_on(self, state: OnlineState) -> None:
+        self._stepper.state = state.filter
+        self._state = state._replace(filter=None)
+
+    # --- one measurement
+
+    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> tuple[OnlineState, numpy.ndarray]:
+        """Ask the policy where a decision is due; the action is ``(A, width)`` or ``(width,)``."""
+        assert self._policy is not None
+        number = state.measurements - 1
+        if self._averaged:
+            observation, state = self._average(observation, state, number)
+        if number % self._interval == 0:
+            shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
+            action, memory = self._policy.predict(shown, state.policy, state.fresh)
+            state = state._replace(policy=memory, action=action, fresh=numpy.zeros(self.tracks, dtype=bool))
+        action = state.action
+        turned = action.T if action.ndim == 2 else action
+        return state, numpy.ascontiguousarray(turned[..., self._pad])
+
+    def _average(
+        self, observation: numpy.ndarray, state: OnlineState, number: int
+    ) -> tuple[numpy.ndarray, OnlineState]:
+        """Show means over the measurements since the last decision."""
+        if number == 0:
+            return observation, state
+        total = state.total + observation[self._averaged]
+        if number % self._interval:
+            return observation, state._replace(total=total)
+        observation = observation.copy()
+        observation[self._averaged] = total / self._interval
+        return observation, state._replace(total=0.0)
+
+    def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
+        cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
+        if self.tracks == 1:
+            cut = lambda array: array[..., 0]  # noqa: E731
+        answer = {name: cut(array) for name, array in found.items()}
+        if "lost" not in answer:  # a policy and an agent steer a filter that nobody else looks at
+            answer["lost"] = cut(_fault_of(found["mean"], found["covariance"]))
+        answer["lost"] = self._each(
+            [FAULTS[int(i) - 1] if i else "" for i in numpy.atleast_1d(answer["lost"])]
+        )
+        departure = [""] * self.tracks if self.watch is None else self.watch.describe()[: self.tracks]
+        return Estimate(_plain(time), self.names, self.units, **answer, departure=self._each(departure))
+
+    def _each(self, words: list[str]) -> Any:
+        return words[0] if self.tracks == 1 else words
+
+    # --- what is given
+
+    def _running(self) -> OnlineState:
+        if self._state is None:
+            raise ValueError("the track has not been started: call start first")
+        return self._state
+
+    def _times(self, time: Any) -> numpy.ndarray:
+        try:
+            found = numpy.asarray(time, dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            found = numpy.array(numpy.nan)
+        if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
+            raise ValueError(
+                f"time must be finite seconds, a number or ({self.tracks},) numbers, got {reprlib.repr(time)}"
+            )
+        return numpy.broadcast_to(found, (self.tracks,)).copy()
+
+    def _has_interval(self) -> bool:
+        return bool(getattr(self.task.parameters, "sampling_interval", None) or self.task.interval)
+
+    def _default_interval(self) -> float:
+        interval = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
+        if interval is None:
+            raise ValueError(f"{self.task.id} has no sampling interval: give update the time")
+        return float(interval)
+
+    def _check_interval(self, interval: numpy.ndarray, time: Any) -> None:
+        """Raise ValueError for times that are closer than any sensor is read: motion within them is rounding."""
+        least = (
+            LEAST_INTERVAL * self._default_interval() if time is not None and self._has_interval() else 0.0
+        )
+        if (interval < least).any():
+            raise ValueError(
+                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {reprlib.repr(time)} after "
+                f"{_plain(self._running().input['time'])} s"
+            )
+
+    def _check_covariance(self, initial: Any) -> None:
+        """Raise ValueError for an initial covariance that is none."""
+        covariance = getattr(initial, "covariance", None)
+        if covariance is None:
+            return
+        # Where an environment begins with what is known exactly, it may be: the others must be definite.
+        known = numpy.einsum("iin->in", self.input.initial.covariance)[:, :1] == 0.0
+        exact = known & (numpy.einsum("iin->in", covariance) == 0.0) & (covariance == 0.0).all(axis=1)
+        fault = _fault_of(initial.mean, covariance + numpy.eye(len(exact))[:, :, None] * exact)
+        if fault.any():
+            track = int((fault > 0.0).argmax())
+            which = f" of track {track}" if self.tracks > 1 else ""
+            raise ValueError(
+                f"the initial covariance{which} must be symmetric and positive definite, got "
+                f"{reprlib.repr(covariance[..., track].tolist())}"
+            )
+
+    def _padded(self, part: Any) -> Any:
+        """Repeat the last track up to a multiple of eight: rounding in matrix products must not depend on N."""
+        return map_arrays(lambda array: numpy.ascontiguousarray(array[..., self._pad]), part)
+
+    def _check_restart(self) -> None:
+        """Raise ValueError where single tracks cannot start anew."""
+        self._running()
+        if self._interval > 1 or self.model.filter.in_python:
+            raise ValueError(
+                f"{self.name!r} cannot start single tracks anew "
+                f"({'decisions hold for several measurements' if self._interval > 1 else 'it runs in Python'}): follow "
+                "each with a filter of its own"
+            )
+
+    def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
+        """Let some tracks begin, and the others go on."""
+        chosen = numpy.zeros(self.tracks, dtype=bool)
+        numbers = numpy.asarray(tracks)
+        if numbers.dtype.kind not in "iub" or (numbers.dtype.kind == "b") != (
+            numbers.shape == (self.tracks,)
+        ):
+            numbers = numpy.array([-1 - self.tracks])
+        try:
+            chosen[numbers] = True
+        except IndexError:
+            raise ValueError(
+                f"tracks are numbers from 0 to {self.tracks - 1}, got {reprlib.repr(tracks)}"
+            ) from None
+        old = self._running()
+        return old._replace(
+            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
+            input=select_nested(chosen, begun.input, old.input),
+            fresh=chosen | old.fresh,
+        )
+
+
+def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
+    """Report the estimate, and what the filter says of the measurement."""
+    records = model.filter.records(episode.filter, episode.measurement)
+    return {
+        "mean": model.filter.mean(episode.filter),
+        "covariance": model.filter.covariance(episode.filter),
+        **{name: records[name] for name in REPORTED if name in records},
+    }
+
+
+def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
+    """Numbers of what is wrong with estimates, see :func:`.filters.find_fault`, ``(N,)``."""
+    nothing = numpy.zeros(mean.shape[-1])
+    return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
+
+
+def _plain(values: numpy.ndarray) -> Any:
+    """A number where all are the same."""
+    return float(values[0]) if (values == values[0]).all() else values

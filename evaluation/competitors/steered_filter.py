@@ -1,0 +1,259 @@
+"""A bank closed by a policy: a filter like any other, which needs nobody who asks the policy.
+
+Traced for one track, its arithmetic is a straight line: what steers is then compiled and exported with its bank.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...compiler import namespace
+from ...compiler.block import LANES
+from ...compiler.functions import Function, Specialised, leaves, map_arrays
+from ...compiler.namespace import NotTraceable
+from ...compiler.program import Graph
+from ...envs.contract.filter import Filter, Input
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.observation import Array
+from ...envs.engine.compiled import CompiledModel, warn_of
+from .kinds import Policy, says_traceable
+
+
+class Decisions(NamedTuple):
+    """What a policy has decided so far, and remembers."""
+
+    memory: Any
+    """Of the policy, every array as ``(entries, N)``; before its first decision zeros."""
+    count: Array
+    """Measurements taken in since the last decision, that of the decision among them; zero before the first one,
+    ``(N,)``."""
+    action: Array
+    """In force, ``(A, N)``."""
+    total: Array
+    """Sums over the measurements since the last decision of the fields that are shown as means, ``(fields, N)``."""
+
+
+Act = Callable[[Array, Any, Array], tuple[Array, Any]]
+"""From an observation ``(N, fields)``, memory, and whether the episode begins ``(N,)``, to an action ``(N, A)`` or
+``(N,)`` and the memory."""
+
+
+class Decider:
+    """A policy asked at every measurement, of whose answers those stand that are due.
+
+    Args:
+        model: whose observations it is shown.
+        act: asks the policy.
+        memory: that the policy returns, arrays of one track; their values do not matter. The batch is the first axis
+            or else the last. Where one has neither, the filter is for one track: N is 1, or the arrays are traced.
+        interval: measurements for which an action holds; default: the task's decision interval.
+    """
+
+    def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
+        self.xp, self.ask, self._template = model.task.xp, act, memory
+        self._shapes = shapes_of(memory)
+        self._fields = len(model.fields)
+        self.space = model.action_space
+        self.size = math.prod(self.space.shape or (1,))
+        self.interval = model.task.decision_interval if interval is None else interval
+        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
+        self.averaged = averaged if self.interval > 1 else []
+
+    def start(self, zero: Array) -> Decisions:
+        """Nothing is decided yet; all numbers are zero, ``(N,)``."""
+        memory = map_arrays(
+            lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
+        )
+        action = self.xp.stack([zero] * self.size)
+        return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.averaged), 1)))
+
+    def is_due(self, state: Decisions) -> Array:
+        """Whether the policy is asked at the next measurement, ``(N,)``."""
+        return (state.count == 0.0) | (state.count >= float(self.interval))
+
+    def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
+        """Return the action in force, ``(A, N)`` floats or ``(N,)`` integers, after an observation ``(fields, N)``."""
+        xp, K = self.xp, self.interval
+        first = state.count == 0.0
+        due, total = self.is_due(state), state.total
+        if self.averaged:
+            total = xp.where(first, 0.0, total + xp.stack([observation[i] for i in self.averaged]))
+            means = xp.where(first, xp.stack([observation[i] for i in self.averaged]), total / K)
+            place = {field: i for i, field in enumerate(self.averaged)}
+            observation = xp.stack(
+                [means[place[i]] if i in place else observation[i] for i in range(self._fields)]
+            )
+            total = xp.where(due, 0.0, total)
+        answer, memory = self._ask(observation, state.memory, first)
+        if K > 1:
+            answer = xp.where(due, answer, state.action)
+            kept = iter(leaves(state.memory))
+            memory = map_arrays(lambda array: xp.where(due, array, next(kept)), memory)
+        action = answer if self.space.shape else xp.astype(answer[0], xp.int64)
+        # Never more than the interval: float has no whole numbers beyond 2^24 for a filter that runs for days.
+        count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
+        return action, Decisions(memory, count, answer, total)
+
+    def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
+        """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
+        shapes, N = iter(self._shapes), observation.shape[-1]
+
+        def restore(array: Array) -> Array:
+            shape, kind = next(shapes)
+            if shape[:1] == (1,):
+                number = self.xp.reshape(array.T, (-1, *shape[1:]))
+            else:
+                number = self.xp.reshape(array, (*shape[:-1], N) if shape[-1:] == (1,) else shape)
+            return number > 0.5 if kind == "b" else number
+
+        def flatten(array: Array, shape: tuple[int, ...] = (1,)) -> Array:
+            array = self.xp.asarray(array)
+            if shape[:1] != (1,) and shape[-1:] == (1,):
+                rows = self.xp.reshape(array, (-1, N))
+            else:
+                rows = self.xp.reshape(array, (N if shape[:1] == (1,) else 1, -1)).T
+            return self.xp.astype(rows, self.xp.float64)
+
+        answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
+        answer = self.xp.asarray(answer)
+        if answer.size != self.size * N or (answer.dtype.kind == "f" and not self.space.shape):
+            raise ValueError(
+                f"expected an action of {self.space}, got {answer.dtype} of shape {answer.shape}"
+            )
+        remembered = iter(shape for shape, _ in self._shapes)
+        return flatten(answer), map_arrays(lambda array: flatten(array, next(remembered)), memory)
+
+
+class Steered(NamedTuple):
+    """State of a steered filter."""
+
+    bank: Any
+    """Of the bank."""
+    policy: Decisions
+    """Of the policy."""
+
+
+class SteeredFilter(Filter[Any, Any, Steered]):
+    """A bank closed by a policy.
+
+    Args:
+        model: with the bank.
+        decider: asks the policy.
+    """
+
+    def __init__(self, model: Model, decider: Decider) -> None:
+        super().__init__(model.task)
+        self.model, self.bank, self.decider = model, model.filter, decider
+        self.adapts_covariance = self.bank.adapts_covariance  # type: ignore[misc]  # of this bank
+
+    def start(self, initial: Any) -> Steered:
+        """Start the bank; the policy begins at its first decision."""
+        return Steered(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
+
+    def predict(self, state: Steered, measurement: Any) -> Steered:
+        """Predict in the bank."""
+        return state._replace(bank=self.bank.predict(state.bank, measurement))
+
+    def update(self, state: Steered, given: Input) -> Steered:
+        """Ask the policy where a decision is due, and apply its action."""
+        observation = self.model.observe(Episode(None, given.measurement, state.bank))
+        action, decisions = self.decider.decide(observation, state.policy)
+        return Steered(self.bank.act(state.bank, given.measurement, action), decisions)
+
+    def mean(self, state: Steered) -> Array:
+        """That of the bank."""
+        return self.bank.mean(state.bank)
+
+    def covariance(self, state: Steered) -> Array:
+        """That of the bank."""
+        return self.bank.covariance(state.bank)
+
+    def feedback(self, state: Steered, measurement: Any) -> Any:
+        """That of the bank."""
+        return self.bank.feedback(state.bank, measurement)
+
+    def records(self, state: Steered, measurement: Any) -> dict[str, Array]:
+        """Those of the bank."""
+        return self.bank.records(state.bank, measurement)
+
+
+def shapes_of(memory: Any) -> list[tuple[tuple[int, ...], str]]:
+    """Shapes and kinds of the arrays that a policy remembers."""
+    return [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
+
+
+def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
+    """Return what asks a policy at every measurement of a model.
+
+    Args:
+        model: on NumPy or traced arrays.
+        policy: made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
+        interval: measurements for which an action holds; default: the task's decision interval.
+    """
+    blank = numpy.zeros((1, len(model.fields)))
+    with numpy.errstate(all="ignore"):
+        _, memory = policy.act(blank, None, numpy.ones(1, dtype=bool))
+    return Decider(model, policy.act, memory, interval)
+
+
+def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
+    """Close the bank of a model by a policy; arguments as of :func:`decider_of`.
+
+    Raises:
+        NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
+    """
+    return SteeredFilter(model, decider_of(model, policy, interval))
+
+
+def trace_policy(model: CompiledModel, policy: Policy) -> Specialised:
+    """Return what a policy decides, for :meth:`.Lanes.run`: a function of what is shown and of :class:`Decisions`.
+
+    Args:
+        model: compiled, in which it acts.
+        policy: made for it.
+
+    Raises:
+        NotTraceable: if its arithmetic cannot be traced.
+    """
+    decider, graph, given = _trace_decider(model, policy, None)
+    return Specialised(decider.decide, graph, given, unchanged=0, given_turned=True)
+
+
+def trace_decision(model: CompiledModel, policy: Policy) -> tuple[Function, Decisions]:
+    """Return the same of a policy that is asked only where a decision is due, and its memory before the first one.
+
+    Raises:
+        NotTraceable: if its arithmetic cannot be traced.
+    """
+    decider, graph, given = _trace_decider(model, policy, 1)
+    function = Function(decider.decide, graph, unchanged=0)
+    function.specialise(*given)
+    return function, given[1]
+
+
+def _trace_decider(model: CompiledModel, policy: Policy, interval: int | None) -> tuple[Decider, Graph, Any]:
+    graph = Graph(loops=True)
+    with namespace.tracing(graph):
+        decider = decider_of(model.programs.traced, policy, interval)
+        nothing = decider_of(model, policy, interval).start(numpy.zeros(LANES))
+    return decider, graph, (numpy.zeros((len(model.fields), LANES)), nothing)
+
+
+def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
+    """Return a policy traced, or None where it is asked in Python; a warning says why what calls itself traceable is
+    not.
+
+    Args:
+        model: in which it acts.
+        policy: made for it.
+        trace: :func:`trace_policy` or :func:`trace_decision`.
+    """
+    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and says_traceable(policy)):
+        return None
+    try:
+        return trace(model, policy)
+    except NotTraceable as error:
+        warn_of(f"policy {type(policy).__name__} of {model.task.id}", error)
+        return None

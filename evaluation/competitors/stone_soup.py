@@ -1,0 +1,68 @@
+"""Components of Stone Soup as an estimator."""
+
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy
+from stonesoup.models.measurement.linear import LinearGaussian
+from stonesoup.types.detection import Detection
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.state import GaussianState
+
+from ...envs.contract.task import Array
+from .adapters import SingleTrackEstimator
+
+START = datetime(2000, 1, 1)
+"""Stone Soup wants a date; which one is of no consequence."""
+
+
+class StoneSoupEstimator(SingleTrackEstimator):
+    """A predictor and an updater of Stone Soup, one state an episode.
+
+    Subclasses set ``self.predictor`` and ``self.updater``, after ``super().__init__(task)``. Where a
+    measurement is more than positions with a covariance they define :meth:`detection`, for a control or hypotheses of
+    their own :meth:`step`, for particles :meth:`begin`.
+
+    """
+
+    predictor: Any
+    updater: Any
+
+    @property
+    def interval(self) -> float:
+        """Seconds from one measurement to the next, where these do not say; where the parameters leave it open a
+        subclass must.
+        """
+        return self.task.parameters.sampling_interval
+
+    def begin(self, initial: Any) -> Any:
+        """Gaussian state at the start of the track."""
+        return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
+
+    def detection(self, measurement: Any, timestamp: datetime) -> Any:
+        """Detection of the position, with the covariance of this measurement in its model; None where there is none.
+
+        Args:
+            measurement: of this track.
+            timestamp: of the measurement.
+        """
+        z, R = self.reading(measurement)
+        if z is None:
+            return None
+        places = [self.state.index(name) for name in self.task.groups["position"]]
+        model = LinearGaussian(ndim_state=len(self.state), mapping=places, noise_covar=R)
+        return Detection(z[:, None], timestamp=timestamp, measurement_model=model)
+
+    def step(self, track: Any, measurement: Any) -> Any:
+        """Predict to the time of the measurement and update with its detection, if there is one."""
+        interval = measurement.interval if hasattr(measurement, "interval") else self.interval
+        timestamp = track.timestamp + timedelta(seconds=float(interval))
+        prediction = self.predictor.predict(track, timestamp=timestamp)
+        detection = self.detection(measurement, timestamp)
+        if detection is None:
+            return prediction
+        return self.updater.update(SingleHypothesis(prediction, detection))
+
+    def estimate(self, track: Any) -> tuple[Array, Array]:
+        """``mean`` and ``covar``."""
+        return numpy.asarray(track.mean), numpy.asarray(track.covar)

@@ -1,0 +1,167 @@
+"""Animated pictures of an episode, under whatever estimates, for documentation and to look at a bad one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy
+from PIL import Image
+
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.parameters import check_integer
+from ...envs.contract.task import Task
+from ...envs.engine.backend import make_model
+from ...envs.engine.environment import TaskEnv
+from ...envs.engine.episode_noise import uniforms_of_seeds
+from ...envs.engine.scenario_choice import find_scenario
+from ..competitors.kinds import kind_of, make_competitor
+from ..competitors.stepping import SteppingPolicy
+from ..running.evaluate import control_of
+from ..running.rollout import run_competitor
+from ..storage.files import whole_file
+
+SHADES = 7
+"""Steps from a colour of the figure to white, for smooth edges."""
+
+
+def episode_frames(
+    task: type[Task],
+    name: str,
+    competitor: Any,
+    scenario: Any = None,
+    seed: int = 0,
+    every: int = 2,
+    **keywords: Any,
+) -> list[Image.Image]:
+    """Play an episode and draw it.
+
+    Args:
+        task: class of the environment's.
+        name: of the competitor, for the title.
+        competitor: policy, estimator, smoother or reference, or what makes it.
+        scenario: name of a scenario, or a trajectory.
+        seed: of the episode, as in ``reset``.
+        every: actions from one frame to the next; the last action is always shown.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, and for bounds, which estimate nothing.
+    """
+    every, kind = check_integer("every", every, 1), kind_of(competitor)
+    if kind == "bound":
+        raise ValueError(f"{name!r} is a bound: it estimates nothing that could be drawn")
+    keywords = {**getattr(competitor, "task_keywords", {}), **keywords}
+    draw = _policy_frames if kind == "policy" else _estimate_frames
+    return draw(task, name, competitor, scenario, seed, every, keywords)
+
+
+def _policy_frames(
+    task: type[Task],
+    name: str,
+    policy: Any,
+    scenario: Any,
+    seed: int,
+    every: int,
+    keywords: Mapping[str, Any],
+) -> list[Image.Image]:
+    """Draw an episode as the environment does."""
+    control = control_of(policy, "policy", None, task, name)
+    world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
+    assert world.picture is not None
+    world.picture.caption = f"policy {name}"
+    actor = SteppingPolicy(world.model, make_competitor(policy, world.model))
+    observation, _ = world.reset(seed=seed)
+    frames, memory, finished = [Image.fromarray(_frame(world))], actor.begin([seed]), False
+    taken = 0
+    while not finished:
+        action, memory = actor.predict(observation, memory)
+        observation, _, _, finished, _ = world.step(action)
+        taken += 1
+        if finished or taken % every == 0:
+            frames.append(Image.fromarray(_frame(world)))
+    world.close()
+    return frames
+
+
+def _estimate_frames(
+    task: type[Task],
+    name: str,
+    estimator: Any,
+    scenario: Any,
+    seed: int,
+    every: int,
+    keywords: Mapping[str, Any],
+) -> list[Image.Image]:
+    """Draw the estimates of a filter of its own, which is shown no observation and takes no action."""
+    # They bring matplotlib.
+    from ...envs.drawing.estimate_picture import EstimatePicture
+    from ...envs.drawing.rendering import EpisodePicture
+
+    kind, chosen = kind_of(estimator), find_scenario(task, scenario, keywords)
+    model = make_model(task, task.controls[0], scenario, **keywords)
+    length = int(model.task.lengths(uniforms_of_seeds([seed], model.task.noise))[0])
+    found = run_competitor(model, estimator, kind, [seed], _picture_track)
+    track = {key: values[0, :length] for key, values in found.items()}
+    drawn = EstimatePicture(model, track)
+    picture = EpisodePicture(model, chosen.name, "rgb_array", 1.0, drawn)
+    picture.caption = f"{kind} {name}"
+    frames, step = [], every * model.task.decision_interval
+    for k in range(length):
+        picture.append(drawn.values(track, k))
+        if (k + 1) % step == 0 or k == length - 1:
+            frames.append(Image.fromarray(picture.frame(None)))
+    picture.close()
+    return frames
+
+
+def _picture_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return model.picture_track(episode)
+
+
+def _frame(world: TaskEnv) -> Any:
+    frame = world.render()
+    assert frame is not None
+    return frame
+
+
+def _palette() -> Image.Image:
+    """Colours of the figures and their shades: one palette for all frames, or colours would flicker.
+
+    A palette chosen from the pixels would drop what is small, such as the radar's mark.
+    """
+    from matplotlib.colors import to_rgb
+
+    # Imported here for the same reason as in the environment.
+    from ...envs.drawing import rendering
+
+    white = numpy.ones(3)
+    share = numpy.arange(SHADES)[:, None] / SHADES
+    shades = [(1.0 - share) * to_rgb(colour) + share * white for colour in rendering.COLOURS]
+    image = Image.new("P", (1, 1))
+    image.putpalette(
+        numpy.rint(255.0 * numpy.concatenate([white[None], *shades])).astype(int).ravel().tolist()
+    )
+    return image
+
+
+def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
+    """Write frames as an endless GIF whose last frame stays for two seconds.
+
+    Args:
+        frames: at least one.
+        path: of the file, which is complete or not there.
+        frames_per_second: speed.
+    """
+    palette = _palette()
+    drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]
+    with whole_file(path) as partial:
+        drawn[0].save(
+            partial,
+            format="GIF",
+            save_all=True,
+            append_images=drawn[1:],
+            duration=durations,
+            loop=0,
+            optimize=True,
+        )

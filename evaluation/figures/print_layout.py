@@ -1,0 +1,242 @@
+"""Axes for print: widths of a paper's columns, letters, limits, names at the ends of lines, and files."""
+
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import numpy
+
+from ..storage.files import whole_file
+
+MOST_BESIDE = 8
+"""Names that fit beside the lowest axes."""
+WIDTHS = {1: 3.5, 2: 7.16}
+"""Inches, of one and two columns of a paper."""
+FONT_SIZES = {1: 7.0, 2: 8.0}
+"""Points, which are printed as they are: the figure has the width of its place."""
+FORMATS = ("png", "svg", "pdf")
+DOTS_PER_INCH = 200
+
+
+def check_columns(columns: int) -> int:
+    """Return a number of columns, or raise ValueError if no figure is that wide."""
+    if columns not in WIDTHS:
+        raise ValueError(f"a figure is 1 or 2 columns wide, got {columns}")
+    return columns
+
+
+def check_formats(formats: Iterable[str]) -> list[str]:
+    """Return formats, each once, or raise ValueError for one in which no figure is written."""
+    for each in formats:
+        if each not in FORMATS:
+            raise ValueError(
+                f"figures are written as {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {each!r}"
+            )
+    return list(dict.fromkeys(formats))
+
+
+def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """Draw with the sizes of print, whatever matplotlib has been told elsewhere."""
+
+    @wraps(draw)
+    def draw_in_print(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
+        from matplotlib import rc_context
+
+        size = FONT_SIZES[check_columns(columns)]
+        settings: Any = {
+            "font.family": "sans-serif",
+            "font.size": size,
+            "axes.labelsize": size,
+            "axes.titlesize": size,
+            "figure.titlesize": size,
+            "legend.fontsize": size - 0.5,
+            "xtick.labelsize": size - 0.5,
+            "ytick.labelsize": size - 0.5,
+            "axes.linewidth": 0.6,
+            "xtick.major.width": 0.6,
+            "ytick.major.width": 0.6,
+        }
+        with rc_context(settings):
+            return draw(*arguments, columns=columns, **keywords)
+
+    return draw_in_print
+
+
+def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = None) -> Any:
+    """Return an empty figure and its axes, one above the other, each of a height in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if height is None:
+        height = {1: 2.0, 2: 2.5}[columns] if rows < 4 else 1.7
+    figure = Figure(figsize=(WIDTHS[columns], height * rows + 0.35), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
+
+
+def figure_with_pairs(rows: int, columns: int = 2) -> Any:
+    """Return an empty figure and its axes, two beside each other in every row, ``(rows, 2)``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTHS[columns], {1: 1.6, 2: 2.3}[columns] * rows + 0.35), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, 2, squeeze=False)
+
+
+def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
+    """Return the figure with its title, and a legend, of the first axes or of handles: beside it where there is room,
+    else below.
+    """
+    width = figure.get_figwidth()
+    size = FONT_SIZES[1 if width < 5.0 else 2]
+    # Letters are half as wide as they are high, and a little.
+    letters = int(72.0 * width / (0.55 * size))
+    wrapped = "\n".join(line for part in title.split("\n") for line in textwrap.wrap(part, letters))
+    figure.suptitle(wrapped, x=0.01, ha="left")
+    figure.set_figheight(figure.get_figheight() + 1.2 * size * wrapped.count("\n") / 72.0)
+    if handles is None:
+        handles = figure.axes[0].get_legend_handles_labels()[0]
+    if handles:
+        labels = [handle.get_label() for handle in handles]
+        longest = max(map(len, labels))
+        if width >= 5.0:
+            figure.legend(handles, labels, loc="outside right upper", frameon=False)
+        else:
+            # A sample of the line, and half a letter's height for each letter.
+            columns = max(1, min(len(labels), int(72.0 * width / (0.52 * size * longest + 32.0))))
+            rows = -(-len(labels) // columns)
+            figure.set_figheight(figure.get_figheight() + (1.45 * size * rows + 6.0) / 72.0)
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    return figure
+
+
+def logarithmic(axis: Any) -> None:
+    """Label a logarithmic axis, whose limits are set, with plain numbers: decades; 2 and 5 too within three, 3 within
+    one; round ones, a few, within less than half of one.
+    """
+    from matplotlib.ticker import MaxNLocator, NullLocator
+
+    low, high = axis.get_view_interval()
+    axis.set_major_formatter("{x:g}")
+    if high <= 4.0 * low:
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_minor_locator(NullLocator())
+        return
+    digits = "235" if high <= 10.0 * low else "25" if high <= 1e3 * low else ""
+    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
+
+
+def sensible_limits(
+    lines: Sequence[numpy.ndarray],
+    always: Sequence[numpy.ndarray] = (),
+    bounds: Sequence[numpy.ndarray] = (),
+) -> tuple[float, float]:
+    """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
+
+    A line takes the room from its 5th percentile, so that it need not begin at zero, to its largest value, but not more
+    than a factor of six above what half of the lines take.
+
+    Args:
+        lines: positive; NaN where there is none.
+        always: lines that are shown whatever they are.
+        bounds: lines that may be far below what anybody reaches: they take a factor of six below the others at most.
+    """
+    ends = numpy.array([numpy.percentile(own, [5.0, 100.0]) for line in lines if len(own := positive(line))])
+    if not len(ends):
+        return 0.1, 10.0
+    low, high = ends[:, 0].min(), min(ends[:, 1].max(), numpy.median(ends[:, 1]) * 6.0)
+    for line in always:
+        if len(own := positive(line)):
+            low, high = min(low, numpy.percentile(own, 5.0)), max(high, own.max())
+    for line in bounds:
+        if len(own := positive(line)):
+            low, high = min(low, max(numpy.percentile(own, 5.0), low / 6.0)), max(high, own.min())
+    margin = max((high / low) ** 0.06, 1.02)
+    return float(low / margin), float(high * margin)
+
+
+def positive(values: numpy.ndarray) -> numpy.ndarray:
+    """Return the values that a logarithmic axis can show."""
+    found: numpy.ndarray = values[numpy.isfinite(values) & (values > 0.0)]
+    return found
+
+
+def _spread(wanted: Sequence[float], gap: float) -> list[float]:
+    """Places as near to the wanted ones as a gap between them allows, within 0 and 1."""
+    order = numpy.argsort(wanted, kind="stable")
+    places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
+    for _ in range(200):
+        close = numpy.diff(places) < gap - 1e-9
+        if not close.any():
+            break
+        for i in numpy.flatnonzero(close):
+            middle = 0.5 * (places[i] + places[i + 1])
+            places[i], places[i + 1] = middle - 0.5 * gap, middle + 0.5 * gap
+        places = numpy.clip(
+            places, gap * numpy.arange(len(places)), 1.0 - gap * numpy.arange(len(places))[::-1]
+        )
+    found = numpy.empty(len(places))
+    found[order] = places
+    return found.tolist()
+
+
+def direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float, Any]], rows: int) -> None:
+    """Name lines at their right end.
+
+    Args:
+        figure: that the axes are in.
+        axis: whose limits and scales are set.
+        ends: label -> where its line ends, and its colour.
+        rows: axes above each other in the figure.
+    """
+    size = FONT_SIZES[1 if figure.get_figwidth() < 5.0 else 2] - 0.5
+    height = 72.0 * (figure.get_figheight() - 0.7) / rows * 0.85  # of the axes, points; about
+    to_fraction = axis.transData + axis.transAxes.inverted()
+    wanted = [float(to_fraction.transform(end[:2])[1]) for end in ends.values()]
+    for (label, (_, _, colour)), at, place in zip(
+        ends.items(), wanted, _spread(wanted, 1.15 * size / height), strict=True
+    ):
+        start = min(max(at, 0.0), 1.0)
+        axis.plot(
+            [1.0, 1.012, 1.02],
+            [start, place, place],
+            transform=axis.transAxes,
+            color=colour,
+            lw=0.5,
+            clip_on=False,
+        )
+        axis.text(1.026, place, label, transform=axis.transAxes, va="center", color=colour, fontsize=size)
+
+
+def room_for_labels(labels: Iterable[str], columns: int) -> bool:
+    """Whether names beside the axes leave most of the width to them, and the lowest axes are high enough for them."""
+    labels = list(labels)
+    width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
+    return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
+
+
+def wrap_label(label: str, columns: int) -> str:
+    """Break the name of an ordinate that is longer than a low panel is high."""
+    return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
+
+
+def save(figure: Any, path: Path) -> None:
+    """Save a figure as its suffix says, whole or not at all: ``.png``; ``.svg``, whose text stays text; ``.pdf``, which
+    holds the fonts it takes. The same figure gives the same file.
+
+    Raises:
+        ValueError: for another suffix, or if it cannot be written.
+    """
+    from matplotlib import rc_context
+
+    written = path.suffix.removeprefix(".").lower()
+    check_formats([written])
+    # Without the time of writing.
+    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(written)
+    # Type 42: TrueType as it is, which journals take; Type 3, the default, many refuse.
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "filtergym", "pdf.fonttype": 42}
+    with whole_file(path) as partial, rc_context(settings):
+        figure.savefig(partial, format=written, dpi=DOTS_PER_INCH, metadata=metadata)

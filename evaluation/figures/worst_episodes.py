@@ -1,0 +1,215 @@
+"""The episodes that cost a competitor most, run once more to be looked at: an episode is fixed by its seed."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ..running.evaluate import Experiment, Plan, plan_of, run_piece
+from ..running.metrics import mean_cost
+from ..statistics.bootstrap import ratio
+from ..statistics.cause_split import COST, COUNT, EVERYTHING, VARIABLE, cause_sums, held_causes, reason_weight
+from .looks import COLOURS
+from .print_layout import add_title, figure_with_pairs, in_print
+
+MOST_WORST = 3
+"""Episodes that are looked at."""
+MOST_CAUSES = 2
+LEAST_WEIGHT = 0.1
+"""Main causes of an episode, and what each of them weighs at least."""
+
+
+class WorstEpisode(NamedTuple):
+    """An episode that costs a competitor much."""
+
+    number: int
+    """Among those of the evaluation."""
+    seed: str
+    """With which ``env.reset`` and ``filtergym animate`` show it."""
+    cost: float
+    """Mean over its measurements."""
+    opponent_cost: float
+    """That of whom the competitor is compared with; NaN where there is nobody."""
+    causes: list[str]
+    """The main ones, see :func:`main_causes`."""
+
+
+def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
+    """Return the numbers of the dearest episodes, the worst first.
+
+    Args:
+        costs: mean cost of every episode; one that is NaN is left out.
+        most: how many at most.
+    """
+    order = numpy.argsort(-costs, kind="stable")
+    return [int(i) for i in order[:most] if not numpy.isnan(costs[i])]
+
+
+def run_episodes(
+    experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
+) -> xarray.Dataset:
+    """Run some episodes of an experiment once more, and keep what a picture of each shows.
+
+    Args:
+        experiment: of which they are.
+        competitors: by name, as of :func:`.evaluate.run_experiment`.
+        numbers: of the episodes.
+
+    Returns:
+        An evaluation of these episodes, in their order, as of :func:`.evaluate.run_experiment`.
+    """
+    drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
+    plan = _with_episodes(plan_of(drawn, competitors), numbers)
+    kept = {name: run_piece(plan.piece(name, 0, len(numbers), True), _unheard) for name in competitors}
+    return plan.dataset(kept, plan.seeds)
+
+
+def _unheard(measurements: int) -> None:
+    """Tell nobody of the progress: these are few."""
+
+
+def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:
+    flown, lengths = (None if each is None else each[numbers] for each in (plan.flown, plan.lengths))
+    return plan._replace(seeds=[plan.seeds[i] for i in numbers], flown=flown, lengths=lengths)
+
+
+def describe_worst(
+    dataset: xarray.Dataset, numbers: list[int], name: str, opponent: str = ""
+) -> list[WorstEpisode]:
+    """Say of each of some episodes what it costs, whom, and by what cause.
+
+    Args:
+        dataset: of :func:`run_episodes`.
+        numbers: of its episodes.
+        name: of the competitor.
+        opponent: with whom it is compared; empty: nobody.
+    """
+    own = mean_cost(dataset, name)
+    other = mean_cost(dataset, opponent) if opponent else numpy.full(len(numbers), numpy.nan)
+    causes = main_causes(dataset.sel(policy=name))
+    seeds = dataset["episode_seed"].values.tolist()
+    return [
+        WorstEpisode(number, str(seeds[i]), float(own[i]), float(other[i]), causes[i])
+        for i, number in enumerate(numbers)
+    ]
+
+
+def main_causes(run: xarray.Dataset) -> list[list[str]]:
+    """Return the main causes of each episode, by :func:`.cause_split.reason_weight`, the heaviest first.
+
+    Args:
+        run: one competitor's part of an evaluation.
+
+    Returns:
+        At most ``MOST_CAUSES`` for each; none where no cause weighs ``LEAST_WEIGHT``.
+    """
+    if VARIABLE not in run:
+        return [[] for _ in range(run.sizes["episode"])]
+    names = [name for name, _ in held_causes(run)]
+    sums = cause_sums(run, None)
+    weights = reason_weight(_share_of_all(sums[..., COST]), _share_of_all(sums[..., COUNT]))
+    weights[:, names.index(EVERYTHING)] = 0.0
+    return [
+        [names[k] for k in numpy.argsort(-own, kind="stable")[:MOST_CAUSES] if own[k] >= LEAST_WEIGHT]
+        for own in weights
+    ]
+
+
+def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
+    """Share that each cause has of the whole, ``(episodes, causes)``; zero where the whole is zero."""
+    whole = numpy.broadcast_to(sums[:, :1], sums.shape)
+    return numpy.nan_to_num(ratio(numpy.stack([sums, whole], axis=1)))
+
+
+# --- in print
+
+
+@in_print
+def draw_worst(
+    tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2
+) -> Any:
+    """Draw episodes below each other: where the target was and was believed to be, and how large the error was.
+
+    Args:
+        tracks: of each, with ``truth``, ``seen`` where anything is, ``estimate`` and ``sigma`` over policy, component
+            and time; the attribute ``plane`` says whether the first two components are the axes of a plane.
+        titles: of each, above its first axes and above its second.
+        name: of the competitor whose they are; it is drawn first.
+        columns: of a paper, as wide as which the figure is.
+    """
+    from matplotlib.lines import Line2D
+
+    figure, axes = figure_with_pairs(len(tracks), columns)
+    others = list(dict.fromkeys(str(n) for track in tracks for n in track["policy"].values if n != name))
+    colours = dict(zip([name, *others], COLOURS, strict=False))
+    for pair, track, title in zip(axes, tracks, titles, strict=True):
+        for axis, words in zip(pair, title, strict=True):
+            lines = (textwrap.fill(line, {1: 20, 2: 48}[columns]) for line in words.split("\n"))
+            axis.set_title("\n".join(lines), loc="left")
+        _draw_positions(pair[0], track, colours, name)
+        _draw_errors(pair[1], track, colours)
+    handles = [
+        Line2D([], [], color="0.75", linewidth=3.0, label="truth"),
+        Line2D([], [], color="0.5", linestyle="", marker="+", markersize=3.0, label="measured"),
+        *(Line2D([], [], color=colour, linewidth=1.0, label=one) for one, colour in colours.items()),
+        Line2D([], [], color="0.3", linewidth=0.7, linestyle=":", label="two reported sigma"),
+    ]
+    add_title(figure, f"Worst episodes of {name}", [])
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns == 1 else 5, frameon=False)
+    return figure
+
+
+def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str], name: str) -> None:
+    """Truth, readings and estimates in the plane, or of the first component over time."""
+    plane = bool(track.attrs["plane"])
+    clock = track["elapsed" if "elapsed" in track.coords else "time"].values
+
+    def line(values: xarray.DataArray) -> tuple[numpy.ndarray, numpy.ndarray]:
+        first, second = (values.isel(component=i).values for i in (0, min(1, values.sizes["component"] - 1)))
+        return (first, second) if plane else (clock, first)
+
+    own = track.sel(policy=name)
+    if "truth" in track:
+        axis.plot(*line(own["truth"]), color="0.75", linewidth=3.0)
+    if "seen" in track:
+        axis.plot(
+            *line(own["seen"]), color="0.5", linestyle="", marker="+", markersize=2.5, markeredgewidth=0.5
+        )
+    for one in reversed([str(n) for n in track["policy"].values]):
+        axis.plot(*line(track["estimate"].sel(policy=one)), color=colours[one], linewidth=1.0)
+    labels = [
+        f"{component.replace('_', ' ')}, {unit}"
+        for component, unit in zip(
+            track["component"].values.tolist(), track["unit"].values.tolist(), strict=True
+        )
+    ]
+    axis.set_xlabel(labels[0] if plane else _clock_label(track))
+    axis.set_ylabel(labels[1] if plane else labels[0])
+    if plane:
+        axis.set_aspect("equal", adjustable="datalim")
+    axis.grid(alpha=0.25, lw=0.4)
+
+
+def _draw_errors(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]) -> None:
+    """Size of the error in the plane, or of the first component, with two of its own sigmas."""
+    clock = track["elapsed" if "elapsed" in track.coords else "time"].values
+    drawn = track.isel(component=slice(2 if track.attrs["plane"] else 1))
+    for one in reversed([str(n) for n in track["policy"].values]):
+        own = drawn.sel(policy=one)
+        sigma = 2.0 * numpy.sqrt((own["sigma"].values ** 2).sum(axis=0))
+        if "truth" in track:
+            error = numpy.sqrt(((own["estimate"] - own["truth"]).values ** 2).sum(axis=0))
+            axis.plot(clock, error, color=colours[one], linewidth=1.0)
+        axis.plot(clock, sigma, color=colours[one], linewidth=0.7, linestyle=":")
+    unit = str(track["unit"].values[0])
+    axis.set_ylim(bottom=0.0)
+    axis.set_ylabel(f"error, {unit}")
+    axis.set_xlabel(_clock_label(track))
+    axis.grid(alpha=0.25, lw=0.4)
+
+
+def _clock_label(track: xarray.Dataset) -> str:
+    return "time, s" if "elapsed" in track.coords else "measurement"

@@ -1,0 +1,717 @@
+"""Monte Carlo evaluation: every policy, estimator, smoother, reference and bound on identical noise.
+
+The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cloudpickle
+import gymnasium
+import numpy
+
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.parameters import check_integer
+from ...envs.contract.task import Scenario, Task
+from ...envs.data.recording import Recording
+from ...envs.engine.backend import make_model
+from ...envs.engine.catalogue import importable_name, nearest, task_class
+from ...envs.engine.compiled import Report
+from ...envs.engine.episode_noise import uniforms_of_seeds
+from ...envs.engine.reward import charge
+from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
+from ...filters.gaussian import log_density
+from ..competitors.kinds import TOLD_MORE, Kind, kind_of
+from ..competitors.smoothers import check_open_loop
+from ..statistics.bootstrap import block_of
+from ..statistics.cause_split import VARIABLE, cause_coords
+from ..statistics.innovations import with_innovations
+from ..storage.dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
+from .parallel import Workers, check_workers
+from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
+from .seeds import episode_seeds
+from .threads import one_thread
+from .times import with_times
+
+if TYPE_CHECKING:
+    import xarray
+
+LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
+"""Names of blocks of an observation that show the action before."""
+DRAWN_PREFIX = "drawn_"
+"""Begins the names of what is kept of the first episodes only."""
+
+
+def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+    """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
+
+    Args:
+        maker: of the competitor, or the competitor itself.
+        kind: what it is.
+        control: that is demanded; None demands none.
+        cls: the environment.
+        name: of the competitor, in errors.
+
+    Raises:
+        ValueError: if the competitor cannot act in the control that is demanded, or in none.
+    """
+    if kind != "policy":
+        return cls.controls[0]
+    own = getattr(maker, "control", None)
+    space = getattr(maker, "action_space", None)
+    if own is None and space is not None:
+        models = [make_model(cls, c) for c in cls.controls]
+        acting = [model for model in models if model.action_space == space]
+        if not acting:
+            raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
+        # Controls may share an action space; what they show then tells them apart.
+        shown = getattr(getattr(maker, "observation_space", None), "shape", None)
+        fitting = [t.control for t in acting if (len(t.fields),) == shown] or [t.control for t in acting]
+        own = control if control in fitting else fitting[0]
+    if own is None:
+        return control or cls.controls[0]
+    if control is not None and own != control:
+        raise ValueError(f"policy {name!r} is made for control {own!r}, not {control!r}")
+    return own
+
+
+def check_observation(model: Model, policy: Any, name: str) -> None:
+    """Raise ValueError if a model takes observations of another shape than the task shows, or privileged ones."""
+    space = getattr(policy, "observation_space", None)
+    if isinstance(space, gymnasium.spaces.Dict):
+        raise ValueError(
+            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation shows: let its "
+            "actor answer observations alone, in an object with a method predict"
+        )
+    shown = getattr(space, "shape", None)
+    if shown is not None and shown != (len(model.fields),):
+        raise ValueError(
+            f"policy {name!r} expects observations of shape {shown}, but control {model.control!r} shows "
+            f"{len(model.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
+            "of its run, which does"
+        )
+
+
+def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept of every measurement, arrays ``(..., N)``."""
+    error = model.error(episode)
+    return {
+        "error": error,
+        "cost": model.cost(episode),
+        "charge": charge(model, episode),
+        "causes": model.causes(episode),
+        **_normalised_error(model, error, model.covariance(episode)),
+        **model.records(episode),
+    }
+
+
+def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
+    """Normalised squared error of the components whose truth is known, with their marginal covariance.
+
+    Args:
+        model: task with a filter.
+        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known.
+        covariance: reported for it, ``(C, C, N)``.
+
+    Returns:
+        ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
+        known, ``nees_degrees``.
+    """
+    if model.task.has_whole_truth:
+        return {"nees": log_density(error, covariance)[1]}
+    xp = model.task.xp
+    known = error == error  # no number differs from itself
+    # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
+    pairs = known[:, None] & known[None]
+    apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]
+    squared = log_density(xp.where(known, error, 0.0), xp.where(pairs, covariance, apart))[1]
+    degrees = xp.sum(xp.where(known, 1.0, 0.0), axis=0)
+    return {"nees": xp.where(degrees > 0.0, squared, math.nan), "nees_degrees": degrees}
+
+
+def _expectation_report(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept where the truth is not known."""
+    return model.records(episode)
+
+
+def _expectation_and_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_expectation_report(model, episode), **model.track(episode)}
+
+
+def _measurement_and_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_measurement_report(model, episode), **model.track(episode)}
+
+
+def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept of every measurement, and what is kept of the first episodes only."""
+    kept = (
+        _measurement_report(model, episode) if model.task.has_truth else _expectation_report(model, episode)
+    )
+    return {
+        **kept,
+        **{f"{DRAWN_PREFIX}{name}": values for name, values in model.picture_track(episode).items()},
+    }
+
+
+def _track_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_measurement_and_drawing(model, episode), **model.track(episode)}
+
+
+def _limits(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept of a bound."""
+    return model.filter.records(episode.filter, episode.measurement)
+
+
+def _report(model: Model, tracks: bool) -> Report:
+    """What is kept of every measurement of a task."""
+    if model.task.has_truth:
+        return _measurement_and_track if tracks else _measurement_report
+    return _expectation_and_track if tracks else _expectation_report
+
+
+OPTIONS = (
+    "scenario", "episodes", "seed", "split", "control", "tracks", "drawn_episodes", "backend", "threads", "strict",
+    "timed",
+)  # fmt: skip
+"""Fields of an experiment that a user names side by side with parameters of the task."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Over which episodes of which environment competitors are run, and how.
+
+    Plain data for any process; the environment goes to another process by its name.
+    """
+
+    task: type[Task]
+    """Class of the environment's task."""
+    scenario: Any = None
+    """Name of a scenario, a trajectory, a set of flights, or a recording; None: the training distribution."""
+    episodes: int = 500
+    """Monte Carlo runs M. Every flight of a set gets as many, so they may be rounded up. Of a recording every episode
+    is replayed once, whatever is asked for."""
+    seed: int = 0
+    """Number of the experiment."""
+    split: str = "test"
+    """One of "test", "validation" and "train", which share no episode."""
+    control: str | None = None
+    """Demand this control; None: every policy runs in its own."""
+    tracks: bool = False
+    """Keep what a track is drawn from, see :meth:`.Task.track`; it takes memory."""
+    drawn_episodes: int = 0
+    """Of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate`` and so on over
+    policy, drawn_episode and time."""
+    paper: str = ""
+    """Name of the paper's algorithm, whose score is 0; kept in the attributes of the evaluation."""
+    reference: str = ""
+    """Name of the competitor whose score is 1; kept likewise."""
+    backend: str = "auto"
+    """What computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
+    threads: int = 1
+    """How many share the episodes, of the compiled backend."""
+    strict: bool = False
+    """Raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`."""
+    timed: bool = False
+    """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: of all that is
+    kept the one thing that differs from run to run."""
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters of the task."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        others = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "task"}
+        return _experiment_on, (importable_name(self.task), others)
+
+    def make_task(self) -> Task:
+        """Make the task, with its scenario and the parameters."""
+        return make_task(self.task, self.scenario, **self.keywords)
+
+    def make_model(self, maker: Any, control: str) -> Model:
+        """Make the model that a competitor acts in; the experiment's keywords win over those tuned with it."""
+        keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
+        return make_model(
+            self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords
+        )
+
+
+def _experiment_on(name: str, others: Mapping[str, Any]) -> Experiment:
+    """Return the experiment that another process has sent, on the environment of this name."""
+    return Experiment(task_class(name), **others)
+
+
+@one_thread()
+def run_experiment(
+    experiment: Experiment,
+    competitors: Mapping[str, Any],
+    progress: Progress | None = None,
+    workers: Workers | None = None,
+) -> "xarray.Dataset":
+    """Run policies, estimators, references and bounds over the same episodes.
+
+    Args:
+        experiment: which episodes, and how.
+        competitors: by the name that stands in the tables: each a class or function that makes it,
+            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother
+            with ``smooth``, too.
+        progress: called with the number of measurements done, now and then.
+        workers: who runs competitors and chunks of episodes; default: this process, one after the other.
+
+    Returns:
+        Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
+        truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
+        ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
+        action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
+        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component,
+        ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
+        number), ``nanoseconds`` and ``compiled`` of every policy where the experiment is timed, ``window_first`` and
+        ``window_last`` of every window, and ``elapsed``, seconds since the start of the track, where measurements come
+        regularly. Of a set of flights ``flight`` and ``length`` say which each episode
+        flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
+        recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
+        ``error``, ``cost``, ``charge`` nor ``nees``, and where some of it is not known, errors of that are NaN,
+        ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
+        ``to_netcdf`` saves it; :mod:`.evaluation.storage.dataset` reads windows, groups and keywords out of it.
+
+    Raises:
+        ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
+            the control.
+    """
+    plan = plan_of(experiment, competitors)
+    workers = check_workers(workers)
+    block = block_of(next(iter(plan.models.values())).task.horizon)
+    pieces = [
+        plan.piece(name, first, block, workers.alone)
+        for name in competitors
+        for first in range(0, len(plan.seeds), block)
+    ]
+    if not workers.alone:
+        check_sendable(experiment.task, competitors)
+    sizes = [piece.measurements for piece in pieces]
+    chunks = workers.results(run_piece, pieces, sizes, progress)
+    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
+    count = len(chunks) // len(competitors)
+    for i, name in enumerate(competitors):
+        per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
+        chunks[i * count : (i + 1) * count] = [None] * count
+    dataset = plan.dataset(per_policy, plan.seeds)
+    if experiment.timed:
+        return with_times(dataset, [plan.time(name) for name in competitors])
+    return dataset
+
+
+class Piece(NamedTuple):
+    """Some episodes of one competitor, as plain data for any process."""
+
+    experiment: Experiment
+    name: str
+    maker: Any
+    kind: Kind
+    control: str
+    seeds: list[int]
+    first: int
+    """Number of the first episode."""
+    horizon: int
+    model: Model | None
+    """That was made already, in this process."""
+
+    @property
+    def measurements(self) -> int:
+        """How many there are."""
+        return len(self.seeds) * self.horizon
+
+
+LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
+"""What few estimators and references say: how likely a measurement was."""
+
+
+def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
+    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``.
+
+    Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
+    """
+    experiment, kind = piece.experiment, piece.kind
+    model = piece.model or experiment.make_model(piece.maker, piece.control)
+    report, drawn = _limits if kind == "bound" else _report(model, experiment.tracks), None
+    if kind != "bound" and experiment.drawn_episodes > piece.first:
+        most = experiment.drawn_episodes - piece.first
+        drawn = More(
+            _track_and_drawing if experiment.tracks else _measurement_and_drawing, most, DRAWN_PREFIX
+        )
+    flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    arrays = dict(flown.found)
+    if kind == "policy":
+        _check_reserved(model, arrays)
+    if experiment.strict and "lost" in arrays:
+        _refuse_losses(piece, arrays["lost"])
+    if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+        arrays["action"] = _limit_actions(model.action_space, flown.action)
+    if kind in ("estimator", "smoother", "reference"):
+        for name in LIKELIHOOD:
+            if name in arrays and numpy.isnan(arrays[name]).all():
+                del arrays[name]
+    return arrays
+
+
+def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
+    """Return the actions that are applied, within the limits of their box, ``(episodes, time, A)``."""
+    bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
+    return bounded.reshape(*action.shape[:2], -1)
+
+
+def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
+    """Raise ValueError if a task records something under a name that the evaluation of a policy needs."""
+    for taken in {"action", "lost"} & found.keys():
+        raise ValueError(
+            f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
+            "which actions were applied or episodes lost: call it something else"
+        )
+
+
+def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
+    """Raise ValueError if an episode is lost, for the first measurement at which one is.
+
+    Args:
+        piece: of the competitor.
+        faults: numbers of the reasons, ``(episodes, time)``.
+    """
+    if faults.any():
+        step = int(numpy.argmax((faults > 0.0).any(axis=0)))
+        i = int(numpy.argmax(faults[:, step] > 0.0))
+        raise ValueError(
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + i} at measurement "
+            f"{step + 1}"
+        )
+
+
+def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
+    """Join what was kept of episodes; the chunks are emptied on the way, so that little is held twice."""
+    if len(chunks) == 1:
+        return chunks[0]
+    return {
+        key: numpy.concatenate([chunk.pop(key) for chunk in chunks if key in chunk])
+        for key in list(chunks[0])
+    }
+
+
+class Plan(NamedTuple):
+    """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
+
+    experiment: Experiment
+    """Its scenario opened."""
+    competitors: Mapping[str, Any]
+    kinds: dict[str, Kind]
+    controls: dict[str, str]
+    models: dict[str, Model]
+    scenario: Scenario
+    seeds: list[int]
+    flown: numpy.ndarray | None
+    """Number of the flight of each episode."""
+    lengths: numpy.ndarray | None
+
+    def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
+        """Return some episodes of a competitor as a piece of work, with its task if it is done here."""
+        model = self.models[name]
+        return Piece(
+            self.experiment,
+            name,
+            self.competitors[name],
+            self.kinds[name],
+            self.controls[name],
+            self.seeds[first : first + count],
+            first,
+            model.task.horizon,
+            model if here else None,
+        )
+
+    def time(self, name: str) -> ProcessorTime | None:
+        """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
+        return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
+
+    def dataset(
+        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
+    ) -> "xarray.Dataset":
+        """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
+        experiment = self.experiment
+        dataset = _dataset(per_policy, self, seeds)
+        if self.flown is not None and self.lengths is not None:
+            import xarray
+
+            beyond = dataset["time"].values <= self.lengths[:, None]
+            there = xarray.DataArray(beyond, dims=("episode", "time"))
+            of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
+            present = {
+                name: values.where(of_drawn if "drawn_episode" in values.dims else there)
+                for name, values in dataset.data_vars.items()
+            }
+            dataset = dataset.assign(present).assign_coords(
+                flight=("episode", [self.scenario.flights[i] for i in self.flown]),
+                length=("episode", self.lengths),
+            )
+            if self.scenario.recording is not None:
+                dataset = dataset.assign_coords(
+                    _recording_coords(self.scenario.recording, self.flown, dataset)
+                )
+                dataset = with_innovations(dataset, next(iter(self.models.values())).task)
+        return dataset.assign_attrs(
+            paper=experiment.paper,
+            reference=experiment.reference,
+            notes="\n".join(self.scenario.notes),
+            recorded=int(self.scenario.recording is not None),
+            truth=int(next(iter(self.models.values())).task.has_truth),
+        )
+
+
+def _recording_coords(
+    recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
+) -> dict[str, Any]:
+    """What the evaluation of a recording says of its log.
+
+    Args:
+        recording: that is replayed.
+        episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
+        dataset: the evaluation.
+
+    Returns:
+        Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
+        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth
+        of some is not known.
+    """
+    length = dataset.sizes["time"]
+    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time[episodes, :length])
+    if recording.truth is not None and not recording.truth_known.all():
+        coords["truth_known"] = ("component", recording.truth_known.astype(numpy.int32))
+    return coords
+
+
+def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
+    """Return the plan of an evaluation; refusals as of :func:`run_experiment`."""
+    cls = experiment.task
+    experiment = replace(
+        experiment,
+        scenario=read_files(cls, experiment.scenario),
+        drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
+    )
+    chosen = find_scenario(cls, experiment.scenario, experiment.keywords)
+    episodes, seed, split, control = (
+        experiment.episodes, experiment.seed, experiment.split, experiment.control
+    )  # fmt: skip
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
+    if not competitors:
+        raise ValueError("name at least one policy")
+    seeds = episode_seeds(split, seed, episodes)
+    kinds = {name: kind_of(maker) for name, maker in competitors.items()}
+    controls: dict[str, str] = {}
+    models: dict[str, Model] = {}
+    # Every task is made before any episode runs, so that a wrong keyword costs nothing.
+    for name, maker in competitors.items():
+        controls[name] = control_of(maker, kinds[name], control, cls, name)
+        models[name] = experiment.make_model(maker, controls[name])
+    for name, model in models.items():
+        check_observation(model, competitors[name], name)
+        if kinds[name] == "smoother":
+            check_open_loop(model, name)
+    first = next(iter(models.values()))
+    group_of_each(
+        [c.name for c in first.task.components], first.task.groups
+    )  # refused now, not when all is done
+    if chosen.recording is not None:
+        _check_truth_available(kinds, chosen.name)
+        episodes = len(first.task.flights)  # nothing is random: each once
+    flown, lengths = None, None
+    if first.task.flights:
+        seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
+    if chosen.recording is not None and flown is not None and lengths is not None:
+        order = numpy.argsort(flown)
+        seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
+    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
+
+
+def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
+    """Raise ValueError for what another process cannot be given, or would not find.
+
+    Args:
+        task: class of the environment's.
+        competitors: by their names.
+    """
+    if importable_name(task).startswith("__main__:"):
+        raise ValueError(
+            f"{task.id} is registered by the program that runs, which other processes do "
+            "not run: register it in a module of its own, or leave out jobs and cluster"
+        )
+    for name, maker in competitors.items():
+        try:
+            cloudpickle.dumps(maker)
+        except Exception as error:  # whatever an object raises when it is asked
+            raise ValueError(
+                f"{name!r} cannot be sent to another process ({error}): give its class, or leave out jobs and cluster"
+            ) from error
+
+
+def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
+    """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
+    for competitor, kind in kinds.items():
+        if kind in TOLD_MORE:
+            raise ValueError(
+                f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
+                "components: leave it out"
+            )
+
+
+def _flights_in_turn(
+    model: Model, split: str, seed: int, episodes: int
+) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
+    """Seeds, in their order, of which every flight gets as many as any other; the flight and length of each.
+
+    An episode stays what its seed makes it. Who wants fewer episodes than there are flights gets one of each.
+    """
+    count = len(model.task.flights)
+    share = -(-episodes // count)
+    found: list[int] = []
+    flown: list[int] = []
+    lengths: list[int] = []
+    missing = numpy.full(count, share)
+    first = 0
+    while missing.any():
+        candidates = episode_seeds(split, seed, share * count, first)
+        uniforms = uniforms_of_seeds(candidates, model.task.noise)
+        drawn = zip(candidates, model.task.flight_of(uniforms), model.task.lengths(uniforms), strict=True)
+        for candidate, flight, length in drawn:
+            if missing[flight]:
+                missing[flight] -= 1
+                found.append(candidate)
+                flown.append(int(flight))
+                lengths.append(int(length))
+        first += share * count
+    return found, numpy.array(flown), numpy.array(lengths)
+
+
+def _further_dimensions(key: str, count: int) -> list[str]:
+    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
+    if count < 0:
+        return []
+    key = key.removeprefix(DRAWN_PREFIX)
+    if key == "covariance":
+        return ["component", "other_component"]
+    if key in ("error", "mean_square", "truth", "estimate", "seen"):
+        return ["component"]
+    if key.startswith("measurement_"):
+        return [f"{key}_axis{i}" for i in range(count + 1)]
+    return ["mode" if "mode" in key else key]
+
+
+def action_names(model: Model, count: int) -> tuple[str, ...]:
+    """Names of the components of a box of actions.
+
+    As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
+    for each; else the control, with numbers from 1 on where there are several.
+    """
+    shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
+    for names in (*shown, model.task.modes):
+        # A number alone says less than the hypothesis's name.
+        if len(names) == count and not any(str(name).isdigit() for name in names):
+            return tuple(str(name).replace("-", "_") for name in names)
+    return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
+
+
+def _actions_named(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
+    controls: Mapping[str, str],
+    models: Mapping[str, Model],
+) -> dict[str, tuple[str, ...]]:
+    """Names of the actions of every policy that has any; of their control too, where they steer by several."""
+    acting = [name for name, series in per_policy.items() if "action" in series]
+    several = len({controls[name] for name in acting}) > 1
+    found = {name: action_names(models[name], per_policy[name]["action"].shape[-1]) for name in acting}
+    if several:
+        return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
+    return found
+
+
+def _actions_aligned(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]], actions: Mapping[str, tuple[str, ...]]
+) -> numpy.ndarray:
+    """Actions side by side, ``(policy, episode, time, name)``; NaN where a policy does not steer by that."""
+    every = list(dict.fromkeys(sum(actions.values(), ())))
+    episodes, length = per_policy[next(iter(actions))]["action"].shape[:2]
+    aligned = numpy.full((len(per_policy), episodes, length, len(every)), numpy.nan)
+    for i, (name, series) in enumerate(per_policy.items()):
+        if name in actions:
+            aligned[i][..., [every.index(part) for part in actions[name]]] = series["action"]
+    return aligned
+
+
+def _dataset(
+    per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
+) -> "xarray.Dataset":
+    import xarray
+
+    kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
+    model = next(iter(models.values()))
+    names = list(per_policy)
+    components = [c.name for c in model.task.components]
+    times = numpy.arange(1, model.task.horizon + 1)
+    variables: dict[str, Any] = {}
+    actions = _actions_named(per_policy, controls, models)
+    for key in sorted({key for series in per_policy.values() for key in series}):
+        if key == "action":
+            variables[key] = (
+                ["policy", "episode", "time", "action_name"],
+                _actions_aligned(per_policy, actions),
+            )
+            continue
+        example = next(series[key] for series in per_policy.values() if key in series)
+        stacked = numpy.empty((len(names), *example.shape))
+        for i, name in enumerate(names):
+            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
+        dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
+        dims += _further_dimensions(key, example.ndim - 3)
+        variables[key] = (dims, stacked)
+    dataset = xarray.Dataset(
+        variables,
+        coords={
+            "policy": names,
+            "kind": ("policy", [kinds[n] for n in names]),
+            "control": ("policy", [controls[n] for n in names]),
+            "episode": numpy.arange(len(seeds)),
+            "episode_seed": ("episode", [str(seed) for seed in seeds]),
+            "time": times,
+            "component": components,
+            "unit": ("component", [c.unit for c in model.task.components]),
+            "group": ("component", group_of_each(components, model.task.groups)),
+        },
+        attrs={
+            "environment": model.task.id,
+            "scenario": scenario.name,
+            "keywords": keywords_as_text(plan.experiment.keywords),
+            "split": plan.experiment.split,
+            "seed": whole_number(plan.experiment.seed),
+            "cost": model.task.cost_description,
+        },
+    )
+    if model.task.interval is not None:
+        elapsed = (
+            "time",
+            model.task.interval * times,
+            {"units": "s", "long_name": "since the start of the track"},
+        )
+        dataset = dataset.assign_coords(elapsed=elapsed)
+    windows = {
+        name: (first, min(last, model.task.horizon))
+        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
+        if first <= model.task.horizon
+    }
+    dataset = with_windows(dataset, windows)
+    if "mode_probability" in dataset:
+        dataset = dataset.assign_coords(mode=list(model.task.modes))
+    if VARIABLE in dataset:
+        causes = model.task.causes
+        dataset = dataset.assign_coords(
+            cause_coords([c.name for c in causes], [c.phrase for c in causes], model.task.start_measurements)
+        )
+    if actions:
+        dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
+    return dataset

@@ -1,0 +1,528 @@
+"""From an evaluation to numbers: tidy records, every one derived from the dataset and nothing else.
+
+A record is one number with its 95 % bootstrap interval over episodes, or over flights where episodes fly several.
+Differences and ratios are paired: numerator and denominator are resampled together.
+"""
+
+import functools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ..competitors.kinds import RANKED
+from ..statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
+from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
+from ..statistics.cause_split import VARIABLE as CAUSES
+from ..statistics.predictions import correlation, stretch_interval
+from ..statistics.statistic import ALL, Function, Key, Statistic, identity, reduce_run
+from ..storage.dataset import (
+    Losses,
+    count_losses,
+    groups_of,
+    losses_in,
+    seed_of,
+    slices_of,
+    windows_of,
+    with_windows,
+)
+from .threads import one_thread
+from .times import COMPILED, IN_PYTHON, METRIC, time_of
+
+if TYPE_CHECKING:
+    import xarray
+
+    from .own_metrics import OwnMetrics
+
+NOTHING = Estimate(math.nan, math.nan, math.nan)
+
+
+class Record(NamedTuple):
+    """One number of one policy in one window."""
+
+    environment: str
+    control: str
+    scenario: str
+    policy: str
+    kind: str
+    """"policy", "estimator", "smoother", "reference" or "bound"."""
+    metric: str
+    component: str
+    window: str
+    value: float | None
+    low: float | None
+    """Lower end of the 95 % interval; None where there is none."""
+    high: float | None
+    unit: str
+    episodes: int
+    seed: int
+    split: str
+
+
+class Measure(NamedTuple):
+    """A record before it is told whose it is; what an environment's own metrics return."""
+
+    metric: str
+    component: str
+    window: str
+    estimate: Estimate
+    unit: str
+
+
+def squared_errors(
+    run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
+) -> numpy.ndarray:
+    """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
+    parts = list(groups.get(component, (component,)))
+    if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
+        return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
+    return (run["error"].sel(component=parts) ** 2).sum("component", skipna=False).values
+
+
+def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
+    """Components and groups of components whose truth is known, with their units."""
+    units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
+    if "truth_known" in dataset.coords:
+        known = dataset["truth_known"].values > 0
+        units = {name: unit for (name, unit), judged in zip(units.items(), known, strict=True) if judged}
+    groups = groups_of(dataset).items()
+    return units | {name: units[parts[0]] for name, parts in groups if {*parts} <= {*units}}
+
+
+def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
+    """Sum of every episode over the times, and how many there are, of which :func:`.bootstrap.ratio` is the mean.
+
+    Args:
+        values: ``(episodes, time)``; NaN stands for no measurement, or no event.
+
+    Returns:
+        ``(episodes, 2)``.
+    """
+    present = ~numpy.isnan(values)
+    return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
+
+
+def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
+    """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
+    clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
+    return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
+
+
+def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
+    """Mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
+
+    Args:
+        run: that the values are of.
+        values: ``(episodes, time)``; NaN beyond the end of a flight, or of a window that it does not reach.
+    """
+    if "flight" not in run.coords:
+        return values.mean(axis=1)
+    return ratio(sums_of_present(values))
+
+
+def _peak(means: numpy.ndarray) -> numpy.ndarray:
+    """Largest root over time."""
+    found: numpy.ndarray = numpy.fmax.reduce(numpy.sqrt(means), axis=1)
+    return found
+
+
+def record_statistics(
+    run: "xarray.Dataset", episodes: int, metrics: "OwnMetrics | None" = None
+) -> Iterator[Statistic]:
+    """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
+
+    Args:
+        run: some episodes of one competitor.
+        episodes: of the whole evaluation.
+        metrics: the environment's own.
+    """
+    groups, slices = groups_of(run), slices_of(run)
+    is_bound = str(run["kind"].values) == "bound"
+    judged = run.attrs.get("truth", True)
+
+    def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
+        """Mean over every window."""
+        for window, times in slices.items():
+            mean = mean_over_time(run, values[:, times])
+            yield Statistic(("record", metric, component, window, unit), mean, function)
+
+    for component, unit in components_and_groups(run).items() if judged else ():
+        squares = squared_errors(run, component, groups)
+        yield from means("rmse", component, unit, squares, numpy.sqrt)
+        yield Statistic(("record", "peak_rmse", component, "all", unit), squares, _peak)
+        if not is_bound and component not in groups:
+            yield from means("mean_error", component, unit, run["error"].sel(component=component).values)
+    for metric in consistency_metrics(run):
+        yield from _consistency(run, metric, episodes)
+    if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
+        for mode in run["mode"].values.tolist():
+            yield from means(
+                "mean_mode_probability", mode, "1", run["mode_probability"].sel(mode=mode).values
+            )
+    says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
+    if says or not judged:  # there is nothing else of an estimator of one's own then
+        shape = (run.sizes["episode"], run.sizes["time"])
+        log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+        for window, times in slices.items():
+            yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood[:, times])
+    if not is_bound and judged:
+        yield from means("cost", "", "1", run["cost"].values)
+        charge = run["charge"].values
+        total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
+        yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
+    if CAUSES in run and not is_bound and judged:
+        nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
+        yield Statistic(("causes",), cause_sums(run, nees))
+    if "cost" in run and not is_bound:
+        yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+    if "lost" in run and not numpy.isnan(run["lost"].values).all():
+        losses = losses_in(run)
+        share = (losses[:, 1] > 0.0).astype(float)
+        yield Statistic(("record", "lost_episodes", "", "all", "1"), share)
+        yield Statistic(("losses",), losses, count_losses, sample=ALL)
+    if metrics is not None:
+        yield from metrics.statistics(run)
+
+
+def _mean_of_present(metric: str, component: str, window: str, unit: str, values: numpy.ndarray) -> Statistic:
+    """Mean over episodes and times of what is there; a block of episodes may have nothing."""
+    return Statistic(
+        ("record", metric, component, window, unit), sums_of_present(values), ratio, optional=True
+    )
+
+
+def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
+    """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
+
+    The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
+    interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
+    """
+    component = "state" if metric == "nees" else "measurement"
+    normalised, degrees = _over_dimension(run, metric)
+    values = run[metric].values
+    there = ~numpy.isnan(normalised)
+    low, high = chi_square_band(degrees)
+    inside = numpy.where(there, (values >= low) & (values <= high), numpy.nan)
+    inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
+    for window, times in slices_of(run).items():
+        yield _mean_of_present(f"a{metric}", component, window, "1", normalised[:, times])
+        yield _mean_of_present(f"{metric}_inside", component, window, "1", inside[:, times])
+        if metric == "nis":
+            sums = numpy.stack([there[:, times].sum(axis=1), inverse[:, times].sum(axis=1)], axis=1)
+            key = ("record", "anis_band", component, window, "1")
+            yield Statistic(key, sums, functools.partial(_band, episodes=episodes), optional=True)
+
+
+def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
+    degrees = consistency_degrees(run, metric)
+    some = numpy.where(degrees > 0.0, degrees, 1.0)
+    return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
+
+
+def _band(means: numpy.ndarray, episodes: int) -> Estimate:
+    """Where the mean of that many chi-square numbers, each over its degrees of freedom, lies with 95 %.
+
+    The chi-square distribution of the same variance; the very one where all degrees are equal.
+
+    Args:
+        means: over episodes, of the count of numbers and of the sum of their inverse degrees, ``(1 + resamples, 2)``.
+        episodes: of which they are means.
+    """
+    count, inverse = episodes * means[0]
+    if count == 0.0:
+        return NOTHING
+    total = numpy.array([count**2 / inverse])
+    low, high = chi_square_band(total)
+    return Estimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
+
+
+def consistency_metrics(run: "xarray.Dataset") -> list[str]:
+    """Which of ``nees`` and ``nis`` there are; the latter needs its dimension beside it, ``nis_degrees``."""
+    present = ["nees"] * ("nees" in run) + ["nis"] * ("nis" in run and "nis_degrees" in run)
+    return [metric for metric in present if not numpy.isnan(run[metric].values).all()]
+
+
+def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
+    """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
+    if metric == "nees" and "nees_degrees" not in run:
+        return numpy.full(run["nees"].shape, float(run.sizes["component"]))
+    return numpy.nan_to_num(run[f"{metric}_degrees"].values)
+
+
+def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
+    """Quantile of the chi-square distribution.
+
+    Args:
+        probability: of smaller numbers.
+        degrees: of freedom, a number or an array of any shape, larger than zero.
+
+    Returns:
+        The quantile for each number of degrees, in the same shape.
+    """
+    from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
+
+    # Few different ones, and the quantile is dear.
+    different, which = numpy.unique(degrees, return_inverse=True)
+    quantiles: numpy.ndarray = 2.0 * gammaincinv(0.5 * different, probability)
+    return quantiles[which].reshape(numpy.shape(degrees))
+
+
+def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    low, high = (chi_square_quantile(p, runs * degrees) / runs for p in (0.025, 0.975))
+    return low, high
+
+
+def score(
+    cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
+) -> Estimate:
+    """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
+    room = paper - reference
+    # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
+    # worse it would praise what is worse still.
+    return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
+
+
+class Contender(NamedTuple):
+    """A competitor and all that its records are made of."""
+
+    name: str
+    kind: str
+    control: str
+    measures: list[Measure]
+    """Of itself alone."""
+    further: list[Measure]
+    """The environment's own."""
+    costs: numpy.ndarray | None
+    """Mean cost of every episode; None of bounds, and without truth."""
+    losses: Losses | None
+    causes: CauseCosts | None = None
+    """None of bounds, without truth, and of an evaluation that holds no causes."""
+
+
+def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
+    """Mean cost of every episode of one competitor, ``(episodes,)``."""
+    return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
+
+
+class _Against:
+    """Comparisons of every episode's cost with the paper's algorithm, the reference and the best."""
+
+    def __init__(
+        self, contenders: Sequence[Contender], paper: str, reference: str, bootstrap: Bootstrap
+    ) -> None:
+        self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
+        self.paper, self.reference, self.bootstrap = paper, reference, bootstrap
+        against = self.costs.get(paper)
+        self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
+        columns = [*self.costs.values(), *map(_wins, self.ratios.values())]
+        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else ()
+        self.means = dict(zip(self.costs, means, strict=False))
+        self.wins = dict(zip(self.ratios, means[len(self.costs) :], strict=True))
+        ranked = {c.name: c.costs.mean() for c in contenders if c.kind in RANKED and c.costs is not None}
+        self.ranked = list(ranked)
+        self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
+        # The first where none is a number, as of flights in which nobody was measured.
+        self.best = list(ranked)[int(numpy.argmin(list(ranked.values())))] if ranked else ""
+
+    def behind_best(self, name: str) -> Iterator[Measure]:
+        """Paired relative difference of the cost to the best one's."""
+        if name in self.ranked:
+            difference = self.bootstrap.relative_difference(self.means[name], self.means[self.best])
+            yield Measure("behind_best", self.best, "all", difference, "1")
+
+    def others(self, name: str) -> Iterator[Measure]:
+        """Score and paired difference to the paper's algorithm, where there is what they need."""
+        if name not in self.ratios:
+            return
+        bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
+        found = {
+            "cost_difference": bootstrap.interval(cost - paper),
+            "relative_cost_difference": bootstrap.relative_difference(cost, paper),
+            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
+            "win_rate": bootstrap.interval(self.wins[name]),
+        }
+        # A share of the room that a causal competitor has says nothing of one that uses later measurements.
+        if self.reference in self.costs and name not in self.smoothers:
+            found["score"] = score(cost, paper, self.means[self.reference], bootstrap)
+        for metric, estimate in found.items():
+            yield Measure(metric, "", "all", estimate, "1")
+
+
+def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
+    """What the innovations of one competitor come to: their size and whether they are white.
+
+    ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
+    correlation of successive ones, zero where they are white; of every group of what is measured.
+
+    Args:
+        run: one competitor's part of an evaluation.
+    """
+    if "prediction_error" not in run:
+        return
+    groups = run["measured_group"].values
+    for group in dict.fromkeys(groups.tolist()):
+        chosen = numpy.flatnonzero(groups == group)
+        innovation = numpy.moveaxis(run["prediction_error"].values[..., chosen], -1, 0)
+        squares = (innovation**2).sum(axis=0)
+        there = numpy.isfinite(squares)
+        if not there.any():
+            continue
+        values = numpy.stack([squares, numpy.ones_like(squares)], axis=-1)
+        size = stretch_interval(there, values, lambda means: numpy.sqrt(ratio(means)))
+        yield Measure("prediction_error", group, "all", size, str(run["measured_unit"].values[chosen[0]]))
+        yield Measure("innovation_correlation", group, "all", correlation(innovation, there), "1")
+
+
+def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
+    """One where an episode costs less than by the paper's algorithm, ``(episodes,)``."""
+    # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
+    draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
+    return numpy.where(draw, 0.5, ratio < 1.0)
+
+
+@one_thread()
+def flight_records(dataset: "xarray.Dataset") -> list[Record]:
+    """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
+
+    Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
+
+    Args:
+        dataset: from an evaluation of a set of flights.
+    """
+    records = []
+    for flight in sorted(set(dataset["flight"].values.tolist())):
+        part = dataset.isel(episode=numpy.flatnonzero(dataset["flight"].values == flight))
+        part = part.isel(time=slice(int(part["length"].max())))
+        windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
+        part = with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
+        records += [r for r in tidy_records(part) if r.metric in PER_FLIGHT]
+    return records
+
+
+PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
+"""Metrics that are told of every flight."""
+
+
+@one_thread()
+def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None) -> list[Record]:
+    """Every metric of every policy with its interval.
+
+    ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
+    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
+    and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
+    is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
+    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
+    ``lost_episodes`` of estimators (share). Where the evaluation was timed ``nanoseconds``, processor time of a
+    measurement, whose component says whether it is ``compiled`` code's or ``python``'s. Without truth what needs it is
+    left out. Of a recording with tracks ``prediction_error`` and ``innovation_correlation``, whose intervals are over
+    stretches of measurements.
+
+    Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
+    and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
+    ranked ``behind_best`` (paired; the component names the best). And the environment's own metrics.
+
+    Args:
+        dataset: from an evaluation.
+        metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
+    """
+    bootstrap = bootstrap_of(dataset)
+    # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
+    own = None if dataset.attrs.get("recorded") else metrics
+    declare = functools.partial(record_statistics, episodes=bootstrap.episodes, metrics=own)
+    runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
+    contenders = []
+    for run in runs:
+        contender = contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own)
+        contenders.append(contender._replace(measures=[*contender.measures, *prediction_measures(run)]))
+    return records_of(contenders, dataset, bootstrap)
+
+
+def contender_of(
+    results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: "OwnMetrics | None"
+) -> Contender:
+    """Return what the records of a competitor are made of.
+
+    Args:
+        results: of :func:`record_statistics`.
+        run: its part of an evaluation, of whose variables none is needed.
+        bootstrap: over the episodes.
+        metrics: the environment's own.
+    """
+    measures = []
+    for (kind, *words), value in results.items():
+        if kind == "record":
+            metric, component, window, unit = words
+            estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
+            measures.append(Measure(metric, component, window, estimate, unit))
+    further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
+    name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
+    causes = None
+    if ("causes",) in results:
+        found, causes = split(results["causes",], run, bootstrap)
+        further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
+    if (time := time_of(run)) is not None:
+        estimate = Estimate(time.nanoseconds, math.nan, math.nan)
+        measures.append(Measure(METRIC, COMPILED if time.compiled else IN_PYTHON, "all", estimate, "ns"))
+    return Contender(
+        name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
+    )
+
+
+def _compare_causes(
+    contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
+) -> Iterator[Measure]:
+    """Cost under each cause over that of the opponent; a cause stands in the place of a window."""
+    split = {c.name: c.causes for c in contenders if c.causes is not None}
+    if contender.name not in split:
+        return
+    costs = {name: float(causes.of(EVERYTHING)[0]) for name, causes in split.items()}
+    opponent = opponent_of(contender.name, costs, [c.name for c in contenders if c.kind in RANKED])
+    if opponent:
+        for m in compare(split[contender.name], split[opponent], opponent, bootstrap):
+            yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
+
+
+def records_of(
+    contenders: Sequence[Contender], evaluation: "xarray.Dataset", bootstrap: Bootstrap
+) -> list[Record]:
+    """Return every record, with the comparisons that take several competitors.
+
+    Args:
+        contenders: all of them.
+        evaluation: whose attributes say of what.
+        bootstrap: over the episodes.
+    """
+    attrs = evaluation.attrs
+    against = _Against(contenders, attrs["paper"], attrs["reference"], bootstrap)
+
+    def finite(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
+    records = []
+    for c in contenders:
+        measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
+        measures += _compare_causes(c, contenders, bootstrap)
+        for m in measures:
+            records.append(
+                Record(
+                    attrs["environment"],
+                    c.control,
+                    attrs["scenario"],
+                    c.name,
+                    c.kind,
+                    m.metric,
+                    m.component,
+                    m.window,
+                    finite(m.estimate.value),
+                    finite(m.estimate.low),
+                    finite(m.estimate.high),
+                    m.unit,
+                    bootstrap.episodes,
+                    seed_of(evaluation),
+                    attrs["split"],
+                )
+            )
+    return records

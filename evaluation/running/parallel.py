@@ -1,0 +1,385 @@
+"""Work spread over processes of this machine, or over a cluster; what comes out is what one process makes.
+
+A piece of work is a function of a module and what it is called with: plain data, such as names and seeds, or objects
+that can be pickled. Pieces are run in any order, each with one thread of BLAS and torch, and nothing is drawn that the
+piece itself does not seed; so who puts the results into the order of the pieces has the same bits wherever they came
+from.
+
+On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are run again where a
+process or a machine is lost. joblib's backend for Ray is a pool of actors, and ends with the first that is lost.
+"""
+
+import os
+import pickle
+import secrets
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import cloudpickle
+
+from ...envs.engine.catalogue import FOUND_IN, on_path
+from .rollout import Progress
+from .threads import one_thread
+
+RETRIES = 10
+"""How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
+CLUSTER_PROCESSES = 16
+"""Processes that a cluster elsewhere is thought to have, where work is cut for it."""
+NO_HTTP_ROUTES: dict[str, Any] = {
+    f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker", "nanny")
+}
+"""Dask's web servers tell whoever asks of the work, and have no authentication: nothing is served."""
+CLUSTERS = "ray, ray://HOST:PORT, ray://auto, dask, tcp://HOST:PORT or tls://HOST:PORT"
+
+Function = Callable[[Any, Progress], Any]
+"""Of a module: from a piece of work, and what is told of measurements done, to its result."""
+
+
+class Place(NamedTuple):
+    """Where the modules and files are that pieces of work name."""
+
+    folder: str
+    paths: list[str]
+    named_in: list[str]
+    """Folders of modules that the user has named, where nothing else is looked for."""
+
+
+class Outcome(NamedTuple):
+    """What became of a piece of work."""
+
+    number: int
+    result: Any
+    error: Exception | None
+    traceback: str
+    """Of the error, where it was raised."""
+    warnings: list[tuple[str, type[Warning]]]
+
+
+class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
+    """Traceback of an error in another process."""
+
+
+def _end_with(parent: int) -> None:
+    """Let this process end with the one that began it, which may be killed and could not tell it."""
+
+    def watch() -> None:
+        if sys.platform == "win32":
+            from _winapi import SYNCHRONIZE, OpenProcess
+            from multiprocessing.connection import wait
+
+            wait([OpenProcess(SYNCHRONIZE, False, parent)])
+        else:
+            while os.getppid() == parent:
+                time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _run_piece(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
+    """Do a piece of work, in a process that may know nothing yet."""
+    if os.getcwd() != place.folder:
+        with suppress(OSError):  # another machine may not have it
+            os.chdir(place.folder)
+    # Engines search the working directory, too, where a file is no library, unless this command does.
+    unwanted = {"", place.folder} - set(place.paths)
+    sys.path[:] = [path for path in sys.path if path not in unwanted]
+    sys.path.extend(path for path in place.paths if path not in sys.path and Path(path).is_dir())
+    with warnings.catch_warnings(record=True) as noted, one_thread():
+        try:
+            function = pickle.loads(packed)  # only now: its modules may lie on those paths
+            with on_path(place.named_in):
+                item = pickle.loads(packed_item)
+            found = Outcome(index, function(item, lambda measurements: None), None, "", [])
+        except Exception as error:
+            found = Outcome(index, None, _sendable(error), traceback.format_exc(), [])
+    return found._replace(warnings=[(str(warning.message), warning.category) for warning in noted])
+
+
+def _sendable(error: Exception) -> Exception:
+    """Return an error that can be told to another process; in words if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error.with_traceback(None)
+
+
+def check_workers(workers: Any) -> "Workers":
+    """Return who does the work; where nobody is named, this process.
+
+    Raises:
+        ValueError: for anything else, such as a number.
+    """
+    if workers is not None and not isinstance(workers, Workers):
+        raise ValueError(
+            f"workers must be filtergym.evaluation.running.parallel.Workers, such as Workers(2), got {workers!r}"
+        )
+    return workers or Workers()
+
+
+class Workers:
+    """Who does the work; ``with Workers(4) as workers`` ends what was begun for it.
+
+    Args:
+        jobs: processes; 1: this one; -1: as many as there are cores.
+        cluster: ``"ray"`` or ``"dask"``: a new one on this machine, which lets nobody else in, with ``jobs`` processes,
+            where that is more than one, or as many as there are cores. One that runs already: ``ray://HOST:PORT``;
+            ``ray://auto``, that of this machine, whoever has begun it; of Dask ``tls://HOST:PORT``, with the
+            certificates of Dask's configuration, or ``tcp://HOST:PORT``, which is open to whoever reaches the port.
+            None: no cluster.
+
+    Raises:
+        ValueError: for another number or word, or where the packages of a cluster are missing.
+    """
+
+    def __init__(self, jobs: int = 1, cluster: str | None = None) -> None:
+        if jobs != -1 and jobs < 1:
+            raise ValueError(f"jobs must be at least 1, or -1 for all cores, got {jobs}")
+        self.engine = ""
+        if cluster is not None:
+            scheme, elsewhere, _ = cluster.partition("://")
+            engines = (
+                {"ray": "ray", "tcp": "dask", "tls": "dask"} if elsewhere else {"ray": "ray", "dask": "dask"}
+            )
+            if scheme not in engines:
+                raise ValueError(f"cluster must be {CLUSTERS}, got {cluster!r}")
+            self.engine = engines[scheme]
+            if elsewhere and jobs != 1:
+                raise ValueError("a cluster has as many processes as it has: leave out jobs")
+        self.jobs, self.cluster = jobs, cluster
+        self._ended = ExitStack()
+        self._dask: Any = None
+
+    @property
+    def alone(self) -> bool:
+        """Whether this process does everything itself."""
+        return self.jobs == 1 and self.cluster is None
+
+    @property
+    def width(self) -> int:
+        """Into how many pieces work is best cut; of a cluster that runs elsewhere a guess."""
+        if self.alone:
+            return 1
+        if self.cluster is not None and "://" in self.cluster:
+            return CLUSTER_PROCESSES
+        return self._cores
+
+    @property
+    def _cores(self) -> int:
+        """How many processes a new cluster has."""
+        if self.jobs not in (1, -1):
+            return self.jobs
+        import joblib
+
+        return int(joblib.cpu_count())  # of those that this process may use
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.close()
+
+    def run(
+        self,
+        function: Function,
+        items: Sequence[Any],
+        sizes: Sequence[int] | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[tuple[int, Any]]:
+        """Do pieces of work.
+
+        Args:
+            function: of a module, which workers import.
+            items: what it is called with.
+            sizes: measurements of each, for the progress.
+            progress: told of measurements done; of work elsewhere when a piece has come back.
+
+        Yields:
+            Number of a piece and its result, as they come.
+
+        Raises:
+            ValueError: if a process is lost for good, or the cluster is not there; and whatever the function raises.
+        """
+        tick = progress or (lambda measurements: None)
+        if self.alone:
+            for index, item in enumerate(items):
+                with one_thread():
+                    result = function(item, tick)
+                yield index, result
+            return
+        place = Place(os.getcwd(), list(sys.path), list(FOUND_IN))
+        packed = cloudpickle.dumps(function)
+        calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
+        spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
+        shown_warnings: set[tuple[str, type[Warning]]] = set()
+        # Processes that begin search no libraries in the working directory; :func:`_run_piece` tells them the paths.
+        with _environment(PYTHONSAFEPATH="1"):
+            for outcome in spread(calls):
+                for text, category in outcome.warnings:
+                    if (text, category) not in shown_warnings:
+                        shown_warnings.add((text, category))
+                        warnings.warn(text, category, stacklevel=2)
+                if outcome.error is not None:
+                    raise outcome.error from Elsewhere(outcome.traceback)
+                if sizes is not None:
+                    tick(sizes[outcome.number])
+                yield outcome.number, outcome.result
+
+    def results(
+        self,
+        function: Function,
+        items: Sequence[Any],
+        sizes: Sequence[int] | None = None,
+        progress: Progress | None = None,
+    ) -> list[Any]:
+        """Do pieces of work, see :meth:`run`, and return what comes out in their order."""
+        found: list[Any] = [None] * len(items)
+        for index, result in self.run(function, items, sizes, progress):
+            found[index] = result
+        return found
+
+    def _over_processes(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        import joblib
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+        from joblib.parallel import LokyBackend
+
+        class Processes(LokyBackend):
+            def configure(self, *given: Any, **options: Any) -> Any:
+                own = {"initializer": _end_with, "initargs": (os.getpid(),)}
+                return super().configure(*given, **own, **options)
+
+        # Whoever ends the work early, by an error or Ctrl-C, knows that the rest is not done.
+        warnings.filterwarnings("ignore", message=".*tasks which were still being processed by the workers")
+        try:
+            with joblib.parallel_config(backend=Processes(), inner_max_num_threads=1):
+                # Arrays are passed whole: those that joblib maps into memory could not be written to.
+                pool = joblib.Parallel(
+                    self.jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None
+                )
+                yield from pool(joblib.delayed(_run_piece)(*call) for call in calls)
+        except TerminatedWorkerError as error:
+            raise ValueError(
+                "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
+                "fewer jobs, or go on from here by the same command where it keeps what is done"
+            ) from error
+
+    def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        try:
+            import dask
+            from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+
+            # Certificates that this process tells its workers alone: whoever else connects is refused.
+            begin = self._dask is None and self.cluster == "dask"
+            security = Security.temporary() if begin else None
+        except ImportError as error:
+            raise _missing(error) from error
+        if self._dask is None:
+            where: Any = self.cluster
+            try:
+                if begin:
+                    with dask.config.set(NO_HTTP_ROUTES):
+                        where = LocalCluster(
+                            n_workers=self._cores,
+                            threads_per_worker=1,
+                            processes=True,
+                            dashboard_address=None,
+                            protocol="tls://",
+                            security=security,
+                        )
+                    self._ended.callback(where.close)
+                self._dask = Client(where, timeout=30)
+            except (OSError, ValueError) as error:
+                raise ValueError(f"there is no cluster of Dask at {self.cluster}: {error}") from error
+            self._ended.callback(self._dask.close)
+        futures = [self._dask.submit(_run_piece, *call, pure=False) for call in calls]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+                future.release()  # a result is large, and has been taken
+        except KilledWorker as error:
+            raise ValueError(f"the cluster has lost a piece of work for good: {error}") from error
+        finally:
+            self._dask.cancel(futures)
+
+    def _over_ray(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to tell others
+        try:
+            import ray
+        except ImportError as error:
+            raise _missing(error) from error
+        if not ray.is_initialized():
+            try:
+                self._begin_ray(ray)
+            except (ConnectionError, OSError, ValueError, RuntimeError) as error:
+                raise ValueError(f"there is no cluster of Ray at {self.cluster}: {error}") from error
+            self._ended.callback(ray.shutdown)
+        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_piece)
+        pending: list[Any] = []
+        try:
+            yield from self._from_ray(ray, remote, calls, pending)
+        finally:
+            for reference in pending:  # of who ends the work early
+                ray.cancel(reference, force=True)
+
+    @staticmethod
+    def _from_ray(
+        ray: Any, remote: Any, calls: Iterator[tuple[Any, ...]], pending: list[Any]
+    ) -> Iterator[Outcome]:
+        """Keep the cluster busy; ``pending`` is what it has to do."""
+        more = True
+        while pending or more:
+            # The cluster may grow meanwhile; two pieces for each core keep it busy.
+            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            while more and len(pending) < most:
+                call = next(calls, None)
+                more = call is not None
+                if call is not None:
+                    pending.append(remote.remote(*call))
+            if pending:
+                ready, pending[:] = ray.wait(pending, num_returns=1)
+                try:
+                    yield from ray.get(ready)
+                except ray.exceptions.RayError as error:
+                    reason = str(error).strip().splitlines()[0]
+                    raise ValueError(f"the cluster has lost a piece of work for good: {reason}") from error
+
+    def _begin_ray(self, ray: Any) -> None:
+        quiet = {"log_to_driver": False, "logging_level": "error"}
+        if self.cluster != "ray":
+            ray.init("auto" if self.cluster == "ray://auto" else self.cluster, **quiet)
+            return
+        # A new one, whatever runs here. Since 2.59 Ray lets in only who knows its token; without one of ours it would
+        # leave one in a file that other users may be able to read.
+        if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        ray.init("local", num_cpus=self._cores, include_dashboard=False, **quiet)
+
+
+@contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Set variables of the environment for a while, and for the processes that begin in it."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _missing(error: ImportError) -> ValueError:
+    return ValueError(f"a cluster needs more packages: pip install 'filtergym[cluster]' ({error})")

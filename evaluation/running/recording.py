@@ -1,0 +1,142 @@
+"""Recordings made from the simulation: what the sensors say in episodes of a scenario, with the truth."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy
+
+from ...envs.contract.filter import Filter, Initial, Input
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.task import Task, named_arrays
+from ...envs.data.foreign_files import MOST_NUMBERS
+from ...envs.data.recording import Recording, measure_once
+from ...envs.data.recording_files import differing
+from ...envs.engine.backend import make_model
+from ...envs.engine.episode_noise import uniforms_of_seeds
+from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
+from .evaluate import Experiment
+from .rollout import Progress, start_lanes
+from .seeds import episode_seeds
+
+CHUNK = 256
+"""Episodes recorded side by side."""
+
+
+class NoFilter(Filter[Task, Any, Initial]):
+    """In place of a filter where nobody estimates: the initial estimate stands."""
+
+    def start(self, initial: Any) -> Initial:
+        """Report the initial estimate."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, state: Initial, given: Input) -> Initial:
+        """Learn nothing."""
+        return state
+
+
+def _no_filter(model: Model) -> NoFilter:
+    return NoFilter(model.task)
+
+
+def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
+    """Record what the sensors say in the episodes of an experiment, and the truth.
+
+    They are the episodes that an evaluation of the experiment flies. Replayed on the same backend, observations,
+    estimates and costs are the same, bit for bit.
+
+    Args:
+        experiment: whose episodes these are; no policy runs, and of its fields only those are used that say which
+            episodes, with which parameters and on what backend.
+        progress: called with the number of measurements done, now and then.
+
+    Raises:
+        ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
+    """
+    cls, split, seed, episodes = experiment.task, experiment.split, experiment.seed, experiment.episodes
+    seeds = episode_seeds(split, seed, episodes)
+    chosen = find_scenario(cls, read_files(cls, experiment.scenario), experiment.keywords)
+    if chosen.recording is not None:
+        raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
+    plain = make_task(cls, chosen, **experiment.keywords)
+    _check_size(plain, episodes)
+    model = make_model(cls, scenario=chosen, backend=experiment.backend, **experiment.keywords)
+    model = model.with_filter(_no_filter)
+    chunks = [
+        _record(model, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
+    ]
+    measurements, initial = (
+        {name: numpy.concatenate([part[name] for part in parts]) for name in parts[0]}
+        for parts in zip(*chunks, strict=True)
+    )
+    truth, lengths = measurements.pop("truth"), initial.pop("length")
+    if "interval" in measurements:
+        times = numpy.cumsum(measurements["interval"], axis=1)
+    else:
+        times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
+    there = times_there(lengths, truth.shape[1])
+    parameters = differing(plain.parameters)
+    for name in cls.World.own_parameters:
+        parameters.pop(name, None)
+    names = [str(i) for i in range(episodes)]
+    if plain.flights:
+        names = [f"{chosen.flights[number]} {i}" for i, number in enumerate(initial.pop("flight"))]
+    return Recording(
+        environment=cls.id,
+        measurements=measurements,
+        initial=initial,
+        seconds=numpy.where(there, times, numpy.nan),
+        lengths=lengths,
+        truth=truth,
+        names=tuple(names),
+        parameters=parameters,
+        name=f"{chosen.name} recorded",
+        source=f"filtergym record {cls.id}, scenario {chosen.name}, {split} split, seed {seed}",
+    )
+
+
+def _check_size(task: Task, episodes: int) -> None:
+    """Raise ValueError if episodes are more than a recording may hold, or the loop is closed."""
+    arrays = dict(named_arrays(measure_once(task)[1]))
+    row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(task.components) + 1
+    if row * episodes * (task.horizon + 1) > MOST_NUMBERS:
+        raise ValueError(
+            f"{episodes:,} episodes of {task.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
+            "that a recording may hold: record fewer"
+        )
+
+
+def times_there(lengths: numpy.ndarray, rows: int) -> numpy.ndarray:
+    """Measurements that are recorded: those acted on, and the one that the last observation shows, ``(E, rows)``."""
+    return numpy.arange(rows) <= lengths[:, None]
+
+
+def _record(
+    model: Model, seeds: Sequence[int], tick: Progress
+) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
+    """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
+    initial: dict[str, numpy.ndarray] = {}
+    series: dict[str, list[numpy.ndarray]] = {}
+    count = len(seeds)
+
+    def first(values: numpy.ndarray) -> numpy.ndarray:
+        return numpy.moveaxis(values[..., :count], -1, 0).copy()
+
+    def keep_start(episode: Episode) -> None:
+        initial.update({name: first(values) for name, values in named_arrays(episode.measurement)})
+
+    def keep(episode: Episode) -> None:
+        for name, values in named_arrays(episode.measurement):
+            series.setdefault(name, []).append(first(values))
+        series.setdefault("truth", []).append(first(model.task.world.state(episode.truth)))
+
+    lanes, nothing = start_lanes(model, seeds, keep_start), numpy.zeros(count, dtype=numpy.int64)
+    for _ in range(lanes.decisions_per_episode):
+        for episode, _ in lanes.decide(nothing):
+            keep(episode)
+        tick(count * model.task.decision_interval)
+    keep(lanes.state)
+    uniforms = uniforms_of_seeds(seeds, model.task.noise)
+    initial["length"] = model.task.lengths(uniforms)
+    if model.task.flights:
+        initial["flight"] = model.task.flight_of(uniforms)
+    return {name: numpy.stack(values, axis=1) for name, values in series.items()}, initial

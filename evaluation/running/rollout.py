@@ -1,0 +1,369 @@
+"""Episodes from their seeds to their end, with whatever competes in the loop."""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...compiler.functions import Specialised, round_up_lanes
+from ...compiler.native import optimised_code
+from ...envs.contract.model import Episode, Model
+from ...envs.contract.observation import Array
+from ...envs.engine.compiled import CompiledModel, Report, can_step
+from ...envs.engine.environment import check_action
+from ...envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
+from ...envs.engine.lanes import Lanes, whole_episode
+from ..competitors.filters import put_in_loop
+from ..competitors.kinds import Kind, check_competitor, compilation_key, kind_of, make_competitor
+from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
+from ..competitors.steered_filter import compile_policy, trace_policy
+from ..competitors.stepping import SteppingPolicy
+
+Progress = Callable[[int], None]
+"""Called with the number of measurements just done."""
+
+
+def start_lanes(
+    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+) -> Lanes:
+    """Return one episode for each seed, side by side, with its first measurement made.
+
+    Args:
+        model: task with a bank.
+        seeds: of the episodes.
+        on_start: called with the episodes at the start of the track.
+    """
+    lanes = Lanes(model, len(seeds), on_start=on_start)
+    lanes.begin(identities_of_seeds(seeds))
+    return lanes
+
+
+def rollout(
+    model: Model,
+    competitor: Any,
+    seeds: Sequence[int],
+    report: Report = whole_episode,
+    *,
+    kind: Kind | None = None,
+    name: str = "competitor",
+) -> Iterator[tuple[Any, Array]]:
+    """Run whatever competes over one episode for each seed, measurement by measurement.
+
+    Args:
+        model: task with a bank; of a policy, that of its control.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it. A smoother
+            runs over the episodes twice, the second time with what it says when all is measured.
+        seeds: of the episodes, all run side by side.
+        report: function of the model and the state after the measurement was taken in; default: the state itself.
+        kind: what the competitor is; default: what it says.
+        name: of it, in errors.
+
+    Yields:
+        For every measurement the report, arrays ``(..., N)`` whose lanes beyond ``len(seeds)`` are padding, and the
+        action applied to it, batch first.
+    """
+    kind = kind or kind_of(competitor)
+    if kind == "policy":
+        yield from _steer_by_python(model, competitor, seeds, report, name)
+        return
+    yield from _step_filter(_put_in_loop(model, competitor, kind, seeds, name), seeds, report)
+
+
+def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
+    """Step a filter that needs nobody who steers it."""
+    lanes, action = start_lanes(looped, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+    for _ in range(lanes.decisions_per_episode):
+        for found, _ in lanes.decide(action, report):
+            yield found, action
+
+
+def _steer_by_python(
+    model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
+) -> Iterator[tuple[Any, Array]]:
+    """Step a bank, and ask its policy before every decision."""
+    lanes = start_lanes(model, seeds)
+    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
+    memory = policy.begin(seeds)
+    for _ in range(lanes.decisions_per_episode):
+        action, memory = policy.predict(lanes.observe(), memory)
+        for found, _ in lanes.decide(action, report):
+            yield found, action
+
+
+def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
+    """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
+    if kind == "smoother":
+        check_open_loop(model, name)
+        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
+    return put_in_loop(model, competitor, kind, name, len(seeds))
+
+
+def _smoothed_estimates(
+    model: Model, competitor: Any, seeds: Sequence[int], name: str
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother, N a multiple of eight.
+
+    Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
+    """
+    task = model.task
+    lengths = task.lengths(uniforms_of_seeds(seeds, task.noise))
+    K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
+    means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
+    for length in numpy.unique(lengths).tolist():
+        lanes = numpy.flatnonzero(lengths == length)
+        own = [seeds[lane] for lane in lanes.tolist()]
+        looped = put_in_loop(model, competitor, "smoother", name, len(own))
+        found = run_forward(looped, start_lanes(looped, own), length, name)
+        for kept, answered in zip((means, covariances), found, strict=True):
+            kept[..., :length, lanes] = answered[..., : len(own)]
+            kept[..., length:, lanes] = answered[..., -1:, : len(own)]
+    last = numpy.minimum(numpy.arange(width), len(seeds) - 1)
+    return means[..., last], covariances[..., last]
+
+
+class More(NamedTuple):
+    """What is reported of the first episodes only; of all it would take much memory."""
+
+    report: Report
+    """Of all that is reported of them."""
+    episodes: int
+    """How many they are."""
+    prefix: str
+    """Begins the names of what is not reported of the others."""
+
+
+class Flown(NamedTuple):
+    """What is reported of episodes that were run to their end."""
+
+    found: dict[str, numpy.ndarray]
+    """Arrays ``(episodes, time, ...)`` by name; not always one row after the other in memory."""
+    action: numpy.ndarray | None
+    """That a policy applied to each measurement, ``(episodes, time, ...)``; None of what has none."""
+
+
+def run_episodes(
+    model: Model,
+    competitor: Any,
+    kind: Kind,
+    seeds: Sequence[int],
+    report: Report,
+    name: str = "competitor",
+    tick: Progress | None = None,
+    more: More | None = None,
+) -> Flown:
+    """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
+
+    Where everything is compiled, world, filter, policy and report, all episodes are one call of native code; else they
+    are stepped. The numbers are the same.
+
+    Args:
+        model: as in :func:`rollout`, likewise what follows.
+        competitor: likewise.
+        kind: likewise.
+        seeds: likewise.
+        report: of arrays ``(..., N)`` by name.
+        name: of the competitor, in errors.
+        tick: told of measurements done.
+        more: what is reported of the first episodes beside it.
+    """
+    count, steering, tick = len(seeds), None, tick or (lambda measurements: None)
+    steers = kind == "policy"
+    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
+    if steers:
+        steering = _steering_of(model, competitor, name)
+    compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
+    if compiled and (steering is not None or not steers):
+        first = 0 if more is None else min(more.episodes, count)
+        parts = [] if more is None else [_run_compiled(looped, steering, seeds[:first], more.report, tick)]
+        if first < count:
+            parts.append(_run_compiled(looped, steering, seeds[first:], report, tick))
+        return _one_after_another(parts)
+    steps = (
+        _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
+        if steers
+        else _step_filter(looped, seeds, report if more is None else more.report)
+    )
+    return _step_episodes(steps, count, steers, tick, more)
+
+
+def _run_compiled(
+    looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
+) -> Flown:
+    """Run compiled episodes as one call of native code."""
+    lanes, count = start_lanes(looped, seeds), len(seeds)
+    reports, actions = lanes.run(report, steering)
+    tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
+    found = {name: _episodes_first(values, count) for name, values in reports.items()}
+    return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
+
+
+def _one_after_another(parts: Sequence[Flown]) -> Flown:
+    """Join episodes; what is reported of some only is theirs alone."""
+    if len(parts) == 1:
+        return parts[0]
+    found = {
+        name: numpy.concatenate([part.found[name] for part in parts if name in part.found])
+        for name in parts[0].found
+    }
+    actions = [part.action for part in parts if part.action is not None]
+    return Flown(found, numpy.concatenate(actions) if actions else None)
+
+
+def _step_episodes(
+    steps: Iterator[tuple[Any, Array]], count: int, steers: bool, tick: Progress, more: More | None
+) -> Flown:
+    """Keep what is reported of episodes that are stepped."""
+    series: dict[str, list[numpy.ndarray]] = {}
+    actions = []
+    for found, action in steps:
+        for name, values in found.items():
+            if more is not None and name.startswith(more.prefix):
+                values = values[..., : more.episodes].copy()  # a view would keep the numbers of all
+            series.setdefault(name, []).append(values)
+        actions.append(numpy.asarray(action))
+        tick(count)
+    together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
+    return Flown(together, numpy.stack(actions, axis=1) if steers else None)
+
+
+def _steering_of(model: Model, competitor: Any, name: str) -> Specialised | None:
+    """Return what steers the model in native code; None of a policy that is asked in Python."""
+
+    def trace() -> Specialised | None:
+        policy = check_competitor(name, make_competitor(competitor, model), "policy")
+        found: Specialised | None = compile_policy(model, policy, trace_policy)
+        return found
+
+    if not isinstance(model, CompiledModel):
+        return None
+    try:
+        return model.programs.keep((run_episodes, compilation_key(competitor)), trace)
+    except TypeError:  # it has no hash
+        return trace()
+
+
+def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
+    """Return a view ``(episodes, time, ...)`` of arrays ``(time, ..., N)``, without the padding."""
+    return numpy.moveaxis(values[..., :count], -1, 0)
+
+
+def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.ndarray:
+    """Return actions ``(time, ..., N)``, episodes first.
+
+    Raises:
+        ValueError: for the first that is not in the action space, but for the limits of a box.
+    """
+    space, kept = model.action_space, _episodes_first(actions, count)
+    if isinstance(space, gymnasium.spaces.Discrete):
+        kept = kept.astype(numpy.int64)
+        wrong = (kept < 0) | (kept >= space.n)
+    else:
+        wrong = ~numpy.isfinite(kept)
+    for k in numpy.flatnonzero(wrong.any(axis=(0, *range(2, wrong.ndim))))[:1]:
+        check_action(space, kept[:, k], count)
+    return kept
+
+
+TIMED_EPISODES, TIMED_MEASUREMENTS = 512, 256
+"""Episodes side by side, and measurements of each, of which a time is taken: enough for two digits."""
+RUN_SECONDS = 0.02
+"""How long a run takes, about, where the episodes are long enough."""
+TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
+"""For how long, and how often, runs are repeated of which the quickest counts."""
+
+
+class ProcessorTime(NamedTuple):
+    """What a measurement takes on one core: world and competitor together."""
+
+    nanoseconds: float
+    """Of a measurement of one of many episodes side by side."""
+    compiled: bool
+    """Whether all of it is native code; else the time is mostly that of the steps between, in Python."""
+
+
+def measure_time(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str = "competitor"
+) -> ProcessorTime | None:
+    """Measure the processor time of a measurement: the world moves, is measured, and the competitor estimates.
+
+    Of :data:`TIMED_EPISODES` episodes side by side, after everything is traced and compiled: of native code the
+    quickest of several runs, since what disturbs one only adds to it; of what is asked in Python the median decision.
+
+    Args:
+        model: as in :func:`rollout`, likewise what follows.
+        competitor: likewise.
+        kind: likewise. A smoother answers when all is measured, and a bound estimates nothing: None.
+        seeds: of some episodes, which are repeated where they are fewer.
+        name: of the competitor, in errors.
+    """
+    if kind in ("smoother", "bound"):
+        return None
+    seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
+    task, steers = model.task, kind == "policy"
+    decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
+    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
+    steering = _steering_of(model, competitor, name) if steers else None
+    if can_step(looped, _report_estimate) and (steering is not None or not steers):
+        spent = _time_compiled(looped, steering, seeds, decisions)
+        return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
+    steps = (
+        _steer_by_python(model, competitor, seeds, _report_estimate, name)
+        if steers
+        else _step_filter(looped, seeds, _report_estimate)
+    )
+    spent = _time_steps(steps, decisions, task.decision_interval)
+    return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False)
+
+
+def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
+    return {"estimate": model.mean(episode)}
+
+
+def _time_compiled(
+    looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
+) -> float:
+    """Seconds of a decision of all episodes, in the quickest run of optimised code."""
+    lanes, identities = start_lanes(looped, seeds), identities_of_seeds(seeds)
+    interval = looped.task.decision_interval
+
+    def run(count: int) -> float:
+        lanes.begin(identities)
+        began = time.process_time()
+        lanes.run(_report_estimate, steering, count * interval)
+        return time.process_time() - began
+
+    with optimised_code():
+        run(1)  # compiles
+    setting_up = min(run(1) for _ in range(FEWEST_RUNS))  # and a first decision
+    # No step branches, so that every decision takes as long: a dear one need not be repeated to the end.
+    count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
+    if count == 1:
+        return setting_up
+    spent: list[float] = []
+    while len(spent) < FEWEST_RUNS or (sum(spent) < TIMED_SECONDS and len(spent) < MOST_RUNS):
+        spent.append(run(count))
+    return (min(spent) - setting_up) / (count - 1)
+
+
+def _time_steps(steps: Iterator[Any], decisions: int, interval: int) -> float:
+    """Seconds of the median decision."""
+    spent: list[float] = []
+    for _ in range(decisions):
+        began = time.process_time()
+        for _ in range(interval):
+            next(steps)
+        spent.append(time.process_time() - began)
+        if sum(spent[1:]) > 2.0 * TIMED_SECONDS:
+            break
+    return float(numpy.median(spent[1:] or spent))  # the first starts the episodes and compiles
+
+
+def run_competitor(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
+) -> dict[str, numpy.ndarray]:
+    """Run whatever competes, see :func:`run_episodes`, and return what is reported, ``(episodes, time, ...)``."""
+    return run_episodes(model, competitor, kind, seeds, report).found

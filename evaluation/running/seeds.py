@@ -1,0 +1,31 @@
+"""Seeds of episodes: three splits that share nothing, whatever the number beside them."""
+
+import numpy
+
+from ...envs.contract.parameters import check_integer
+from ...envs.engine.catalogue import nearest
+
+SPLITS = {"train": 0, "validation": 1, "test": 2}
+
+
+def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[int]:
+    """Seeds of a run of episodes.
+
+    Each is an ordinary Gymnasium seed: ``env.reset(seed=...)`` replays the episode.
+
+    Args:
+        split: "train", "validation" or "test".
+        seed: number of the experiment; different numbers share no episode.
+        episodes: how many.
+        first: how many to skip.
+
+    Raises:
+        ValueError: for an unknown split, a seed below zero, or fewer episodes than one.
+    """
+    if not isinstance(split, str) or split not in SPLITS:
+        raise nearest("split", split, SPLITS)
+    episodes = check_integer("episodes", episodes, 1)
+    seed = check_integer("seed", seed, 0)
+    sequence = numpy.random.SeedSequence([SPLITS[split], seed])
+    words = sequence.generate_state(first + episodes, numpy.uint64)
+    return [int(word) for word in words[first:]]

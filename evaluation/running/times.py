@@ -1,0 +1,127 @@
+"""What competitors take of the processor, as coordinates of an evaluation, and who lies on the front of cost and time.
+
+The time of a measurement is that of the simulated world and of the competitor up to its estimate, on one core, of many
+episodes side by side (:func:`.rollout.measure_time`). Tracing, compilation, and what is computed of errors are not in
+it. It differs from run to run: an evaluation holds it only where it is asked for, and is otherwise the same bits.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..competitors.kinds import RANKED
+from .rollout import ProcessorTime
+
+if TYPE_CHECKING:
+    import xarray
+
+COORDINATES = ("nanoseconds", "compiled")
+"""Names of the coordinates over policy."""
+METRIC = "nanoseconds"
+"""Of the records that hold the time."""
+COMPILED, IN_PYTHON = "compiled", "python"
+"""Components of these records."""
+PYTHON_MARK, FRONT_MARK = "py", "*"
+"""In tables, of times that are mostly Python's, and of who lies on the front."""
+TIME_TITLE = "ns"
+"""Of the column of times."""
+TIME_NOTE = (
+    f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
+    "An asterisk marks the front, where no other ranked competitor costs less in as much time or less. "
+    f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
+)
+EQUAL_TIMES = 1.1
+"""Ratio up to which two times are taken for the same: so much they differ from run to run."""
+
+
+def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None]) -> "xarray.Dataset":
+    """Return an evaluation with the time of each of its competitors, or one competitor's part of one."""
+    values = [math.nan if time is None else time.nanoseconds for time in times]
+    compiled = [int(time is not None and time.compiled) for time in times]
+    attrs = {"units": "ns", "long_name": "processor time of a measurement, of world and competitor"}
+    if "policy" not in dataset.dims:
+        return dataset.assign_coords(nanoseconds=((), values[0], attrs), compiled=compiled[0])
+    return dataset.assign_coords(nanoseconds=("policy", values, attrs), compiled=("policy", compiled))
+
+
+def time_of(run: "xarray.Dataset") -> ProcessorTime | None:
+    """Return the time of one competitor's part of an evaluation; None where it is not known."""
+    if COORDINATES[0] not in run.coords or math.isnan(nanoseconds := float(run[COORDINATES[0]])):
+        return None
+    return ProcessorTime(nanoseconds, bool(run[COORDINATES[1]]))
+
+
+class Point(NamedTuple):
+    """A competitor between what it takes and what it is worth."""
+
+    name: str
+    kind: str
+    time: ProcessorTime
+    cost: float
+    """In whatever unit, of all points the same."""
+
+
+def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
+    """Times by name, from tidy records of one environment and scenario."""
+    return {
+        r.policy: ProcessorTime(r.value, r.component == COMPILED)
+        for r in records
+        if r.metric == METRIC and r.value is not None
+    }
+
+
+def points_of_records(records: Sequence[Any]) -> list[Point]:
+    """Points of all competitors whose cost and time are known; the cost is relative to the paper's algorithm, in %.
+
+    Args:
+        records: tidy ones of one environment and scenario.
+    """
+    times = times_of_records(records)
+    return [
+        Point(r.policy, r.kind, times[r.policy], 100.0 * r.value)
+        for r in records
+        if r.metric == "relative_cost_difference" and r.value is not None and r.policy in times
+    ]
+
+
+def front(points: Sequence[Point]) -> list[str]:
+    """Names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto front).
+
+    Whoever takes about as long, within :data:`EQUAL_TIMES`, and costs less beats, too; so noise of the clock puts
+    nobody on the front.
+    """
+    ranked = [point for point in points if point.kind in RANKED and math.isfinite(point.cost)]
+    found = [
+        one
+        for one in ranked
+        if not any(
+            other.cost < one.cost and other.time.nanoseconds <= EQUAL_TIMES * one.time.nanoseconds
+            for other in ranked
+        )
+    ]
+    # Of equal costs the quickest.
+    by_cost: dict[float, Point] = {}
+    for point in sorted(found, key=lambda point: point.time.nanoseconds):
+        by_cost.setdefault(point.cost, point)
+    return [point.name for point in by_cost.values()]
+
+
+def time_text(time: ProcessorTime | None) -> str:
+    """Nanoseconds in two digits, marked where the time is that of Python."""
+    if time is None or time.nanoseconds <= 0.0:
+        return "-"
+    rounded = round(time.nanoseconds, min(1 - math.floor(math.log10(time.nanoseconds)), 0))
+    return f"{rounded:,.0f}" + ("" if time.compiled else f" {PYTHON_MARK}")
+
+
+def column_of_times(records: Sequence[Any]) -> dict[str, str]:
+    """Text of a table's column of times by name, with a mark for who lies on the front; empty where none is known.
+
+    Args:
+        records: tidy ones of one environment and scenario.
+    """
+    on_front = front(points_of_records(records))
+    return {
+        name: time_text(time) + (f" {FRONT_MARK}" if name in on_front else "")
+        for name, time in times_of_records(records).items()
+    }

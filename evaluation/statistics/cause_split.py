@@ -1,0 +1,179 @@
+"""Cost and consistency of a competitor split by cause: how much of them falls in turns, at the start, on outliers.
+
+Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and what remains:
+``other`` holds where no cause does. They may hold together, so shares need not add up to one. Whatever is compared is
+paired: both competitors have their means from the same resamples of the episodes.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy
+
+from ...envs.contract.causes import RESERVED
+from .bootstrap import Bootstrap, Estimate, ratio
+
+if TYPE_CHECKING:
+    import xarray
+
+EVERYTHING, START, OTHER = RESERVED
+"""Names of the whole, in the place of a cause, and of the causes that every evaluation adds."""
+CAUSE_METRICS = "cause_"
+"""Begins the names of metrics by cause."""
+VARIABLE = "causes"
+"""Of an evaluation: which causes hold, see :func:`.envs.causes.cause_number`."""
+COUNT, COST, NEES, JUDGED = range(4)
+"""What is summed where a cause holds: one, the cost, the NEES over its dimension, and one where there is a NEES."""
+
+
+class CauseMeasure(NamedTuple):
+    """A number of one competitor under one cause."""
+
+    metric: str
+    cause: str
+    estimate: Estimate
+    opponent: str = ""
+    """With whom it is compared."""
+
+
+class CauseCosts(NamedTuple):
+    """Mean cost of a measurement under each cause, in the data and in every resample."""
+
+    names: list[str]
+    """Of the causes, those that never hold left out; first ``EVERYTHING``."""
+    means: numpy.ndarray
+    """``(1 + resamples, causes)``."""
+
+    def of(self, cause: str) -> numpy.ndarray:
+        """Return those under a cause, ``(1 + resamples,)``."""
+        found: numpy.ndarray = self.means[:, self.names.index(cause)]
+        return found
+
+
+def cause_coords(names: Sequence[str], phrases: Sequence[str], start: int) -> dict[str, object]:
+    """Return the coordinates of an evaluation that say what its causes are.
+
+    Args:
+        names: of those that the environment declares, in their order.
+        phrases: that say when each holds.
+        start: how many measurements are the start of a track.
+    """
+    return {"cause": list(names), "cause_phrase": ("cause", list(phrases)), "start_measurements": start}
+
+
+def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
+    """Return what says when each cause of an evaluation holds, by name; nothing where it holds no causes."""
+    if "cause" not in dataset.coords:
+        return {}
+    declared = zip(dataset["cause"].values.tolist(), dataset["cause_phrase"].values.tolist(), strict=True)
+    first = f"in the first {int(dataset['start_measurements'])} measurements"
+    return {**dict(declared), START: first, OTHER: "where none of the causes holds"}
+
+
+def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
+    """Yield every cause and whether it holds at each measurement, booleans ``(episodes, time)``; the whole first.
+
+    Args:
+        run: one policy's part of an evaluation that holds causes.
+    """
+    numbers = numpy.nan_to_num(run[VARIABLE].values).astype(numpy.int64)
+    yield EVERYTHING, numpy.ones(numbers.shape, dtype=bool)
+    early = run["time"].values <= int(run["start_measurements"])
+    start = numpy.broadcast_to(early, numbers.shape)
+    for place, name in enumerate(run["cause"].values.tolist()):
+        yield name, (numbers >> place) & 1 > 0
+    yield START, start
+    yield OTHER, (numbers == 0) & ~start
+
+
+def cause_sums(run: "xarray.Dataset", nees: numpy.ndarray | None) -> numpy.ndarray:
+    """Sum what is split over the measurements in which each cause holds.
+
+    Args:
+        run: one policy's part of some episodes.
+        nees: over its dimension, ``(episodes, time)``, NaN where there is none; None where nobody says it.
+
+    Returns:
+        ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
+    """
+    cost = run["cost"].values
+    known = ~numpy.isnan(cost)
+    judged = numpy.zeros(cost.shape, dtype=bool) if nees is None else ~numpy.isnan(nees)
+    values = numpy.stack([known, numpy.where(known, cost, 0.0), numpy.zeros(cost.shape), judged])
+    if nees is not None:
+        values[NEES] = numpy.where(judged, nees, 0.0)
+    return numpy.stack(
+        [numpy.einsum("set,et->es", values, held) for _, held in held_causes(run)], axis=1, dtype=float
+    )
+
+
+def split(
+    sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
+) -> tuple[list[CauseMeasure], CauseCosts]:
+    """Split a competitor's cost and consistency by cause; causes that never hold are left out.
+
+    Args:
+        sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.
+        run: of whose variables none is needed.
+        bootstrap: over the episodes.
+
+    Returns:
+        For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement)
+        and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, to be compared.
+    """
+    names = [EVERYTHING, *run["cause"].values.tolist(), START, OTHER]
+    measures, present, costs = [], [], []
+    for name, own in zip(names, numpy.moveaxis(sums, 1, 0), strict=True):
+        if own[0, COUNT] <= 0.0:
+            continue
+        found = {
+            "cause_measurement_share": (own[:, COUNT], sums[:, 0, COUNT]),
+            "cause_cost_share": (own[:, COST], sums[:, 0, COST]),
+            "cause_cost": (own[:, COST], own[:, COUNT]),
+            "cause_anees": (own[:, NEES], own[:, JUDGED]),
+        }
+        ratios = {metric: ratio(numpy.stack(both, axis=1)) for metric, both in found.items()}
+        measures += [CauseMeasure(metric, name, bootstrap.interval(each)) for metric, each in ratios.items()]
+        present.append(name)
+        costs.append(ratios["cause_cost"])
+    return measures, CauseCosts(present, numpy.stack(costs, axis=1))
+
+
+def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
+    """Weigh causes by how much of the cost falls under them, and how much dearer a measurement is there.
+
+    The share of the cost times the logarithm of the mean cost under the cause over that of all measurements: much cost
+    in few measurements weighs most, a cause that holds nearly always little.
+
+    Args:
+        cost_share: of the whole cost, of any shape.
+        measurement_share: of all measurements, likewise.
+
+    Returns:
+        Weights of that shape; zero where no cost falls.
+    """
+    some = (cost_share > 0.0) & (measurement_share > 0.0)
+    dearer = numpy.divide(cost_share, measurement_share, out=numpy.ones_like(cost_share), where=some)
+    return numpy.where(some, cost_share, 0.0) * numpy.log(dearer)
+
+
+def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
+    """Return with whom a competitor is compared: the cheapest other one that is ranked; empty where there is nobody.
+
+    Args:
+        name: of the competitor.
+        costs: mean costs by name.
+        ranked: names of those that are ranked; of the others one is taken where no ranked one is left.
+    """
+    others = [other for other in costs if other != name]
+    return min([other for other in others if other in ranked] or others, key=costs.__getitem__, default="")
+
+
+def compare(
+    own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
+) -> Iterator[CauseMeasure]:
+    """Compare the cost under every cause, paired: ``cause_cost_ratio``, that of a competitor over its opponent's."""
+    for name in own.names:
+        if name in other.names:
+            both = numpy.stack([own.of(name), other.of(name)], axis=1)
+            yield CauseMeasure("cause_cost_ratio", name, bootstrap.interval(ratio(both)), opponent)

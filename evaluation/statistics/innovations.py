@@ -1,0 +1,76 @@
+"""Innovations of recorded measurements: measured less predicted, in the sensor's units, of whoever estimates.
+
+What is predicted follows from the estimate after the measurement before, as the log format of the environment says. A
+filter whose model is that of the log has innovations that are white: successive ones are not correlated. Intervals are
+those of :mod:`.predictions`, which one recording has, too.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+from ...envs.contract.task import Task
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
+    """Return an evaluation of a recording with the variable ``prediction_error`` (policy, episode, time, measured).
+
+    NaN where nothing was received, at the first measurement, and of a smoother, which predicts nothing. Where no log
+    format says what an estimate predicts, or no estimates were kept, the evaluation stays as it is.
+
+    Args:
+        dataset: of an evaluation with tracks.
+        task: of the recording.
+    """
+    log_format = type(task).log_format
+    if log_format is None or log_format.predict is None or "estimate" not in dataset:
+        return dataset
+    innovations = []
+    for name in dataset["policy"].values:
+        run = dataset.sel(policy=name)
+        estimate = run["estimate"].transpose("component", "episode", "time").values
+        before = numpy.roll(estimate, 1, axis=2)
+        before[:, :, 0] = numpy.nan
+        if str(run["kind"].values) == "smoother":
+            before[:] = numpy.nan
+        predicted, measured = log_format.predict(before, _Measured(run), task.parameters)
+        innovations.append(numpy.moveaxis(measured - predicted, 0, -1))
+    values = numpy.stack(innovations)
+    quantities = log_format.predicted[: values.shape[-1]]
+    return dataset.assign(prediction_error=(("policy", "episode", "time", "measured"), values)).assign_coords(
+        measured=[quantity.name for quantity in quantities],
+        measured_unit=("measured", [quantity.unit for quantity in quantities]),
+        measured_group=("measured", [quantity.group for quantity in quantities]),
+    )
+
+
+def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
+    """What was measured of what estimates predict, ``(m, episodes, time)``; None where nobody predicts.
+
+    Args:
+        run: one competitor's part of an evaluation with tracks.
+        task: of the recording.
+    """
+    log_format = type(task).log_format
+    if log_format is None or log_format.predict is None or "estimate" not in run:
+        return None
+    estimate = run["estimate"].transpose("component", "episode", "time").values
+    found: numpy.ndarray = log_format.predict(estimate, _Measured(run), task.parameters)[1]
+    return found
+
+
+class _Measured:
+    """Measurements of one competitor's part of a dataset by attribute, ``(..., episodes, time)``."""
+
+    def __init__(self, run: "xarray.Dataset") -> None:
+        self._run = run
+
+    def __getattr__(self, name: str) -> Any:
+        key = f"measurement_{name}"
+        if name.startswith("_") or key not in self._run:
+            raise AttributeError(name)
+        array: numpy.ndarray = self._run[key].values
+        return numpy.moveaxis(array, -1, 0) if array.ndim > 2 else array

@@ -1,0 +1,67 @@
+"""What was written as JSON is what is read, or is refused."""
+
+import reprlib
+import types
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints, is_typeddict
+
+from ...envs.data import foreign_files
+
+Stored = TypeVar("Stored")
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it cannot be read, or breaks a limit of :mod:`~filtergym.envs.foreign_files`.
+    """
+    try:
+        return foreign_files.read_json(path)
+    except FileNotFoundError:
+        raise
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def restore(cls: type[Stored], values: Any) -> Stored:
+    """Make a dataclass or named tuple from its fields.
+
+    Raises:
+        ValueError: if a field is missing, unknown, or not of its declared type.
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"expected the fields of a {cls.__name__}, got {reprlib.repr(values)}")
+    try:
+        found = cls(**values)
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    for name, hint in get_type_hints(cls).items():
+        value = getattr(found, name)
+        if not fits(value, hint):
+            raise ValueError(f"{name} must be {getattr(hint, '__name__', hint)}, got {reprlib.repr(value)}")
+    return found
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Say whether a value from JSON is of a declared type; a whole number is a float, too."""
+    origin, of = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin is types.UnionType:
+        return any(fits(value, other) for other in of)
+    if origin is list:
+        return isinstance(value, list) and all(fits(item, of[0]) for item in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(fits(item, of[1]) for item in value.values())
+    if is_typeddict(hint):
+        hints = get_type_hints(hint)
+        return (
+            isinstance(value, dict)
+            and hint.__required_keys__ <= value.keys() <= hints.keys()
+            and all(fits(item, hints[name]) for name, item in value.items())
+        )
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, int | float if hint is float else hint)

@@ -1,0 +1,269 @@
+"""An advice as one self-contained page: sentences, tables, the checks of the log, and pictures of what was found.
+
+Time in pictures is in seconds since the first row of the log.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ...baselines.advice import Advice
+from ...baselines.fitting import DROP
+from ...envs.contract.task import Task
+from ...evaluation.competitors.likelihood import Span
+from ...evaluation.running.metrics import chi_square_band
+from ...evaluation.statistics.innovations import received
+from ..tables.advice import (
+    COLUMNS,
+    ParameterText,
+    advice_rows,
+    parameter_name,
+    parameter_size,
+    parameter_text,
+    verdict,
+)
+from ..tables.results import Settings
+from .html_page import pack, render_page
+
+MOST_EPISODES = 12
+"""That are drawn."""
+MOST_POINTS = 4000
+"""Of a line; of longer recordings every second, third ... is drawn."""
+WINDOWS_OF_NIS = 40
+"""Into which a recording is cut for its mean NIS, at most, and measurements of one, at least."""
+SHORTEST_WINDOW = 10
+DIGITS = 6
+ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
+
+
+class LogFacts(NamedTuple):
+    """What a log holds, and what was found in it."""
+
+    facts: list[tuple[str, str]]
+    notes: tuple[str, ...]
+
+
+def advice_html(
+    advice: Advice, task: Task, sentences: Sequence[str], learned: Sequence[str], settings: Settings
+) -> str:
+    """Return the page.
+
+    Args:
+        advice: of :func:`~..baselines.advice.advise`.
+        task: of the recording, with its parameters.
+        sentences: what is said of it after the first one.
+        learned: names of shipped agents.
+        settings: how it was made.
+    """
+    return render_page(
+        "advice.html.jinja",
+        "advice.js",
+        name=advice.recording.name,
+        verdict=verdict(advice),
+        sentences=sentences,
+        fitted=advice.fitted.name,
+        advised=advice.advised.name,
+        parameters=list(_parameters(advice, advice.fitted.name)),
+        rows=list(advice_rows(advice, learned)),
+        columns=[title.replace("-\n", "") for title in COLUMNS],
+        families=[
+            (name, list(_parameters(advice, name))) for name in advice.fits if name not in advice.diverging
+        ],
+        has_truth=advice.recording.truth is not None,
+        rival=advice.rival,
+        diverging=advice.diverging,
+        log=_log_facts(advice, task),
+        settings=settings,
+        figures=pack(
+            {
+                "names": _shown(advice),
+                "episodes": list(_episodes(advice, task)),
+                "profiles": list(_profiles(advice)),
+                "drop": DROP,
+            }
+        ),
+        has_track=received(advice.replay.isel(policy=0), task) is not None,
+        has_innovations="prediction_error" in advice.replay,
+        has_nis="nis" in advice.replay,
+    )
+
+
+def _shown(advice: Advice) -> list[str]:
+    """Who is drawn: the advised one first."""
+    return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
+
+
+def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
+    """Parameters of a fitted filter in words; intervals where they were computed."""
+    tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
+    for key, value in found.values.items():
+        interval = profiles[key].interval if key in profiles else None
+        yield parameter_name(key), parameter_text(key, value, interval, tunable, key in found.at_limit)
+
+
+def _log_facts(advice: Advice, task: Task) -> LogFacts:
+    """Count what is in the log."""
+    recording, share = advice.recording, advice.share
+    total = int(recording.rows.sum())
+    steps = numpy.diff(recording.seconds, axis=1)
+    steps = steps[numpy.isfinite(steps)]
+    duration = float(numpy.nansum(numpy.nanmax(recording.seconds, axis=1) + recording.started))
+    facts = [("measurements after the start of the track", f"{total:,}"), ("duration", f"{duration:,.6g} s")]
+    if len(recording.names) > 1:
+        facts.insert(0, ("tracks", f"{len(recording.names):,}"))
+    if len(steps):
+        facts.append(("interval", f"{numpy.median(steps):.4g} s in the median, {steps.max():.4g} s at most"))
+    available = recording.measurements.get("available")
+    if available is not None:
+        there = numpy.isfinite(recording.seconds)
+        missed = there & ~(available > 0.0)
+        facts.append(
+            ("without a measurement", f"{missed.sum():,} ({100.0 * missed.sum() / there.sum():.1f} %)")
+        )
+        if missed.any():
+            facts.append(("longest gap", f"{_longest_gap(recording.seconds, available):.4g} s"))
+    facts += [
+        (name.replace("_", " "), f"{value:g}, as the log states it")
+        for name, value in recording.typical.items()
+    ]
+    facts.append(("truth", "in the log" if recording.truth is not None else "none"))
+    counts = [
+        sum(span.last - span.first for span in spans) for spans in (share.fitted, share.chosen, share.judged)
+    ]
+    facts.append(
+        (
+            "measurements that are fitted, that choose, that judge",
+            " / ".join(f"{count:,}" for count in counts),
+        )
+        if share.apart
+        else ("use of them", "too few to be shared out: all are fitted, choose and judge")
+    )
+    return LogFacts(facts, recording.notes)
+
+
+def _longest_gap(seconds: numpy.ndarray, available: numpy.ndarray) -> float:
+    """Longest time from one measurement to the next, s."""
+    times = [each[there > 0.0] for each, there in zip(seconds, available, strict=True)]
+    return max((float(numpy.nanmax(numpy.diff(each))) for each in times if len(each) > 1), default=0.0)
+
+
+# --- pictures
+
+
+def _episodes(advice: Advice, task: Task) -> Iterator[dict[str, Any]]:
+    """What is drawn of each track of the recording."""
+    replay, recording = advice.replay, advice.recording
+    for episode in range(min(replay.sizes["episode"], MOST_EPISODES)):
+        rows = min(int(recording.rows[episode]), replay.sizes["time"])
+        run = replay.isel(episode=[episode], time=slice(0, rows))
+        seconds = recording.seconds[episode, :rows] + recording.started[episode]
+        step = -(-rows // MOST_POINTS)
+        found = {
+            "name": recording.names[episode],
+            "seconds": _numbers(seconds[::step]),
+            "spans": list(_spans(advice, episode, seconds)),
+            **_track(run, task, _shown(advice), step),
+            **_innovations(run, advice.advised.name, step),
+        }
+        if "nis" in run:
+            found["nis"] = [_mean_nis(run, name, seconds) for name in _shown(advice)]
+        yield found
+
+
+def _numbers(values: numpy.ndarray) -> list[float | None]:
+    """Numbers as JSON has them, in few digits."""
+    return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in values]
+
+
+def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tuple[str, float, float]]:
+    """What each stretch of the track served for, from which second to which."""
+    share = advice.share
+    if not share.apart:
+        return
+    spans: list[tuple[str, Span]] = [
+        (role, span) for role in ROLES for span in getattr(share, role) if span.episode == episode
+    ]
+    for role, span in spans:
+        first, last = min(span.first, len(seconds) - 1), min(span.last, len(seconds) - 1)
+        yield ROLES[role], float(seconds[first]), float(seconds[last])
+
+
+def _track(run: xarray.Dataset, task: Task, names: Sequence[str], step: int) -> dict[str, Any]:
+    """Where the target was measured, estimated and truly was: of a plane its two axes, else the main component."""
+    measured = received(run.isel(policy=0), task)
+    if measured is None or task.log_format is None:
+        return {}
+    group = task.log_format.predicted[0].group
+    components = list(task.groups.get(group, (group,)))[:2]
+    units = [component.unit for component in task.components if component.name in components]
+    chosen = run.sel(component=components).isel(episode=0, time=slice(None, None, step))
+    found: dict[str, Any] = {
+        "components": [
+            f"{name.replace('_', ' ')}, {unit}" for name, unit in zip(components, units, strict=True)
+        ],
+        "measured": [_numbers(values[0, ::step]) for values in measured[: len(components)]],
+        "estimates": [
+            [
+                _numbers(values)
+                for values in chosen["estimate"].sel(policy=name).transpose("component", "time").values
+            ]
+            for name in names
+        ],
+    }
+    if "truth" in chosen:
+        true = chosen["truth"].isel(policy=0).transpose("component", "time").values
+        found["truth"] = [_numbers(values) for values in true]
+    return found
+
+
+def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
+    """Innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
+    if "prediction_error" not in run or "nis" not in run:
+        return {}
+    groups = run["measured_group"].values
+    one = run.sel(policy=name).isel(episode=0, measured=groups == groups[0])
+    values, nis = one["prediction_error"].values, one["nis"].values
+    length = numpy.sqrt((values**2).sum(axis=-1))
+    with numpy.errstate(divide="ignore", invalid="ignore"):
+        scaled = values * (numpy.sqrt(nis) / length)[:, None]
+    return {
+        "measured_names": [str(each) for each in one["measured"].values],
+        "innovations": [_numbers(each[::step]) for each in scaled.T],
+    }
+
+
+def _mean_nis(run: xarray.Dataset, name: str, seconds: numpy.ndarray) -> dict[str, Any]:
+    """Mean NIS over its dimension in windows of the recording, and the chi-square band of each, over seconds."""
+    nis, degrees = (run[key].sel(policy=name).values[0] for key in ("nis", "nis_degrees"))
+    there = numpy.flatnonzero(numpy.isfinite(nis) & (degrees > 0.0))
+    size = max(SHORTEST_WINDOW, -(-len(there) // WINDOWS_OF_NIS))
+    windows = [there[i : i + size] for i in range(0, len(there) - size + 1, size)]
+    total = numpy.array([degrees[window].sum() for window in windows])
+    low, high = chi_square_band(total) if len(total) else (total, total)
+    return {
+        "size": size,
+        "seconds": _numbers(numpy.array([seconds[window].mean() for window in windows])),
+        "mean": _numbers(numpy.array([nis[window].sum() / degrees[window].sum() for window in windows])),
+        "low": _numbers(low / total),
+        "high": _numbers(high / total),
+    }
+
+
+def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
+    """Likelihood of every parameter of the fitted filter, the others adapted."""
+    name = advice.fitted.name
+    for key, profile in advice.profiles[name].items():
+        plain = key.removeprefix("log10_")
+        unit = advice.tunables[name].units.get(plain, "")
+        values = numpy.array([parameter_size(key, value) for value in profile.values])
+        yield {
+            "title": parameter_name(key) + (f", {unit}" if unit else ""),
+            "is_log": key.startswith("log10_"),
+            "values": _numbers(values),
+            "drops": _numbers(profile.drops),
+            "ends": [parameter_size(key, profile.interval.low), parameter_size(key, profile.interval.high)],
+            "best": parameter_size(key, advice.fits[name].values[key]),
+        }

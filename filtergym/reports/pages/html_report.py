@@ -1,0 +1,353 @@
+"""One self-contained page from a file of results: it opens offline, and executes nothing of what the file says."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
+from ...evaluation.running.metrics import Record
+from ...evaluation.running.times import (
+    TIME_TITLE,
+    column_of_times,
+    front,
+    points_of_records,
+    times_of_records,
+)
+from ..tables.headline import headline
+from ..tables.ranking import origin, ranking_sentence, remarks
+from ..tables.results import Result, Settings, serialise_datasets
+from ..tables.terminal_tables import (
+    against_paper,
+    consistency_word,
+    main_components,
+    rank_competitors,
+    score_text,
+    with_interval,
+)
+from .front_picture import front_images
+from .html_page import pack, render_page
+from .outcome import outcome_sentences, protocol_sentences
+from .why_section import why_section, worst_data
+
+WORDS = ("competitor", "covariance", "origin", "control")
+"""Columns that hold no numbers."""
+
+
+class Entry(NamedTuple):
+    """One cell of a table."""
+
+    text: str
+    sorted_by: float | str | None = None
+    """None: stands last, whatever the order."""
+
+
+def report_html(results: Sequence[Result], settings: Settings) -> str:
+    """Return the page.
+
+    Args:
+        results: of any environments and scenarios.
+        settings: how they were made.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if not results:
+        raise ValueError("there are no results to report")
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result.environment, []).append(result)
+    environments = [
+        {
+            "id": id,
+            "anchor": f"e{number}",
+            "dots": pack(_dots(group)) if len(group) > 1 else None,
+            "paper": group[0].paper,
+            "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
+        }
+        for number, (id, group) in enumerate(groups.items())
+    ]
+    return render_page(
+        "report.html.jinja",
+        "report.js",
+        outcome=outcome_sentences(results),
+        protocol=protocol_sentences(results),
+        fronts=front_images(results),
+        remarks=remarks(results),
+        headline=headline(results),
+        environments=environments,
+        settings=settings,
+        words=WORDS,
+        not_causal=NOT_CAUSAL,
+        first=results[0].records[0],
+    )
+
+
+def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any]:
+    """What the template shows of an environment in a scenario."""
+    first = result.records[0]
+    header, rows = _table(result)
+    return {
+        "anchor": anchor,
+        "result": result,
+        "episodes": first.episodes,
+        "split": first.split,
+        "seed": first.seed,
+        "sentence": ranking_sentence(result.records, result.paper, result.learned),
+        "header": header,
+        "rows": rows,
+        "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
+        "why": why_section(result),
+        "figures": _figures(result),
+        "data": pack(
+            {
+                "lines": _lines(result, group),
+                "paper": result.paper,
+                "ranking": _differences(result),
+                "front": _front(result),
+                "worst": worst_data(result),
+                **serialise_datasets(result),
+            }
+        ),
+    }
+
+
+def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
+    """Header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
+    records = result.records
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    shown = main_components(records)
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+
+    def number(name: str, metric: str, component: str, scale: float = 1.0) -> Entry:
+        record = found.get((name, metric, component, "all"))
+        text = with_interval(record, scale, negligible=0.005 if scale == 100.0 else 0.0)
+        return Entry(text, None if record is None else record.value)
+
+    against = f"cost against {result.paper or 'paper'}, %"
+    header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
+    times, texts = times_of_records(records), column_of_times(records)
+    header += [TIME_TITLE] * bool(times)
+    header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
+    predicted = {r.component: r.unit for r in records if r.metric == "prediction_error"}
+    for group, unit in predicted.items():
+        header += [f"error of predicted {group}, {unit}", f"correlation of successive ones, {group}"]
+    header += ["origin", "control"]
+    rows = []
+    for name, kind, control in rank_competitors(records):
+        median, wins = against_paper(found, name)
+        nees = found.get((name, "anees", "state", "all"))
+        value = None if nees is None else nees.value
+        score = found.get((name, "score", "", "all"))
+        rows.append(
+            [
+                Entry(name, name),
+                number(name, "relative_cost_difference", "", 100.0),
+                Entry(median, _number(median)),
+                Entry(wins, _number(wins)),
+                Entry("-" if value is None else f"{value:.3g}", value),
+                Entry(consistency_word(nees), consistency_word(nees)),
+                Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
+                *[
+                    Entry(texts.get(name, "-"), times[name].nanoseconds if name in times else None)
+                    for _ in range(bool(times))
+                ],
+                *(number(name, "rmse", component) for component in shown),
+                *(
+                    number(name, metric, group)
+                    for group in predicted
+                    for metric in ("prediction_error", "innovation_correlation")
+                ),
+                Entry(origin(result, name, kind), origin(result, name, kind)),
+                Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
+            ]
+        )
+    return header, rows
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text.replace(",", ""))
+    except ValueError:
+        return None
+
+
+def _differences(result: Result) -> list[list[Any]]:
+    """Name, and cost against the paper's algorithm with its interval in percent, of the ranked and the reference."""
+    found: dict[str, Record] = {
+        r.policy: r for r in result.records if (r.metric, r.window) == ("relative_cost_difference", "all")
+    }
+    rows = []
+    for name, kind, _ in rank_competitors(result.records):
+        record = found.get(name)
+        if record is None or record.value is None or (kind not in RANKED and name != result.reference):
+            continue
+        low, high = (record.value if end is None else end for end in (record.low, record.high))
+        rows.append([name, origin(result, name, kind), *(100.0 * x for x in (record.value, low, high))])
+    return rows
+
+
+def _front(result: Result) -> list[list[Any]]:
+    """Name, origin, nanoseconds, cost against the paper's algorithm in percent, whether compiled, and whether on the
+    front, of the ranked and the reference.
+    """
+    points = points_of_records(result.records)
+    on_front = front(points)
+    return [
+        [
+            p.name,
+            origin(result, p.name, p.kind),
+            p.time.nanoseconds,
+            p.cost,
+            p.time.compiled,
+            p.name in on_front,
+        ]
+        for p in points
+        if p.kind in RANKED or p.name == result.reference
+    ]
+
+
+def _dots(group: Sequence[Result]) -> dict[str, Any]:
+    """What the picture over all scenarios of an environment shows: the competitors of the curves of the training
+    distribution, of which the verdict speaks; where it was not run, of the first scenario.
+    """
+    shown = next((result for result in group if result.default), group[0])
+    return {
+        "paper": group[0].paper,
+        "lines": [line for line in _lines(shown, group) if line["origin"] not in ("bound", "smoother")],
+        "scenarios": [
+            [result.scenario, "training" if result.training else "held out", _differences(result)]
+            for result in group
+        ],
+    }
+
+
+def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
+    """Name, origin and colour of what is drawn; a name has the same colour in all scenarios of its environment."""
+    names: dict[str, str] = {}
+    for one in [*(other for other in group if other.default), *group]:
+        kinds = {record.policy: record.kind for record in one.records}
+        present = [] if one.curves is None else [str(name) for name in one.curves["policy"].values.tolist()]
+        for name in present:
+            names.setdefault(name, origin(one, name, kinds.get(name, "policy")))
+    # Learned ones first: there are fewer colours than names.
+    coloured = sorted(
+        (name for name, where in names.items() if where not in ("paper", "reference", "bound", "smoother")),
+        key=lambda name: names[name] != "learned",
+    )
+    own = names if result.curves is None else map(str, result.curves["policy"].values.tolist())
+    return [
+        {
+            "name": name,
+            "origin": names[name],
+            "colour": coloured.index(name) if name in coloured else None,
+        }
+        for name in own
+    ]
+
+
+def _figures(result: Result) -> list[dict[str, str]]:
+    """Figures of a scenario: what each is called, what it shows in words, and what reads it instead of looking."""
+    found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
+    order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
+
+    def in_words(metric: str, component: str, names: Sequence[str]) -> str:
+        parts = []
+        for name in names:
+            record = found.get((name, metric, component))
+            if record is not None and record.value is not None:
+                parts.append(f"{name} {record.value:.3g}{'' if record.unit == '1' else ' ' + record.unit}")
+        return ", ".join(parts)
+
+    figures = []
+    if _differences(result):
+        figures.append(
+            {
+                "kind": "ranking",
+                "title": f"Cost against {result.paper or 'the paper'}",
+                "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
+                "alternative": "The table above holds these numbers.",
+            }
+        )
+    if points := points_of_records(result.records):
+        figures.append(
+            {
+                "kind": "front",
+                "title": "Cost and time",
+                "text": "Mean cost against the processor time of a measurement, of simulated world and competitor "
+                "together. Nobody else costs less in as much time as those on the front, the line; open: asked in "
+                "Python.",
+                "alternative": f"On the front, the quickest first: {', '.join(front(points))}.",
+            }
+        )
+    if result.curves is not None and "rmse" in result.curves:
+        component = str(result.curves["quantity"].values[0])
+        figures += [
+            {
+                "kind": "rmse",
+                "title": "Error over time",
+                "text": "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second "
+                "one all again.",
+                "alternative": f"RMSE of {component} over the whole run: {in_words('rmse', component, order[:6])}.",
+            },
+            {
+                "kind": "exceeded",
+                "title": "Distribution of errors",
+                "text": "Share of measurements whose error is larger.",
+                "alternative": f"Largest RMSE at any time: {in_words('peak_rmse', component, order[:6])}.",
+            },
+        ]
+    if result.curves is not None and {"cost_minus_paper", "cost_minus_best"} & set(result.curves):
+        figures.append(
+            {
+                "kind": "difference",
+                "title": "Mine minus theirs over time",
+                "text": "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero "
+                "is better.",
+                "alternative": "The difference over the whole run stands in the table above.",
+            }
+        )
+    if result.curves is not None and {"anees", "anis"} & set(result.curves):
+        figures.append(
+            {
+                "kind": "consistency",
+                "title": "Consistency",
+                "text": "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is "
+                "consistent; the band holds 95 % of a consistent estimator's (chi-square).",
+                "alternative": f"Mean NEES over its dimension: {in_words('anees', 'state', order[:6])}.",
+            }
+        )
+    if result.curves is not None and BEHAVIOUR_CURVES & set(result.curves):
+        figures.append(
+            {
+                "kind": "steering",
+                "title": "Gains, weights and actions over time",
+                "text": "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten "
+                "episodes of an action or a gain.",
+                "alternative": "What each competitor steers, and how, says the page of the environment.",
+            }
+        )
+    if result.track is not None:
+        figures.append(
+            {
+                "kind": "track",
+                "title": "A track to look at",
+                "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, "
+                "what was measured, estimates, and their covariances at two standard deviations. Move the slider.",
+                "alternative": "An animation of one episode; its numbers are in the table above, over all episodes.",
+            }
+        )
+    if any(one.track is not None for one in result.worst):
+        figures.append(
+            {
+                "kind": "worst",
+                "title": "The worst episodes",
+                "text": "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, "
+                "estimates, and their covariances at two standard deviations. The slider begins where "
+                "the error is largest.",
+                "alternative": "An animation of single episodes; the tables of the causes tell their seeds and costs.",
+            }
+        )
+    return figures
+
+
+BEHAVIOUR_CURVES = {"mode_probability", "true_class_probability", "action", "gain"}
+"""Curves of what competitors do."""

@@ -1,0 +1,197 @@
+"""What a benchmark comes to: one sentence for each environment, for readers who know nothing of this package."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ...evaluation.competitors.kinds import RANKED
+from ...evaluation.running.metrics import Record
+from ...evaluation.running.times import EQUAL_TIMES, times_of_records
+from ..tables.ranking import Place, ranking
+from ..tables.results import Result
+
+HALF = (0.45, 0.55)
+"""Share of the paper's cost that is called half of it."""
+
+
+def outcome_sentences(results: Sequence[Result]) -> list[str]:
+    """Say of each environment how the best competitor stands to the paper's algorithm, and learned to classical ones.
+
+    Two competitors are called level where the interval of their paired difference holds zero.
+
+    Args:
+        results: of which those of training distributions are taken; where there is none, all.
+    """
+    usual = [result for result in results if result.default] or list(results)
+    return [sentence_of(result) for result in usual if ranking(result.records, result.learned)]
+
+
+def protocol_sentences(results: Sequence[Result]) -> list[str]:
+    """Say what the sentences and the table below them rest on.
+
+    Args:
+        results: as of :func:`outcome_sentences`.
+    """
+    records = [result.records[0] for result in results if result.default or not _any_default(results)]
+    episodes = sorted({record.episodes for record in records})
+    first = records[0]
+    each = " to ".join(f"{number:,}" for number in dict.fromkeys((episodes[0], episodes[-1])))
+    return [
+        f"Every competitor met the same {each} episodes of an environment ({first.split} split, seed {first.seed}). "
+        "Ranges hold 95 %; competitors are level where that of their difference holds zero. Error cost is the mean "
+        "squared error of the estimate, in a control loop the loop's quadratic cost; times are of one processor core."
+    ]
+
+
+def _any_default(results: Sequence[Result]) -> bool:
+    return any(result.default for result in results)
+
+
+def sentence_of(result: Result) -> str:
+    """Return the sentence on one environment and scenario, in which somebody is ranked."""
+    places = ranking(result.records, result.learned)
+    best = places[0]
+    clauses = [_best_clause(result, best)]
+    learned_is_best = best.role == "learned"
+    rival = next((place for place in places if (place.role == "learned") != learned_is_best), None)
+    origin = "classical" if learned_is_best else "learned"
+    if rival is None:
+        if result.learned or learned_is_best:
+            return f"{_subject(result)}: {clauses[0]}."
+        return f"{_subject(result)}: {clauses[0]}; no learned competitor takes part."
+    clause = f"the best {origin} one, `{rival.name}`, "
+    behind = rival.behind
+    if behind is None or behind.value is None:
+        clause += "costs more"
+    elif behind.low is None or behind.high is None or behind.low <= 0.0:
+        clause += "is level with it"
+    elif behind.value >= 1.0:
+        times, low, high = (f"{1.0 + share:.2g}" for share in (behind.value, behind.low, behind.high))
+        clause += f"costs {times} times as much ({low} to {high} times)"
+    else:
+        clause += f"is {_percent(behind.value)} % behind it ({_range(behind.low, behind.high)})"
+    if (lead := find_lead(result.records, places, origin)) is not None:
+        place = f"where a measurement may take {_times(lead)}"
+        if lead.name == rival.name:
+            clause += f", and leads {place}"
+        else:
+            clause += f"; {place}, the {origin} `{lead.name}` leads"
+    return f"{_subject(result)}: {clauses[0]}; {clause}."
+
+
+def _subject(result: Result) -> str:
+    return result.short if result.default else f"{result.short}, scenario `{result.scenario}`"
+
+
+def _best_clause(result: Result, best: Place) -> str:
+    """Say who costs least, and how much less than the paper's algorithm."""
+    if best.name == result.paper:
+        return f"the paper's `{best.name}` has the lowest error cost"
+    kinds = {record.policy: record.kind for record in result.records}
+    what = "learned" if best.role == "learned" else "classical"
+    name = f"the {what} {'filter' if kinds[best.name] == 'estimator' else 'policy'} `{best.name}`"
+    found = next(
+        (
+            r
+            for r in result.records
+            if (r.policy, r.metric, r.window) == (best.name, "relative_cost_difference", "all")
+        ),
+        None,
+    )
+    if found is None or found.value is None or not result.paper:
+        return f"{name} has the lowest error cost"
+    paper = f"the paper's `{result.paper}`"
+    low, high = (found.value if end is None else end for end in (found.low, found.high))
+    if high >= 0.0:
+        return f"{name} is level with {paper}"
+    less = _range(-high, -low)
+    if HALF[0] <= 1.0 + found.value <= HALF[1]:
+        return f"{name} has half the error cost of {paper} ({less} less)"
+    return f"{name} has {_percent(-found.value)} % less error cost than {paper} ({less})"
+
+
+class Lead(NamedTuple):
+    """Times of a measurement for which the cheapest of one origin costs less than the cheapest of the other."""
+
+    name: str
+    """Who leads where the most time is allowed."""
+    first: float
+    """From so many nanoseconds on."""
+    last: float
+    """Up to the time of the competitor that ends the lead."""
+
+
+def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -> Lead | None:
+    """Return where competitors of an origin lead in computing time, though another one costs least of all.
+
+    Someone leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of the
+    other origin that takes no more time: a stricter test than that of their paired difference, which records hold only
+    against the best.
+
+    Args:
+        records: of one environment and scenario.
+        places: of :func:`.ranking.ranking`.
+        origin: "learned" or "classical", that of the best excluded.
+
+    Returns:
+        The longest times for which they lead; None where they lead nowhere, or times are not known.
+    """
+    times = {name: time.nanoseconds for name, time in times_of_records(records).items()}
+    costs = {
+        r.policy: r
+        for r in records
+        if (r.metric, r.window) == ("relative_cost_difference", "all")
+        and r.kind in RANKED
+        and r.value is not None
+    }
+    known = [place for place in places if place.name in times and place.name in costs]
+    allowed = sorted({times[place.name] for place in known})
+    lead: Lead | None = None
+    for first, last in itertools.pairwise([*allowed, math.inf]):
+        # Places are in the order of their cost.
+        mine, other = (
+            next(
+                (
+                    place.name
+                    for place in known
+                    if ((place.role == "learned") == (origin == "learned")) is own
+                    and times[place.name] <= first * (1.0 if own else EQUAL_TIMES)
+                ),
+                None,
+            )
+            for own in (True, False)
+        )
+        if mine is None or other is None or not _high(costs[mine]) < _low(costs[other]):
+            continue
+        begins = lead.first if lead is not None and lead.last == first else first
+        lead = Lead(mine, begins, last)
+    return lead
+
+
+def _low(record: Record) -> float:
+    return record.value or 0.0 if record.low is None else record.low
+
+
+def _high(record: Record) -> float:
+    return record.value or 0.0 if record.high is None else record.high
+
+
+def _percent(share: float) -> str:
+    """Per cent in two digits, or in three where that is nearly all."""
+    percent = 100.0 * share
+    digits = 1 if abs(percent) < 9.95 or 99.0 <= percent < 100.0 else 0
+    return f"{percent:,.{digits}f}"
+
+
+def _range(low: float, high: float) -> str:
+    return f"{_percent(low)} to {_percent(high)} %"
+
+
+def _times(lead: Lead) -> str:
+    first, last = (_nanoseconds(end) for end in (lead.first, lead.last))
+    return f"at least {first} ns" if math.isinf(lead.last) else f"{first} to {last} ns"
+
+
+def _nanoseconds(time: float) -> str:
+    return "" if math.isinf(time) else f"{float(f'{time:.2g}'):,.0f}"

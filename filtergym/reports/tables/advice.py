@@ -1,0 +1,448 @@
+"""An advice in words and as a table: which filter, which numbers, and why."""
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy
+from rich.table import Table
+
+from ...baselines.advice import APART, Advice, Competitor
+from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
+from ...baselines.table import Tunable
+from ...envs.data.recording import Recording
+from ...evaluation.statistics.bootstrap import Estimate
+
+MOST_OUTLIERS = 12
+"""Named in a sentence."""
+MOST_ROWS = 12
+LEAST_CORRELATION = 0.1
+"""Of successive prediction errors, from which on it is spoken of."""
+SMALL_SCALE = 0.3
+"""Of the noise, below which most of the error must last longer than a measurement, or is not as stated."""
+LARGE_SCALE = 5.0
+"""Above which what was measured may be no motion."""
+NAME_WIDTH = 16
+"""Columns of a name; longer ones go on below."""
+COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
+"""Of the table, and how wide they are at least, so that no number is cut."""
+NEGLIGIBLE = 5e-4
+"""Difference of errors that is none in the digits of a sentence."""
+FEW = 80
+"""Measurements below which an advice warns."""
+
+
+def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
+    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and whoever follows.
+
+    Args:
+        advice: of :func:`~..baselines.advice.advise`.
+        learned: names of shipped agents.
+    """
+    recording = advice.recording
+    has_truth = recording.truth is not None
+    judged = sum(span.last - span.first for span in advice.share.judged)
+    table = Table(
+        title=f"{recording.name}: {judged:,} measurements that judge (95 % intervals)", title_justify="left"
+    )
+    table.add_column("filter", no_wrap=True)
+    for title, width in COLUMNS.items():
+        table.add_column(title, justify="right", min_width=width)
+    for row in advice_rows(advice, learned):
+        table.add_row("\n".join(textwrap.wrap(row.label, NAME_WIDTH)), *row.cells)
+    what = "estimates" if has_truth else "predictions"
+    table.caption = (
+        "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
+        f"\nless, against: paired with {advice.rival}, the rival: what one would take of the shipped ones by the "
+        f"measurements that chose, on those that judge; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large "
+        "as predicted; correlation: of successive prediction errors, 0 where they are white."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+class Row(NamedTuple):
+    """A row of the table of an advice."""
+
+    competitor: Competitor
+    label: str
+    cells: tuple[str, ...]
+    """In the order of ``COLUMNS``."""
+
+
+def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
+    """Return what stands in the table: the advised filter first; arguments as of :func:`advice_table`."""
+    has_truth = advice.recording.truth is not None
+    known = advice.rival, advice.best_shipped
+    keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
+    room = MOST_ROWS - len(keep)
+    rest = [c for c in advice.competitors if c not in keep]
+    agents = [c for c in rest if c.name in learned]
+    keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
+    for one in [c for c in advice.competitors if c in keep]:
+        cells = (
+            _number(one.log_likelihood),
+            _interval(one.difference, "+.3f"),
+            _number(one.error if has_truth else one.prediction),
+            _interval(_percent(one.relative_error), "+.1f"),
+            _number(one.nis, ".2f"),
+            _interval(one.correlation, "+.2f"),
+        )
+        yield Row(one, _label(advice, one), cells)
+
+
+def reading_lines(recording: Recording) -> Iterator[str]:
+    """Say what was read, before anything is fitted: how much, of which errors, and what is noteworthy."""
+    seconds = recording.seconds
+    steps = numpy.diff(seconds, axis=1)
+    missed = ""
+    if "available" in recording.measurements:
+        there = numpy.arange(seconds.shape[1]) < recording.rows[:, None]
+        count = int((recording.measurements["available"][there] == 0.0).sum())
+        missed = f", {count:,} of them missed" if count else ""
+    yield (
+        f"{recording.name}: read {int(recording.rows.sum()):,} measurements after the start of "
+        f"{len(recording.names)} track{'s' * (len(recording.names) > 1)}{missed}, {numpy.nanmedian(steps):.3g} s apart"
+        f"{', with truth' if recording.truth is not None else ''}."
+    )
+    if recording.deviations:
+        units = {"azimuth_sigma": "degrees"}
+        listed = ", ".join(f"{n} {v:.3g} {units.get(n, 'm')}" for n, v in recording.deviations.items())
+        source = recording.deviations_from
+        if "no column" in source:
+            yield f"Errors: {source}: {listed}. Their scale is fitted."
+        else:
+            yield f"Errors as stated: {listed} (median of {source})."
+    yield from (note for note in recording.notes if "no column" not in note)
+
+
+def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
+    """Return what the judged measurements say of the advised filter; None where it is not known."""
+    one = advice.advised
+    numbers = {
+        "measurements": float(sum(span.last - span.first for span in advice.share.judged)),
+        "rmse_of_estimates": one.error,
+        "rmse_of_predictions": one.prediction,
+        "nis": one.nis,
+        "relative_error": one.relative_error.value,
+        "relative_error_low": one.relative_error.low,
+        "relative_error_high": one.relative_error.high,
+    }
+    rounded = {key: None if math.isnan(value) else float(f"{value:.6g}") for key, value in numbers.items()}
+    return {**rounded, "relative_to": advice.rival}
+
+
+def _label(advice: Advice, one: Competitor) -> str:
+    """Name of a filter, and what it is here."""
+    role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
+    role = "advised" if one is advice.advised else role
+    return f"{one.name} ({role})" if role else one.name
+
+
+def _percent(estimate: Estimate) -> Estimate:
+    return Estimate(*(100.0 * value for value in estimate))
+
+
+def _number(value: float, form: str = ".4g") -> str:
+    return "-" if math.isnan(value) else format(value, form)
+
+
+def _interval(estimate: Estimate, form: str) -> str:
+    if math.isnan(estimate.value):
+        return "-"
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return format(estimate.value, form)
+    return f"{estimate.value:{form}} [{estimate.low:{form}}, {estimate.high:{form}}]"
+
+
+def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
+    """Say what is advised, with which numbers, how sure that is, and what cannot be known.
+
+    Args:
+        advice: of :func:`~..baselines.advice.advise`.
+        learned: names of shipped agents.
+    """
+    one = advice.fitted
+    yield verdict(advice)
+    if one is not advice.advised:
+        yield f"Of what was fitted {one.name} comes closest, with"
+    for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
+        yield f"  {line}"
+    yield from further_sentences(advice, learned)
+
+
+def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
+    """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
+    yield from _hindsight(advice)
+    yield from _fits(advice)
+    yield from _dearer(advice)
+    yield from _outliers(advice)
+    if not advice.tunables[advice.fitted.name].anchored:
+        yield from _noise(advice)
+    yield from _anchor(advice)
+    yield from _warnings(advice)
+    yield from _agents(advice, learned)
+
+
+def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
+    """Say what was fitted, parameter by parameter, with units and intervals.
+
+    Args:
+        tunable: what was fitted.
+        found: the values.
+        intervals: of the parameters.
+    """
+    for name, value in found.values.items():
+        text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
+        said = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
+        yield said + (f": {text.remark}" if text.remark else "")
+
+
+def verdict(advice: Advice) -> str:
+    """First sentence."""
+    one, rival = advice.fitted, advice.rival
+    judged = sum(span.last - span.first for span in advice.share.judged)
+    where = (
+        f"on {judged:,} measurements that neither was chosen by"
+        if advice.share.apart
+        else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
+    )
+    if one is not advice.advised:
+        what = _interval(one.gain, "+.3f")
+        text = (
+            f"Take {rival}, as it is shipped: nothing that was fitted predicts better beyond chance "
+            f"({one.name}: {what} nats per measurement, its parameters paid for)."
+        )
+        if not math.isnan(one.relative_error.value):
+            text += f" {one.name} has {_amount(advice, one.relative_error)} than it, {where}."
+            if one.relative_error.high < 0.0:
+                text += " That is beyond chance: a longer log may turn the choice."
+        return text
+    name = f"Take {one.name}, with the parameters below"
+    if math.isnan(one.relative_error.value) and advice.anchor is not None and one.name == advice.anchor.name:
+        return f"{name}, by the second sensor: there is no truth to say how much it gains."
+    if math.isnan(one.relative_error.value):
+        return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
+    text = (
+        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
+        f"same measurements, {where}."
+    )
+    if one.relative_error.low > 0.0:
+        text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
+    elif one.relative_error.low <= 0.0 <= one.relative_error.high:
+        text += f" The difference may be chance: {rival} is good enough."
+    return text
+
+
+def _amount(advice: Advice, relative: Estimate) -> str:
+    """How much less or more error, with its interval."""
+    value, low, high = _percent(relative)
+    kind = "error" if advice.recording.truth is not None else "error of prediction"
+    less = value <= 0.0
+    text = f"{abs(value):.1f} % {'less' if less else 'more'} {kind}"
+    if math.isnan(low):
+        return text
+    low, high = (-high, -low) if less else (low, high)
+    return f"{text} [{low:.1f}, {high:.1f}]"
+
+
+def _hindsight(advice: Advice) -> Iterator[str]:
+    """Who of the shipped filters was best on the judged measurements, which nobody could know."""
+    best, relative = advice.best_shipped, advice.hindsight
+    if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
+        return
+    count = sum(not c.fitted for c in advice.competitors)
+    yield (
+        f"In hindsight {best} is the best of the {count} shipped ones there: {advice.advised.name} has "
+        f"{_amount(advice, relative)}. The best of many is so partly by luck."
+    )
+
+
+def parameter_name(key: str) -> str:
+    """Name of a parameter in words, of the name under which it is searched."""
+    return key.removeprefix("log10_").replace("_", " ")
+
+
+def parameter_size(key: str, value: float) -> float:
+    """Value of a parameter, of that which is searched."""
+    return float(10.0**value) if key.startswith("log10_") else float(value)
+
+
+class ParameterText(NamedTuple):
+    """A fitted parameter in words."""
+
+    value: str
+    interval: str
+    unit: str
+    remark: str
+    """What its interval means where it is none."""
+
+
+def parameter_text(
+    key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
+) -> ParameterText:
+    """Say a fitted parameter with its interval, and whether it can be known.
+
+    Args:
+        key: as it is searched.
+        value: likewise.
+        interval: of it, if it was computed.
+        tunable: whose it is.
+        is_at_limit: whether it ended at a limit of the search.
+    """
+    unit = tunable.units.get(key.removeprefix("log10_"), "")
+    text = ParameterText(f"{parameter_size(key, value):.3g}", "", unit, "")
+    if interval is None:
+        return text
+    low, high = parameter_size(key, interval.low), parameter_size(key, interval.high)
+    after = f" {unit}" if unit else ""
+    flat = (interval.open_low and interval.open_high) or (
+        key.startswith("log10_") and high > IDENTIFIABLE * low
+    )
+    if flat:
+        return text._replace(
+            remark=f"not identifiable, the likelihood is flat over {low:.2g} to {high:.2g}{after}"
+        )
+    if is_at_limit:
+        first, last = tunable.limits[key]
+        if value - first < last - value:
+            return text._replace(
+                remark=f"at the lower limit of the search, the log says at most {high:.3g}{after}"
+            )
+        return text._replace(
+            remark=f"at the upper limit of the search, the log says at least {low:.3g}{after}"
+        )
+    ends = [f"{'<' * interval.open_low}{low:.3g}", f"{'>' * interval.open_high}{high:.3g}"]
+    return text._replace(interval=f"[{', '.join(ends)}]")
+
+
+def _fits(advice: Advice) -> Iterator[str]:
+    """What is to be told of the fits themselves."""
+    one = advice.fitted
+    spread = advice.fits[one.name].spread
+    if spread > DROP:
+        yield (
+            f"The likelihood of {one.name} has several maxima: the worst of its {STARTS} starts ended {spread:,.1f} "
+            "nats below the best, whose values these are."
+        )
+    if advice.diverging:
+        lose, diverge = ("loses", "it diverges") if len(advice.diverging) == 1 else ("lose", "they diverge")
+        yield (
+            f"Left out: {', '.join(advice.diverging)}, fitted, {lose} the track in the whole recording: {diverge}."
+        )
+
+
+def _dearer(advice: Advice) -> Iterator[str]:
+    """What a family of more computation would bring."""
+    if advice.dearer is not None:
+        name, gain = advice.dearer
+        yield (
+            f"{advice.fitted.name} is the simplest of the fitted ones that are as likely within chance: {name} would "
+            f"bring {_interval(gain, '+.3f')} nats per measurement and takes more computation."
+        )
+
+
+def _outliers(advice: Advice) -> Iterator[str]:
+    """Name the measurements that are taken for outliers, by row and time."""
+    found, recording = advice.outliers, advice.recording
+    count = int(found.sum())
+    if OUTLIER_SHARE not in advice.fits[advice.fitted.name].values:
+        return
+    share = 10.0 ** advice.fits[advice.fitted.name].values[OUTLIER_SHARE]
+    text = (
+        f"{advice.fitted.name} takes {100.0 * share:.1f} % of the measurements for outliers, with errors {WIDE:g} "
+        "times as large"
+    )
+    if not count:
+        yield f"{text}; in this log it names none for sure."
+        return
+    places = []
+    for episode, k in numpy.argwhere(found)[:MOST_OUTLIERS]:
+        track = f"{recording.names[episode]}: " if len(recording.names) > 1 else ""
+        time = recording.seconds[episode, k] if recording.log_time is None else recording.log_time[episode, k]
+        written = time if isinstance(time, str) else f"{float(time):.10g}"
+        places.append(f"{track}{k + 1} (time {written})")
+    more = f" and {count - len(places)} more" if count > len(places) else ""
+    yield f"{text}: {count} here, measurements after the start {', '.join(places)}{more}."
+
+
+def _noise(advice: Advice) -> Iterator[str]:
+    """What the scale of the noise says, and what it does not."""
+    one = advice.fitted
+    if NOISE_SCALE in advice.fits[one.name].values:
+        scale = 10.0 ** advice.fits[one.name].values[NOISE_SCALE]
+        yield (
+            f"The measurements' errors are {scale:.2f} times as large as stated, if they are white: errors that last "
+            "longer than the motion are invisible without a second sensor, whatever the NIS."
+        )
+        if scale > LARGE_SCALE:
+            yield (
+                "That is far more than stated: the stated deviations are wrong, or what was measured moves like "
+                "nothing that was fitted."
+            )
+        if scale < SMALL_SCALE:
+            yield (
+                "That is far less than stated: either the stated deviations are wrong, or most of the error lasts "
+                "from one measurement to the next. Then no filter of this sensor alone comes closer to the truth."
+            )
+    else:
+        yield (
+            "NIS and likelihood say nothing of errors that last longer than the motion: those are invisible without a "
+            "second sensor."
+        )
+
+
+def _anchor(advice: Advice) -> Iterator[str]:
+    """Why a filter with a second sensor is advised or not, and what its likelihood says."""
+    anchor = advice.anchor
+    if anchor is None:
+        return
+    if anchor.name != advice.fitted.name:
+        yield (
+            f"The second sensor does not help here: by {anchor.name} measurements {APART:g} s apart are less likely by "
+            f"{-anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such."
+        )
+        return
+    yield (
+        f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
+        f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next "
+        "filters without it may predict better, because they follow these errors: there likelihoods of both kinds do "
+        "not compare, nor does NIS, and deviations are taken as they are stated."
+    )
+    yield "An error that never changes, or lasts longer than this recording, remains invisible."
+
+
+def _warnings(advice: Advice) -> Iterator[str]:
+    """What makes the advice less than it looks."""
+    one, count = advice.advised, int(advice.recording.rows.sum())
+    if count < FEW:
+        yield f"{count} measurements are few: below {FEW} the parameters are known badly, and so is who is best."
+    correlation = one.correlation
+    sure = not math.isnan(correlation.low) and not correlation.low <= 0.0 <= correlation.high
+    if sure and abs(correlation.value) > LEAST_CORRELATION:
+        yield (
+            f"Successive prediction errors are correlated ({correlation.value:+.2f}): the errors of measurements are "
+            "not white, or the motion is none of the models'. The likelihood then misleads."
+        )
+    wide = [
+        parameter_name(name)
+        for name, interval in advice.intervals.items()
+        if interval.open_low and interval.open_high
+    ]
+    if wide:
+        yield (
+            f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would, or is "
+            "too short."
+        )
+
+
+def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
+    """What the learned agents did, which were trained on other data."""
+    found: list[Competitor] = [
+        c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
+    ]
+    worse = [c for c in found if c.relative_error.low > 0.0]
+    if worse:
+        each = ", ".join(f"{c.name} {100.0 * c.relative_error.value:+.0f} %" for c in worse)
+        yield f"The learned agents were never trained on such data: {each} error against {advice.rival}."

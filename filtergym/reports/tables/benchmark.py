@@ -1,0 +1,332 @@
+"""The main job: every environment with its competitors.
+
+Quick: the telling ones in the training distribution. Full: everything there is to
+compare, in all scenarios.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xarray
+
+from ...agents.named_policies import pretrained_agents
+from ...baselines.problem import Problem, problem_of
+from ...envs.engine.backend import make_model
+from ...envs.engine.catalogue import catalogue
+from ...evaluation.competitors.kinds import RandomPolicy
+from ...evaluation.competitors.smoothers import is_open_loop
+from ...evaluation.running.metrics import Record
+from ...evaluation.running.parallel import Workers, check_workers
+from ...evaluation.running.rollout import Progress
+from ...evaluation.running.seeds import episode_seeds
+from ...evaluation.running.summary import EvaluationRequest, Summary, combine_summaries, summaries
+from ...evaluation.statistics.cause_split import CAUSE_METRICS, phrases_of
+from ...evaluation.storage.dataset import groups_of, notes_of
+from ...evaluation.storage.files import claim_folder, writable_file
+from ...evaluation.storage.store import UNFINISHED, Store
+from ...names import evaluation_requests
+from .results import (
+    RESULTS,
+    Result,
+    WorstTrack,
+    components_to_draw,
+    select_competitors,
+    settings_of,
+    thin_curves,
+    track_of,
+    write_results,
+)
+from .work import work_of
+
+MEASUREMENTS = 60_000
+"""Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
+FULL_SECONDS = 5.0
+"""Time per policy and cell that the full benchmark, of ten times as many measurements, does not go beyond."""
+FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
+"""Of fewer the intervals are too narrow; where episodes are long, the quick benchmark takes no more."""
+LONG = 2000
+"""Measurements of an episode, beyond which the quick benchmark leaves out who was tuned: few episodes side by side cost
+as much as many."""
+
+
+class Cell(NamedTuple):
+    """One environment in one scenario."""
+
+    problem: Problem
+    scenario: str
+    episodes: int
+    policies: tuple[str, ...]
+
+    @property
+    def environment(self) -> str:
+        """Gymnasium id."""
+        return self.problem.id
+
+    @property
+    def name(self) -> str:
+        """Start of the names of the cell's files."""
+        return f"{self.problem.short_name}.{self.scenario}"
+
+    @property
+    def measurements(self) -> int:
+        """Measurements of all policies together."""
+        return self.episodes * _horizon(self.problem.task, self.scenario) * len(self.policies)
+
+
+def _horizon(cls: Any, scenario: str) -> int:
+    return cls.Parameters(**cls.scenarios[scenario].parameters).horizon
+
+
+def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
+    """Names that a cell compares, the paper's algorithm first.
+
+    Quick: the telling ones, tuned where they can be and episodes are not long; shipped agents. Full: every policy and
+    estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
+
+    Args:
+        problem: whose they are.
+        full: everything.
+        horizon: measurements of an episode.
+    """
+    known = problem.baselines
+    tuned = problem.tuned_policies if full or horizon <= LONG else []
+    learned = pretrained_agents(problem.id)
+    if full:
+        unranked = (*known.smoothers, *known.references, *known.bounds)
+        everything = (*known.policies, *known.estimators, *tuned, *learned, *unranked)
+    else:
+        telling = known.benchmark or known.names
+        everything = (*(name for name in telling if f"{name}-tuned" not in tuned), *tuned, *learned)
+    return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
+
+
+def ranked_names(problem: Problem) -> list[str]:
+    """Names of all that is ranked, each under its own control, but random actions."""
+    known = problem.baselines
+    ranked = (*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id))
+    return [
+        name for name in dict.fromkeys(ranked) if problem.baselines.policies.get(name) is not RandomPolicy
+    ]
+
+
+def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
+    """Return how many episodes a competitor runs in some seconds: 2000, or 400 where a measurement is dear.
+
+    Args:
+        problem: whose competitor it is.
+        scenario: of the episodes.
+        most: no more than these.
+    """
+    seconds = problem.baselines.measurement_seconds * _horizon(problem.task, scenario)
+    return min(most, max(FEWEST_EPISODES_FULL, int(2.0 * FULL_SECONDS / seconds)))
+
+
+def without_smoothers_of_closed_loops(
+    problem: Problem, names: Sequence[str], scenario: Any
+) -> tuple[str, ...]:
+    """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
+    smoothers = {*names} & {*problem.baselines.smoothers}
+    if not smoothers or is_open_loop(make_model(problem.task, None, scenario, backend="numpy")):
+        return tuple(names)
+    return tuple(name for name in names if name not in smoothers)
+
+
+def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
+    """List the work: quick, the default scenario, of which the verdict is; full, all of them and more episodes.
+
+    Held-out scenarios are for final tables: on another split than "test" only training scenarios run.
+    """
+    wanted = []
+    for id in environments or catalogue():
+        problem = problem_of(id)
+        cls = problem.task
+        for name, scenario in cls.scenarios.items():
+            if not full and name != cls.default_scenario:
+                continue
+            if split != "test" and not scenario.training:
+                continue
+            horizon = _horizon(cls, name)
+            measurements, fewest = MEASUREMENTS, FEWEST_EPISODES
+            if full:
+                affordable = int(FULL_SECONDS / problem.baselines.measurement_seconds)
+                measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
+            episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
+            names = without_smoothers_of_closed_loops(
+                problem, benchmark_policies(problem, full, horizon), name
+            )
+            wanted.append(Cell(problem, name, episodes, names))
+    return wanted
+
+
+def result_of(
+    problem: Problem,
+    dataset: xarray.Dataset,
+    records: list[Record],
+    curves: xarray.Dataset,
+    learned: Sequence[str],
+    explained: Sequence[str] = (),
+    worst: Sequence[WorstTrack] = (),
+) -> Result:
+    """Turn an evaluation into what a file of results holds of it.
+
+    Args:
+        problem: that was evaluated.
+        dataset: the evaluation, of whose variables only those of the track are needed, which ``drawn_episodes`` keeps.
+        records: of it, tidy.
+        curves: of it; those of what is shown are kept.
+        learned: names that stand for something learned, those of competitors among them.
+        explained: names of those whose cost is to be explained; default: the paper's algorithm.
+        worst: their worst episodes.
+    """
+    cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
+    paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
+    names = dataset["policy"].values.tolist()
+    explained = list(explained) or [name for name in [paper] if name in names]
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned), *explained]))
+    components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
+    named = cls.scenarios.get(scenario)
+    return Result(
+        problem.id,
+        scenario,
+        named.description if named else "",
+        scenario == cls.default_scenario,
+        bool(named and named.training),
+        paper if paper in names else "",
+        reference if reference in names else "",
+        [name for name in names if name in learned],
+        {name: knows[name] for name in names if name in knows},
+        notes_of(dataset),
+        [r for r in records if r.policy in shown or not r.metric.startswith(CAUSE_METRICS)],
+        thin_curves(curves.sel(policy=shown)),
+        track_of(dataset.sel(policy=shown), components, plane),
+        phrases_of(dataset),
+        explained,
+        list(worst),
+    )
+
+
+class BenchmarkOptions(NamedTuple):
+    """What a benchmark runs, and how."""
+
+    full: bool = False
+    """All scenarios and policies, and more episodes."""
+    seed: int = 0
+    """Number of the experiment."""
+    environments: Sequence[str] = ()
+    """Ids; none: all."""
+    split: str = "test"
+    """Or another one, for development."""
+    backend: str = "auto"
+    """What computes the steps, see :func:`~.envs.backend.task_on`."""
+    threads: int = 1
+    """How many share the episodes, of the compiled backend."""
+    command: str = "filtergym benchmark"
+    """That runs this, kept in the results."""
+    timed: bool = True
+    """Measure the processor time of every competitor, which differs from run to run."""
+
+    def requests(self, cell: Cell) -> list[EvaluationRequest]:
+        """Return what is asked for in a cell."""
+        experiment = cell.problem.experiment(
+            cell.scenario,
+            cell.episodes,
+            self.seed,
+            self.split,
+            drawn_episodes=1,
+            backend=self.backend,
+            threads=self.threads,
+            timed=self.timed,
+        )
+        return evaluation_requests(cell.problem, experiment, cell.policies)
+
+
+class Callbacks(NamedTuple):
+    """What is called while a benchmark runs."""
+
+    started: Callable[[int], Progress] = lambda total: lambda done: None
+    """With the number of measurements; returns what is told of progress."""
+    finished: Callable[[Result], None] = lambda result: None
+    """With the result of each cell, in their order."""
+    drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None
+    """With each cell and its curves."""
+
+
+class _Results:
+    """Results of cells, made when the last competitor of each is there.
+
+    Args:
+        wanted: the cells.
+        callbacks: told of curves and results.
+    """
+
+    def __init__(self, wanted: Sequence[Cell], callbacks: Callbacks) -> None:
+        self.wanted, self.callbacks = wanted, callbacks
+        self._summaries: list[dict[str, Summary]] = [{} for _ in wanted]
+        self._results: list[Result | None] = [None] * len(wanted)
+        self._told = 0
+
+    def add(self, i: int, name: str, summary: Summary) -> None:
+        """Take in the summary of a competitor of a cell, and tell of all results that are due."""
+        cell, found = self.wanted[i], self._summaries[i]
+        found[name] = summary
+        if len(found) == len(cell.policies):
+            records, curves, head = combine_summaries([found.pop(name) for name in cell.policies])
+            assert curves is not None  # they were asked for
+            self.callbacks.drawn(cell, curves)
+            learned = pretrained_agents(cell.environment)
+            self._results[i] = result_of(cell.problem, head, records, curves, learned)
+        while self._told < len(self._results) and (due := self._results[self._told]) is not None:
+            self.callbacks.finished(due)
+            self._told += 1
+
+    def all(self) -> list[Result]:
+        """Return the results, in the order of the cells."""
+        return [result for result in self._results if result is not None]
+
+
+def run_benchmark(
+    folder: Path,
+    options: BenchmarkOptions,
+    callbacks: Callbacks | None = None,
+    workers: Workers | None = None,
+) -> list[Result]:
+    """Run every cell, going on after an interruption with the competitors that are missing.
+
+    Args:
+        folder: where ``results.json`` goes; competitors wait in ``unfinished/`` until all are done.
+        options: what is run.
+        callbacks: called meanwhile; default: nothing is.
+        workers: who does the work; default: this process.
+
+    Returns:
+        All results.
+    """
+    episode_seeds(options.split, options.seed, 1)  # refuses a split that is none before anything is written
+    wanted = cells(options.full, options.environments, options.split)
+    settings = settings_of(options.command)
+    store = Store(folder / UNFINISHED)
+    writable_file(folder / RESULTS)
+    callbacks = callbacks or Callbacks()
+    tick = callbacks.started(sum(cell.measurements for cell in wanted))
+    # What is asked for, and the cell that it belongs to.
+    asked = [(one, i) for i, cell in enumerate(wanted) for one in options.requests(cell)]
+    workers = check_workers(workers)
+    if not workers.alone:  # the dear ones first, that nobody waits for them at the end
+        asked.sort(
+            key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
+        )
+    work = [work_of(wanted[i].problem, one) for one, i in asked]
+    claim_folder(folder)  # nothing is refused from here on
+    results = _Results(wanted, callbacks)
+    for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
+        one, i = asked[k]
+        results.add(i, one.name, summary)
+    write_results(folder / RESULTS, results.all(), settings)
+    store.clear()
+    return results.all()
+
+
+def all_records(results: Sequence[Result]) -> list[Record]:
+    """Return the records of all results."""
+    return [record for result in results for record in result.records]

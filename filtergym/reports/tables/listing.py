@@ -1,0 +1,89 @@
+"""What there is: an environment with its paper, controls, scenarios and competitors, in lines for the terminal."""
+
+import textwrap
+from collections.abc import Iterator, Mapping
+
+from ...agents.named_policies import pretrained_agents
+from ...baselines.problem import Problem
+from ...compiler.library import fastest
+from ...compiler.native import processor
+from ...envs.contract.task import Task
+from ...envs.engine.backend import make_model
+from ...envs.engine.catalogue import USER_TASKS, parameter_names
+from ...envs.engine.compiled import AVAILABLE
+
+FEWEST_COLUMNS = 20
+"""Of a text beside its head, however narrow the terminal."""
+
+
+def _backend(cls: type[Task]) -> str:
+    """What computes an environment's steps, and where the exponentials of compiled ones come from."""
+    compiled = AVAILABLE
+    if cls.id in USER_TASKS:  # those of this package can all be traced
+        compiled = make_model(cls, backend="auto").backend == "compiled"
+    return f"compiled (functions of {fastest(processor()[1]).name})" if compiled else "numpy"
+
+
+def summary_of(cls: type[Task]) -> str:
+    """Return the first line of an environment's documentation."""
+    return (cls.__doc__ or "").strip().partition("\n")[0]
+
+
+def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[str]:
+    """Say what each environment is, in one line.
+
+    Args:
+        tasks: by id.
+        width: columns beyond which a line goes on below, None: nowhere.
+    """
+    longest = max(map(len, tasks), default=0)
+    for id, cls in tasks.items():
+        yield _hang(f"{id:<{longest}}", summary_of(cls), width)
+
+
+def environment_lines(problem: Problem, width: int) -> Iterator[str]:
+    """Describe an environment in lines of at most so many columns; the first is its id."""
+    cls, known = problem.task, problem.baselines
+    yield problem.name
+    yield _hang(" ", summary_of(cls), width)
+    rows = {
+        "paper": [cls.paper_source] if cls.paper_source else [],
+        "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
+        "policies": list(known.policies),
+        "estimators": list(known.estimators),
+        "tuned": problem.tuned_policies,
+        "learned": pretrained_agents(cls.id),
+        "smoothers": [f"{', '.join(known.smoothers)} (not causal: they use later measurements)"]
+        if known.smoothers
+        else [],
+        "parameters": parameter_names(cls),
+        "backend": [_backend(cls)],
+    }
+    for title, names in rows.items():
+        if names:
+            yield _hang(f"  {title + ':':<12}", ", ".join(names), width)
+    for title, table in (("references", known.references), ("bounds", known.bounds)):
+        if table:
+            yield f"  {title}:"
+        for name, maker in table.items():
+            yield _hang(f"    {name:<22}", f"knows {maker.knows}", width)
+    yield "  scenarios:"
+    for scenario in cls.scenarios.values():
+        role = " (default)" if scenario.name == cls.default_scenario else ""
+        role += " (training)" if scenario.training else ""
+        yield _hang(f"    {scenario.name:<22}", f"{scenario.description}{role}", width)
+
+
+def _hang(head: str, text: str, width: int | None) -> str:
+    """Return a head and a text beside it, which goes on below itself."""
+    if width is None:
+        return f"{head} {text}"
+    lines = textwrap.wrap(
+        text,
+        max(width - len(head) - 1, FEWEST_COLUMNS),
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+    return "\n".join(
+        f"{head if i == 0 else ' ' * len(head)} {line}".rstrip() for i, line in enumerate(lines or [""])
+    )

@@ -1,0 +1,128 @@
+"""Why a competitor costs what it costs: its records by cause in sentences and as a table."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy
+
+from ...evaluation.competitors.kinds import RANKED
+from ...evaluation.running.metrics import Record
+from ...evaluation.statistics.cause_split import CAUSE_METRICS, EVERYTHING, reason_weight
+from .terminal_tables import rank_competitors, with_interval
+
+MOST_REASONS = 3
+"""Sentences about one competitor."""
+LEAST_EXCESS = 0.05
+"""Share of the cost beyond the share of the measurements from which a cause is a reason."""
+
+
+class Reason(NamedTuple):
+    """What one cause costs a competitor."""
+
+    cause: str
+    measurements: Record
+    """Share of the measurements under it; likewise what follows."""
+    share: Record
+    """Of the cost."""
+    cost: Record
+    """Mean cost of a measurement."""
+    anees: Record | None
+    ratio: Record | None
+    """Of the cost to that of the opponent, whom the component names."""
+
+    @property
+    def excess(self) -> float:
+        """Share of the cost beyond the share of the measurements."""
+        return (self.share.value or 0.0) - (self.measurements.value or 0.0)
+
+    @property
+    def weight(self) -> float:
+        """See :func:`.evaluation.statistics.cause_split.reason_weight`."""
+        shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
+        return float(reason_weight(*shares))
+
+
+def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
+    """Return what each cause costs a competitor, in the order of their declaration; first the whole.
+
+    Args:
+        records: of one environment and scenario.
+        name: of the competitor.
+
+    Returns:
+        Nothing where nothing is split: bounds, and what has no truth.
+    """
+    found: dict[str, dict[str, Record]] = {}
+    for r in records:
+        if r.policy == name and r.metric.startswith(CAUSE_METRICS) and r.value is not None:
+            found.setdefault(r.window, {})[r.metric.removeprefix(CAUSE_METRICS)] = r
+    needed = {"measurement_share", "cost_share", "cost"}
+    return [
+        Reason(
+            cause,
+            own["measurement_share"],
+            own["cost_share"],
+            own["cost"],
+            own.get("anees"),
+            own.get("cost_ratio"),
+        )
+        for cause, own in found.items()
+        if needed <= own.keys()
+    ]
+
+
+def largest_reasons(reasons: Sequence[Reason]) -> list[Reason]:
+    """Return the causes of the largest weight that hold clearly more of the cost than of the measurements.
+
+    Args:
+        reasons: of :func:`reasons_of`.
+    """
+    causes = [reason for reason in reasons if reason.cause != EVERYTHING and reason.excess >= LEAST_EXCESS]
+    return sorted(causes, key=lambda reason: -reason.weight)[:MOST_REASONS]
+
+
+def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name: str) -> list[str]:
+    """Say in short sentences where most of a competitor's cost falls.
+
+    Args:
+        records: of one environment and scenario.
+        phrases: when each cause holds, by name.
+        name: of the competitor.
+    """
+    reasons = reasons_of(records, name)
+    if not reasons:
+        return []
+    sentences = []
+    for reason in largest_reasons(reasons):
+        first = (
+            f"{name}: {_percent(reason.share)} of its cost falls {phrases.get(reason.cause, reason.cause)}"
+        )
+        sentence = f"{first}, {_percent(reason.measurements)} of the measurements"
+        if reason.ratio is not None:
+            sentence += f"; there it costs {_times(reason.ratio)}"
+        sentences.append(f"{sentence}.")
+    return sentences or [f"{name}: no cause holds much more of its cost than of the measurements."]
+
+
+def _percent(record: Record) -> str:
+    return f"{100.0 * (record.value or 0.0):.0f} %"
+
+
+def _times(record: Record) -> str:
+    """Say how many times as much as the opponent's: ``2.3 times imm [1.9, 2.8]``."""
+    value, _, interval = with_interval(record, digits=2).partition(" ")
+    return f"{value} times {record.component}" + (f" {interval}" if interval else "")
+
+
+def explained_by_default(records: Sequence[Record], named: Sequence[str], paper: str) -> list[str]:
+    """Return whom sentences are about unless somebody is named: the first of those whom the user wants evaluated, else
+    the paper's algorithm, else the cheapest.
+
+    Args:
+        records: of one environment and scenario.
+        named: names that the user gives.
+        paper: name of the paper's algorithm.
+    """
+    ranked = [name for name, kind, _ in rank_competitors(records) if kind in RANKED]
+    wanted = [name for name in [*named, paper, *ranked] if name in ranked]
+    return wanted[:1]

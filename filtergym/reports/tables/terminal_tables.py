@@ -1,0 +1,385 @@
+"""Tables of results for the terminal."""
+
+import functools
+import io
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import rich.box
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+
+from ...baselines.tuned_values import Tuned
+from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
+from ...evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
+from ...offline import DatasetSummary
+
+NARROW, WIDE = 24, 44
+"""Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
+INCONSISTENT_WORDS = ("overconfident", "cautious")
+"""With which the words on a covariance end that is not consistent."""
+INCONSISTENT = "!"
+"""Marks a covariance that is off by more than a factor of two."""
+
+
+def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
+    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
+
+    Args:
+        record: with ``value``, ``low`` and ``high``; or None.
+        scale: that all three are multiplied with.
+        digits: significant ones.
+        negligible: what is smaller, scaled, is shown as 0.
+    """
+    if record is None or record.value is None:
+        return "-"
+
+    def text(value: float, form: str = "#") -> str:
+        value *= scale
+        if abs(value) < negligible:
+            return "0"
+        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:{form}.{digits}g}".rstrip(".")
+
+    if record.low is None or record.low == record.high:
+        return text(record.value, "")
+    return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
+
+
+def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
+    """Median difference of the episodes' costs to the paper's algorithm, %, and the share of them that are lower, %."""
+    median, wins = (
+        found.get((*scenario, name, metric, "", "all")) for metric in ("median_cost_ratio", "win_rate")
+    )
+    if median is None or wins is None or median.value is None:
+        return ["-", "-"]
+    percent = 100.0 * (median.value - 1.0)
+    digits = 1 if abs(percent) < 1000.0 else 0
+    return [f"{percent:+,.{digits}f}", f"{100.0 * wins.value:.0f}"]
+
+
+def consistency_word(record: Any) -> str:
+    """Say what a mean NEES over its dimension means: an estimator is consistent where its interval holds one.
+
+    Args:
+        record: with ``value``, ``low`` and ``high``; or None.
+
+    Returns:
+        One or two words; by less than a factor of two an inconsistent one is "slightly" overconfident or cautious.
+    """
+    if record is None or record.value is None:
+        return "says nothing"
+    if record.low is None or record.low == record.high:
+        return "no interval"
+    if record.low <= 1.0 <= record.high:
+        return "consistent"
+    word = "overconfident" if record.value > 1.0 else "cautious"
+    return word if is_far_off(record.value) else f"slightly {word}"
+
+
+def is_far_off(value: float) -> bool:
+    """Say whether a mean NEES over its dimension is off by more than a factor of two."""
+    return not 0.5 <= value <= 2.0
+
+
+def consistency(record: Any) -> str:
+    """Mean NEES over the dimension, marked where it is off by more than a factor of two."""
+    if record is None or record.value is None:
+        return "-"
+    return f"{record.value:.3g}" + (f" {INCONSISTENT}" if is_far_off(record.value) else "")
+
+
+def score_text(record: Any) -> str:
+    """Score with its interval; none where the reference is not significantly better than the paper's algorithm."""
+    return with_interval(record, negligible=1e-9)
+
+
+def main_components(records: Sequence[Any]) -> list[str]:
+    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    first = records[0]
+    names = [
+        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
+    ]
+    return select_components(names)
+
+
+def select_components(names: Sequence[str]) -> list[str]:
+    """Of components and groups of them: the groups where there are any, else the first three."""
+    # One namesake is no group: "range" is not made of "range_rate".
+    return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
+
+
+def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
+    """Name, kind and control of every competitor: those that are ranked by their cost, then those that are not."""
+    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
+    found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
+
+    def place(entry: tuple[str, str, str]) -> tuple[int, float]:
+        value = cost.get(entry[0])
+        section = 0 if entry[1] in RANKED else 1 if entry[1] == "smoother" else 2
+        return section, math.inf if value is None else value
+
+    return sorted(found, key=place)
+
+
+def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int) -> list[Table]:
+    """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
+
+    Args:
+        records: tidy records of one environment and scenario.
+        knows: what references and bounds know, by their names.
+        width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
+            own, so that no number is cut.
+    """
+    first = records[0]
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    names = rank_competitors(records)
+    costs, notes = _cost_columns(records, found)
+    exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
+    fitting = [
+        ([competitors_table(names, {**costs, **exact}, True)], []),
+        ([competitors_table(names, {**costs, **exact}, False)], []),
+        *(
+            ([competitors_table(names, {**costs, **rounded}, False, compact)], [RMSE_NOTE])
+            for compact in (False, True)
+        ),
+    ]
+    tables, more = next(
+        ((tables, more) for tables, more in fitting if first_fitting(tables, width)),
+        (_tables_below_each_other(names, costs, exact, width), []),
+    )
+    tables[0].title = (
+        f"{first.environment}, scenario {first.scenario} "
+        f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
+    )
+    notes += more
+    smoothers = [name for name, kind, _ in names if kind == "smoother"]
+    notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
+    notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
+    tables[-1].caption = "\n".join(notes)
+    return tables
+
+
+Columns = Mapping[str, Callable[[str], str]]
+"""What each competitor has in a column, by the column's title."""
+RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
+
+
+def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Columns on cost, consistency and time, and the sentences that explain them."""
+    columns: dict[str, Callable[[str], str]] = {
+        "cost vs paper, %": lambda name: with_interval(
+            found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+        ),
+        "median,\n%": lambda name: against_paper(found, name)[0],
+        "wins,\n%": lambda name: against_paper(found, name)[1],
+        "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
+    }
+    notes = [
+        "median and wins compare the cost of each episode with that of the paper's algorithm. ANEES is 1 if errors are "
+        f"as large as the covariance says; {INCONSISTENT} marks one that is off by more than a factor of two.",
+    ]
+    if any(r.metric == "score" and r.value is not None for r in records):
+        columns["score"] = lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0]
+        notes.append(
+            "score is 0 for the paper's algorithm and 1 for the reference that it is measured against."
+        )
+    if times := column_of_times(records):
+        columns[TIME_TITLE] = lambda name: times.get(name, "-")
+        notes.append(TIME_NOTE)
+    lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
+    if lost:
+        columns["lost"] = lambda name: f"{lost.get(name, 0)}"
+        notes.append(
+            "lost counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
+        )
+    return columns, notes
+
+
+def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: bool) -> dict[str, Any]:
+    """Columns of the RMSE of the main components."""
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+
+    def rmse(component: str, name: str) -> str:
+        text = with_interval(found.get((name, "rmse", component, "all")))
+        return text if intervals else text.partition(" [")[0]
+
+    return {
+        f"RMSE\n{component.replace('_', ' ')},{' ' if intervals else chr(10)}{units[component]}": functools.partial(
+            rmse, component
+        )
+        for component in main_components(records)
+    }
+
+
+def _tables_below_each_other(
+    names: Sequence[tuple[str, str, str]], costs: Columns, errors: Columns, width: int
+) -> list[Table]:
+    """Costs in one table and errors below, each in a table of its own where they do not fit beside each other."""
+    costs, errors = dict(costs), dict(errors)
+    table = first_fitting(
+        [competitors_table(names, costs, False, compact) for compact in (False, True)], width
+    )
+    if table is None:
+        if TIME_TITLE in costs:
+            errors = {TIME_TITLE: costs.pop(TIME_TITLE), **errors}
+        table = competitors_table(names, costs, False, compact=True)
+    below = first_fitting(
+        [competitors_table(names, errors, False, compact) for compact in (False, True)], width
+    )
+    each = [competitors_table(names, {title: error}, False, True) for title, error in errors.items()]
+    return [table, *(each if below is None else [below])]
+
+
+def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
+    """Return the first table that needs no more columns than there are."""
+    return next((table for table in tables if _widest(table) <= width), None)
+
+
+def plain_table(title: str | None = None) -> Table:
+    """Return an empty table as all look: no lines but one below its head, two spaces between columns."""
+    return Table(
+        title=title,
+        title_justify="left",
+        caption_justify="left",
+        box=rich.box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 0, 0, 1),
+    )
+
+
+def competitors_table(
+    names: Sequence[tuple[str, str, str]],
+    columns: Columns,
+    control: bool,
+    compact: bool = False,
+) -> Table:
+    """Return a table of what each competitor has in each column; those that are not ranked in sections of their own."""
+    table = plain_table()
+    table.add_column("policy", overflow="fold")
+    if control:
+        table.add_column("control")
+    for title in columns:
+        table.add_column(title, justify="right", overflow="fold", no_wrap=compact)
+    section = "ranked"
+    for name, kind, steered in names:
+        if kind not in RANKED and kind != section:
+            table.add_section()
+            section = kind
+        control_column = steered if kind == "policy" else f"({kind})"
+        shown = "\n".join(textwrap.wrap(name, NARROW if compact else WIDE))
+        table.add_row(
+            shown, *([control_column] if control else []), *(column(name) for column in columns.values())
+        )
+    return table
+
+
+def _widest(table: Table) -> int:
+    """Columns that a table takes where nothing is folded."""
+    return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
+
+
+_MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False)
+
+
+HEAD = 10
+"""Columns of a title over a column of short numbers."""
+SHOWN_OF_FLIGHTS = 8
+"""Competitors in a table flight by flight: what fits beside each other."""
+
+
+def flights_table(
+    dataset: Any, records: Sequence[Any], over_all: Sequence[Any], width: int = 10_000
+) -> Table:
+    """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
+
+    Args:
+        dataset: from an evaluation of a set of flights.
+        records: of every flight.
+        over_all: records of all of them together, which rank the competitors.
+        width: columns of the terminal: of the competitors the best are shown, as many as fit.
+    """
+    tables = [_flights(dataset, records, over_all, shown) for shown in range(SHOWN_OF_FLIGHTS, 0, -1)]
+    return first_fitting(tables, width) or tables[0]
+
+
+def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int) -> Table:
+    """Return the table with at most some competitors beside the one that they are compared with."""
+    found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
+    names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
+    shown, paper = main_components(over_all), dataset.attrs["paper"]
+    base = paper if paper in names else [*names, *dataset["policy"].values.tolist()][0]
+    every = [name for name in names if name != paper]
+    others = every[:most]
+    units = {r.component: r.unit for r in over_all if r.metric == "rmse"}
+    flights, lengths = dataset["flight"].values, dataset["length"].values
+    several = len(set(flights.tolist())) > 1
+    what = "recording" if dataset.attrs["recorded"] else "flight"
+    table = plain_table(f"{len(set(flights.tolist()))} {what}{'s' * several}")
+    table.add_column(what, no_wrap=True)
+    table.add_column("episodes", justify="right")
+    table.add_column("measurements", justify="right")
+    for component in shown:
+        title = f"RMSE {component.replace('_', ' ')} of {base}, {units[component]}"
+        table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
+    metric = "relative_cost_difference" if base == paper else "cost"
+    for name in others:
+        title = f"{name}, %" if base == paper else f"cost of {name}"
+        table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
+    for scenario in dict.fromkeys(r.scenario for r in records):
+        flight = scenario.removeprefix(f"{dataset.attrs['scenario']}: ")
+        mine = flights == flight
+        row = [flight, f"{mine.sum()}", f"{lengths[mine].sum():,}"]
+        for name, number, component in [
+            *((base, "rmse", c) for c in shown),
+            *((o, metric, "") for o in others),
+        ]:
+            record = found.get((scenario, name, number, component))
+            if record is None or record.value is None:
+                row.append("-")
+            elif number == "relative_cost_difference":
+                row.append(f"{100.0 * record.value:+.1f}")
+            else:
+                row.append(f"{record.value:.3g}")
+        table.add_row(*row)
+    notes = [f"%: cost against {base}."] if base == paper and others else []
+    if len(others) < len(every):
+        notes.append(f"The best {len(others)} of {len(every)} are shown; all stand in the records.")
+    notes.append(
+        f"Intervals of the table over all {what}s resample whole {what}s; of fewer than ten they are too narrow."
+        if several
+        else f"Intervals below are over the episodes of this one {what}."
+    )
+    table.caption = " ".join(notes)
+    table.caption_justify = "left"
+    return table
+
+
+def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
+    """Return what a search has found beside the values that it started from."""
+    table = plain_table(f"{outcome.policy} on {outcome.scenario}")
+    table.add_column("value")
+    for title in ("untuned", "tuned"):
+        table.add_column(title, justify="right")
+    for name, value in outcome.values.items():
+        table.add_row(name, f"{start[name]:g}", f"{value:g}")
+    table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
+    return table
+
+
+def datasets_table(written: Iterable[DatasetSummary]) -> Table:
+    """Return what data sets hold; those whose environments are the same can be combined."""
+    table = plain_table()
+    table.add_column("data set", overflow="fold")
+    table.add_column("environment", overflow="fold")
+    for title in ("episodes", "steps", "mean return"):
+        table.add_column(title, justify="right")
+    for entry in written:
+        made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
+        table.add_row(
+            entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"
+        )
+    return table

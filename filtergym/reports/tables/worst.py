@@ -1,0 +1,105 @@
+"""The worst episodes of competitors, run once more for the report."""
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy
+import xarray
+
+from ...baselines.problem import Problem
+from ...evaluation.figures.worst_episodes import describe_worst, draw_worst, run_episodes, select_worst
+from ...evaluation.running.evaluate import Experiment
+from ...evaluation.running.metrics import Record
+from ...evaluation.storage.dataset import groups_of
+from ...names import competitors_of
+from .reasons import reasons_of
+from .results import WorstTrack, components_to_draw, track_of
+
+
+def find_worst(
+    problem: Problem,
+    experiment: Experiment,
+    costs: Mapping[str, numpy.ndarray],
+    records: Sequence[Record],
+    explained: Sequence[str],
+    trust: bool = False,
+) -> list[WorstTrack]:
+    """Run the worst episodes of some competitors once more, each beside the opponent, and return their tracks.
+
+    Args:
+        problem: whose competitors they are.
+        experiment: of the evaluation.
+        costs: mean cost of every episode by name, ``(episodes,)``.
+        records: of the evaluation.
+        explained: names of the competitors.
+        trust: load models that can execute code.
+    """
+    found = []
+    for name in explained:
+        if name not in costs:
+            continue
+        opponent = opponent_in(records, name)
+        numbers = select_worst(costs[name])
+        makers = competitors_of(problem, [name, opponent] if opponent else [name], trust)
+        dataset = run_episodes(experiment, makers, numbers)
+        components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
+        for i, worst in enumerate(describe_worst(dataset, numbers, name, opponent)):
+            ratio = worst.cost / worst.opponent_cost if worst.opponent_cost > 0.0 else math.nan
+            found.append(
+                WorstTrack(
+                    name,
+                    opponent,
+                    _label(dataset, i),
+                    worst.cost,
+                    ratio if math.isfinite(ratio) else None,
+                    worst.causes,
+                    track_of(dataset, components, plane, i),
+                )
+            )
+    return found
+
+
+def _label(dataset: xarray.Dataset, number: int) -> str:
+    """Return what shows an episode again: its seed, or of a recording its name there."""
+    name = "flight" if dataset.attrs["recorded"] else "episode_seed"
+    return str(dataset[name].values[number])
+
+
+def opponent_in(records: Sequence[Record], name: str) -> str:
+    """Return with whom the records compare a competitor's cost; empty: with nobody."""
+    ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
+    return ratios[0] if ratios else ""
+
+
+def worst_figures(
+    worst: Sequence[WorstTrack], phrases: Mapping[str, str], columns: int
+) -> Iterator[tuple[str, Any]]:
+    """Draw the worst episodes of each competitor: the name of a file, and the figure.
+
+    Args:
+        worst: of any competitors.
+        phrases: when each cause holds, by name.
+        columns: of a paper, 1 or 2, as wide as which figures are.
+    """
+    names = list(dict.fromkeys(one.policy for one in worst))
+    for name in names:
+        own = [(one, one.track) for one in worst if one.policy == name and one.track is not None]
+        titles = [_titles(one, phrases) for one, _ in own]
+        if own:
+            place = "worst_episodes" if len(names) == 1 else f"worst_episodes_{_file_name(name)}"
+            yield place, draw_worst([track for _, track in own], titles, name, columns=columns)
+
+
+def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
+    """Seed and main cause, and cost, of an episode."""
+    against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
+    cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
+    return f"episode {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
+
+
+def _file_name(name: str) -> str:
+    """Return a competitor's name as a part of a file's."""
+    return re.sub(r"[^\w.-]", "_", Path(name).name)
