@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy
 import scipy.io
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
 
 import filtergym
 

@@ -29,8 +29,8 @@ from filtergym.compiler.native import native
 from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.competitors.kinds.kinds import kind_of, make_competitor
-from filtergym.evaluation.competitors.kinds.steered_filter import steer
+from filtergym.evaluation.competitors.kinds import kind_of, make_competitor
+from filtergym.evaluation.competitors.steered_filter import steer
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds

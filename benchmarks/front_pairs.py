@@ -10,7 +10,7 @@ intervals over episodes; the median is of the episodes' ratios.
 import argparse
 
 import numpy
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
 
 import filtergym

@@ -17,11 +17,11 @@ from filtergym.agents.gate import GatedMaker, is_gateable
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.running.metrics import mean_cost
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
-from filtergym.reports.tables.terminal_tables.ranking import HARM
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from stresses import STRESSES
 
 from filtergym.names import GATED, find_competitor
+from filtergym.reports.tables.ranking import HARM
 
 LOST = 10.0
 """Cost over the paper's from which on a track is lost."""

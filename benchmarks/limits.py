@@ -17,11 +17,11 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import reduce_episodes
-from filtergym.evaluation.statistics.statistic.statistic import ALL, Statistic
+from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.papers.grid import markdown_table
-from filtergym.reports.tables.terminal_tables.benchmark import affordable_episodes, ranked_names
 
 from filtergym.names import evaluation_requests
+from filtergym.reports.tables.benchmark import affordable_episodes, ranked_names
 
 SIGNIFICANT = 3.0
 """Standard errors; of a few hundred comparisons, one in a thousand lies beyond by chance."""

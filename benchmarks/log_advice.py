@@ -12,7 +12,7 @@ import time
 from filtergym.baselines.advice import advise
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import read_recording
-from filtergym.evaluation.statistics.statistic.bootstrap import Estimate
+from filtergym.evaluation.statistics.bootstrap import Estimate
 
 from filtergym.commands.evaluation import causal_names
 from filtergym.names import find_competitor

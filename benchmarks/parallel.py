@@ -107,8 +107,9 @@ def killing(words: list[str]) -> None:
     import ray
     from filtergym.evaluation.running.parallel import Workers
     from filtergym.evaluation.running.rollout import Progress
-    from filtergym.reports.tables.terminal_tables.benchmark import BenchmarkOptions, Callbacks, run_benchmark
     from ray.cluster_utils import Cluster
+
+    from filtergym.reports.tables.benchmark import BenchmarkOptions, Callbacks, run_benchmark
 
     options = BenchmarkOptions(environments=words or ["filtergym/ManeuveringTarget-v0"])
     with tempfile.TemporaryDirectory() as folder:

@@ -59,16 +59,16 @@ from filtergym.evaluation.running.summary import (
     combine_summaries,
     summarise,
 )
-from filtergym.evaluation.statistics.statistic.bootstrap import RESAMPLES, Bootstrap, block_of
+from filtergym.evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.storage.files import write_text
 from filtergym.evaluation.storage.store import Store, Work
-from filtergym.reports.tables.terminal_tables.benchmark import benchmark_policies, cells
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from filtergym.names import evaluation_requests
+from filtergym.reports.tables.benchmark import benchmark_policies, cells
 
 EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
 MEASUREMENTS = 100_000

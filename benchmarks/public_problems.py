@@ -32,7 +32,7 @@ from filtergym.baselines.tuned_values import make_tuned_policy
 from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.data.recording import Recording
 from filtergym.envs.engine.catalogue import short_name
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 
 import filtergym
 

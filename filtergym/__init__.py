@@ -74,7 +74,7 @@ MODULES = {
     "envs.data.recording": ("Recording",),
     "envs.engine.scenario_choice": ("read_recording",),
     "envs.data.trajectory": ("Trajectory",),
-    "evaluation.competitors": ("FunctionPolicy", "Likelihood"),
+    "evaluation.competitors.kinds": ("FunctionPolicy", "Likelihood"),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),
     "own_models": ("state_space",),

@@ -26,4 +26,4 @@ def __getattr__(name: str) -> Any:
     library, module = LIBRARIES[name]
     if importlib.util.find_spec(library) is None:
         raise ImportError(f"{name} needs {library}: pip install {library}, or 'filtergym[adapters]'")
-    return getattr(importlib.import_module(f".evaluation.{module}", __package__), name)
+    return getattr(importlib.import_module(f".evaluation.competitors.{module}", __package__), name)

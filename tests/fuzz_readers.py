@@ -79,9 +79,9 @@ def reading(reader: str, place: Path):
     from filtergym.agents.training_run import load_run
     from filtergym.baselines.fitted_filters import read_artefact
     from filtergym.baselines.problem import problem_of
-    from filtergym.reports.tables.terminal_tables.results import read_results
 
     from filtergym import read_flights, read_recording
+    from filtergym.reports.tables.results import read_results
     from filtergym.submission import check_submission, read_submission, read_verification
 
     problem = problem_of(ENVIRONMENT)

@@ -17,12 +17,12 @@ from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
-from filtergym.evaluation.competitors.kinds import likelihood as likelihood_module
-from filtergym.evaluation.competitors.kinds.likelihood import Span, WindowLikelihood, cut_windows
-from filtergym.evaluation.statistics.statistic.bootstrap import Estimate
-from filtergym.reports.tables.terminal_tables.advice import advice_lines, parameter_lines
+from filtergym.evaluation.competitors import likelihood as likelihood_module
+from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
+from filtergym.evaluation.statistics.bootstrap import Estimate
 
 from filtergym import evaluate
+from filtergym.reports.tables.advice import advice_lines, parameter_lines
 
 ID = "filtergym/ManeuveringTarget-v0"
 PROBLEM = problem_of(ID)

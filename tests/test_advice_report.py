@@ -17,16 +17,15 @@ from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.running.metrics import chi_square_band
-from filtergym.reports.tables.terminal_tables.advice import further_sentences, verdict
 
 from filtergym.__main__ import main
+from filtergym.reports.tables.advice import further_sentences, verdict
 
 pytest.importorskip("plotly")
 pytest.importorskip("jinja2")
 
-from filtergym.reports.tables.terminal_tables.results import settings_of
-
 from filtergym.reports.pages.advice_report import advice_html
+from filtergym.reports.tables.results import settings_of
 
 PROBLEM = problem_of("filtergym/ManeuveringTarget-v0")
 FAMILIES = ("constant-velocity", "constant-acceleration")

@@ -15,7 +15,7 @@ from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.catalogue import catalogue, task_class
-from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy, FunctionPolicy, kind_of
+from filtergym.evaluation.competitors.kinds import ConstantPolicy, FunctionPolicy, kind_of
 from filtergym.evaluation.running.rollout import run_competitor
 from models import make_model
 

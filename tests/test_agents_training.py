@@ -12,11 +12,11 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.environment import TaskVectorEnv
-from filtergym.reports.tables.terminal_tables.terminal_tables import with_interval
 
 from filtergym import evaluate
 from filtergym.names import competitor, tidy_records
-from filtergym.reports.tables.terminal_tables import standing
+from filtergym.reports.tables import standing
+from filtergym.reports.tables.terminal_tables import with_interval
 
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.evaluation.running.metrics import sums_of_present
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, ratio
-from filtergym.evaluation.statistics.statistic.statistic import ALL, Statistic, reduce_run
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, ratio
+from filtergym.evaluation.statistics.statistic import ALL, Statistic, reduce_run
 from scipy import stats
 
 

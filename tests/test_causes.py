@@ -8,30 +8,30 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.evaluation.figures.curve_figures.worst_episodes import (
+from filtergym.evaluation.figures.worst_episodes import (
     describe_worst,
     main_causes,
     run_episodes,
     select_worst,
 )
 from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
-from filtergym.evaluation.statistics.statistic.cause_split import (
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.cause_split import (
     held_causes,
     opponent_of,
     phrases_of,
     reason_weight,
 )
-from filtergym.reports.tables.terminal_tables.lines import fill
-from filtergym.reports.tables.terminal_tables.reasons import (
+
+import filtergym
+from filtergym.reports.tables.lines import fill
+from filtergym.reports.tables.reasons import (
     explained_by_default,
     largest_reasons,
     reason_sentences,
     reasons_of,
 )
-from filtergym.reports.tables.terminal_tables.worst import find_worst, worst_figures
-
-import filtergym
+from filtergym.reports.tables.worst import find_worst, worst_figures
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "kalman-imm-turn", "known-turn", "known-input-bound"]

@@ -13,7 +13,6 @@ import commands
 import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.reports.tables.terminal_tables.results import read_results
 from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
@@ -21,6 +20,7 @@ from filtergym.commands import terminal
 from filtergym.commands.progress import ProgressLines
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
+from filtergym.reports.tables.results import read_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
 OF_OPTIONS = {"Backend": ["filtergym[fast]"], "Cluster": ["filtergym[cluster]"]}
@@ -350,7 +350,7 @@ def test_a_mistake_ends_the_process(tmp_path):
 def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     from filtergym.evaluation.running import summary
 
-    from filtergym.reports.tables.terminal_tables import benchmark
+    from filtergym.reports.tables import benchmark
 
     cells = [
         benchmark.Cell(problem_of(ENV), scenario, 20, ("imm", "known-turn"))
@@ -386,7 +386,7 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
 
 
 def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
-    from filtergym.reports.tables.terminal_tables import benchmark
+    from filtergym.reports.tables import benchmark
 
     cell = benchmark.Cell(problem_of(ENV), "paper", 5, ("imm",))
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])
@@ -401,14 +401,14 @@ def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
 
 
 def test_quick_benchmark_runs_every_environment_in_its_default_scenario():
-    from filtergym.reports.tables.terminal_tables import benchmark
+    from filtergym.reports.tables import benchmark
 
     expected = [(id, cls.default_scenario) for id, cls in catalogue().items()]
     assert [(cell.environment, cell.scenario) for cell in benchmark.cells(False)] == expected
 
 
 def test_full_benchmark_compares_everything():
-    from filtergym.reports.tables.terminal_tables import benchmark
+    from filtergym.reports.tables import benchmark
 
     cells = benchmark.cells(True, [ENV, "filtergym/TightlyCoupledNavigation-v0"])
     own, dear = cells[0], cells[-1]

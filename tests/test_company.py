@@ -6,7 +6,7 @@ import pytest
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors.kinds.kinds import DRAWN_AT_ONCE, RandomPolicy
+from filtergym.evaluation.competitors.kinds import DRAWN_AT_ONCE, RandomPolicy
 from models import make_model
 
 from filtergym import evaluate

@@ -4,12 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
 from filtergym.filters import alpha_beta
-from filtergym.reports.tables.terminal_tables.ranking import ranking, ranking_sentence, who_is_best
 from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
+from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
 

@@ -10,7 +10,7 @@ import xarray
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.evaluate import action_names
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.storage.dataset import windows_of
 from models import make_model
 from scipy.stats import chi2

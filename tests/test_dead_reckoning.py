@@ -16,11 +16,11 @@ from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording, join_recordings
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.evaluation.competitors.kinds.likelihood import Span, cut_windows
+from filtergym.evaluation.competitors.likelihood import Span, cut_windows
 from filtergym.filters import dead_reckoning
-from filtergym.reports.tables.terminal_tables.advice import advice_lines
 
 from filtergym import evaluate, online, read_recording
+from filtergym.reports.tables.advice import advice_lines
 
 ID = "filtergym/ManeuveringTarget-v0"
 PROBLEM = problem_of(ID)

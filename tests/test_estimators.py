@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.evaluation.storage.dataset import notes_of
-from filtergym.reports.tables.terminal_tables.results import read_results
 from models import make_model
 
 import filtergym
 from filtergym.__main__ import main
+from filtergym.reports.tables.results import read_results
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"

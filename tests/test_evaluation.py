@@ -12,7 +12,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuned_values import merge_tables
 from filtergym.baselines.tuning import Candidate, Search, mean_cost, tune
-from filtergym.evaluation.competitors.kinds.kinds import Policy
+from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import windows_of
 

@@ -9,14 +9,14 @@ import pytest
 import xarray
 from filtergym.evaluation.running.metrics import flight_records
 from filtergym.papers.grid import Grid
-from filtergym.reports.tables.terminal_tables.export import latex_table, latex_text, records_as_csv
-from filtergym.reports.tables.terminal_tables.recording_tables import recording_tables
-from filtergym.reports.tables.terminal_tables.terminal_tables import flights_table, results_tables
 from rich.table import Table
 from rich.text import Text
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
+from filtergym.reports.tables.export import latex_table, latex_text, records_as_csv
+from filtergym.reports.tables.recording_tables import recording_tables
+from filtergym.reports.tables.terminal_tables import flights_table, results_tables
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NASTY = '50 % of $a_b$ & {c} ~ ^ # \\ < > | " ± 3 m², σ ≤ ∞, λ, 日, Müller'

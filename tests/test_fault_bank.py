@@ -10,7 +10,7 @@ from filtergym.baselines.table import Variant
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
-from filtergym.evaluation.competitors.kinds.filters import put_in_loop
+from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters.linear_systems import van_loan

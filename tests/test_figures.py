@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 import xarray
-from filtergym.evaluation.figures.curve_figures.curve_figures import draw_error_over_time, evaluation_figures
-from filtergym.evaluation.figures.curve_figures.looks import (
+from filtergym.evaluation.figures.curve_figures import draw_error_over_time, evaluation_figures
+from filtergym.evaluation.figures.looks import (
     COLOURS,
     MOST_HIGHLIGHTED,
     by_cost,
@@ -17,7 +17,7 @@ from filtergym.evaluation.figures.curve_figures.looks import (
     join_names,
     looks,
 )
-from filtergym.evaluation.figures.curve_figures.print_layout import WIDTHS, save, sensible_limits
+from filtergym.evaluation.figures.print_layout import WIDTHS, save, sensible_limits
 from filtergym.evaluation.running.curves import curves_of
 from matplotlib.colors import to_hex
 from pictures import draw_differences, draw_learning_curves

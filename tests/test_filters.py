@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.competitors.kinds.filters import find_fault, is_lacking, put_in_loop
-from filtergym.evaluation.competitors.kinds.kinds import Likelihood
+from filtergym.evaluation.competitors.filters import find_fault, is_lacking, put_in_loop
+from filtergym.evaluation.competitors.kinds import Likelihood
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import FAULTS

@@ -17,7 +17,7 @@ from filtergym.envs.data import flight_tables
 from filtergym.envs.data.flight_cleaning import fit_parabolas
 from filtergym.envs.data.flights import read_flights
 from filtergym.evaluation.running.metrics import flight_records
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.filters.geodesy import east_north
 from gymnasium.vector import AutoresetMode
 from models import make_model

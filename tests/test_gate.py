@@ -17,7 +17,7 @@ from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_rati
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import registration
-from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy, Policy
+from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy
 from models import make_model
 from scipy.stats import norm
 

@@ -20,11 +20,11 @@ from filtergym.agents.training_run import load_run
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.summary import Summary
 from filtergym.evaluation.storage.store import Store, Work
-from filtergym.reports.tables.terminal_tables.results import read_results
 
 import filtergym
 from filtergym import evaluate, make_policy, read_recording, record, tidy_records
 from filtergym.names import competitor
+from filtergym.reports.tables.results import read_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
 AGENT = PRETRAINED / "ManeuveringTarget-v0" / "ppo"

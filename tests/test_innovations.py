@@ -5,9 +5,9 @@ import itertools
 
 import numpy as np
 import pytest
-from filtergym.reports.tables.terminal_tables.recording_tables import recording_tables
 
 from filtergym import evaluate, record, tidy_records
+from filtergym.reports.tables.recording_tables import recording_tables
 
 CASES = {
     "filtergym/ManeuveringTarget-v0": ("imm", "missed-detections", ["position"], ["m"]),

@@ -15,7 +15,7 @@ from filtergym.envs.maneuvering_target import kalman_net as radar
 from filtergym.envs.radar_esm_tracking import kalman_net as fusion
 from filtergym.envs.tightly_coupled_navigation import kalman_net as satellites
 from filtergym.envs.uav_autopilot import kalman_net as aircraft
-from filtergym.evaluation.competitors.kinds.kinds import kind_of
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.filters import coordinated_turn, gnss_ins, kalman, loosely_coupled, packed_covariance
 from models import make_model
 

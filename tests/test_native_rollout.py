@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.competitors.kinds.kinds import Policy, kind_of
+from filtergym.evaluation.competitors.kinds import Policy, kind_of
 from filtergym.evaluation.running import rollout as rollouts
 from filtergym.evaluation.running.evaluate import _limits, _measurement_and_track, control_of
 from filtergym.evaluation.running.rollout import rollout, run_episodes

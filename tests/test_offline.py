@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors.kinds.kinds import kind_of
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.running.transitions import member, transitions_of
 

@@ -10,7 +10,7 @@ from filtergym.envs.contract.live_input import LiveInput
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import read_recording
-from filtergym.evaluation.competitors.kinds.kinds import kind_of
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
 

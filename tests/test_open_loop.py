@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.evaluation.competitors.kinds.kinds import Policy
+from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 

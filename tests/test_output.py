@@ -13,7 +13,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym import evaluate
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console
-from filtergym.reports.tables.terminal_tables import benchmark
+from filtergym.reports.tables import benchmark
 
 EVALUATE = ("evaluate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--episodes", 4)
 

@@ -36,7 +36,7 @@ from made_results import without_times
 import filtergym
 from filtergym import evaluate, tidy_records
 from filtergym.names import evaluation_requests
-from filtergym.reports.tables.terminal_tables import benchmark, work
+from filtergym.reports.tables import benchmark, work
 
 ENV = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"

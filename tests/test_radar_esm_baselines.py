@@ -10,7 +10,7 @@ from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.evaluation.running.rollout import start_lanes
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.quantities import Quantity
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
 from models import make_model

@@ -29,12 +29,12 @@ from filtergym.evaluation.storage.dataset import notes_of
 from filtergym.evaluation.storage.estimates import write_estimates
 from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
-from filtergym.reports.tables.terminal_tables.terminal_tables import with_interval
 from models import make_model
 
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.__main__ import main
 from filtergym.commands.evaluation import causal_names
+from filtergym.reports.tables.terminal_tables import with_interval
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigation-v0"

@@ -11,10 +11,8 @@ import pytest
 from comparison import compared_policies
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors.kinds.kinds import RANKED
+from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
-from filtergym.reports.tables.terminal_tables.ranking import who_is_best
-from filtergym.reports.tables.terminal_tables.results import settings_of, write_results
 from front import panels_of
 from made_results import results_of
 from readme import with_numbers
@@ -31,6 +29,9 @@ from records import (
 )
 from results_table import chosen_markdown, results_markdown
 from sentence_numbers import number_text, record_of
+
+from filtergym.reports.tables.ranking import who_is_best
+from filtergym.reports.tables.results import settings_of, write_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
 DOCS = Path(__file__).parent.parent / "docs"

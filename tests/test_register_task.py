@@ -19,7 +19,7 @@ from filtergym.envs.contract.task import Task
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
-from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy
+from filtergym.evaluation.competitors.kinds import ConstantPolicy
 from filtergym.evaluation.running.parallel import Workers
 from models import make_model
 

@@ -12,7 +12,7 @@ from filtergym.envs.drawing import estimate_picture, rendering
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
-from filtergym.evaluation.figures.curve_figures.animation import episode_frames, write_animation
+from filtergym.evaluation.figures.animation import episode_frames, write_animation
 
 from filtergym import evaluate
 from filtergym.names import competitor

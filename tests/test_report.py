@@ -10,10 +10,14 @@ from types import SimpleNamespace
 import markupsafe
 import numpy as np
 import pytest
-from filtergym.reports.tables.terminal_tables.headline import headline_table
-from filtergym.reports.tables.terminal_tables.ranking import best_of_origins, ranking, remarks
-from filtergym.reports.tables.terminal_tables.reasons import reason_sentences
-from filtergym.reports.tables.terminal_tables.results import (
+from made_results import results_of
+
+from filtergym.reports.pages.html_report import report_html
+from filtergym.reports.pages.outcome import find_lead, outcome_sentences, protocol_sentences
+from filtergym.reports.tables.headline import headline_table
+from filtergym.reports.tables.ranking import best_of_origins, ranking, remarks
+from filtergym.reports.tables.reasons import reason_sentences
+from filtergym.reports.tables.results import (
     MOST_SHOWN,
     MOST_TIMES,
     Settings,
@@ -24,15 +28,11 @@ from filtergym.reports.tables.terminal_tables.results import (
     spread,
     write_results,
 )
-from filtergym.reports.tables.terminal_tables.terminal_tables import (
+from filtergym.reports.tables.terminal_tables import (
     consistency_word,
     results_tables,
     with_interval,
 )
-from made_results import results_of
-
-from filtergym.reports.pages.html_report import report_html
-from filtergym.reports.pages.outcome import find_lead, outcome_sentences, protocol_sentences
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "adaptive-rearm-tuned", "kalman-imm-tuned", "ppo", "known-turn", "known-input-bound"]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy
 import pytest
-from filtergym.evaluation.figures.curve_figures.print_layout import save
+from filtergym.evaluation.figures.print_layout import save
 from filtergym.papers.grid import Grid
 from filtergym.papers.quantities import Quantity, mean, means, quantity
 from filtergym.papers.reproduction import (

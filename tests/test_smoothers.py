@@ -16,25 +16,25 @@ from filtergym.baselines.maneuvering_target.smoothers import (
 )
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Baselines, Variant
-from filtergym.evaluation.competitors.kinds.filters import put_in_loop
-from filtergym.evaluation.competitors.kinds.kinds import RANKED, kind_of
+from filtergym.evaluation.competitors.filters import put_in_loop
+from filtergym.evaluation.competitors.kinds import RANKED, kind_of
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.filters import kalman
-from filtergym.reports.tables.terminal_tables.benchmark import result_of
-from filtergym.reports.tables.terminal_tables.ranking import (
-    best_of_origins,
-    ranking,
-    ranking_sentence,
-    remarks,
-)
-from filtergym.reports.tables.terminal_tables.results import Settings
-from filtergym.reports.tables.terminal_tables.terminal_tables import rank_competitors, results_tables
 from models import make_model
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.commands.evaluation import find_names
 from filtergym.reports.pages.html_report import report_html
 from filtergym.reports.pages.outcome import outcome_sentences
+from filtergym.reports.tables.benchmark import result_of
+from filtergym.reports.tables.ranking import (
+    best_of_origins,
+    ranking,
+    ranking_sentence,
+    remarks,
+)
+from filtergym.reports.tables.results import Settings
+from filtergym.reports.tables.terminal_tables import rank_competitors, results_tables
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SMOOTHERS = baselines_of(TARGET).smoothers

@@ -6,8 +6,8 @@ from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.compiler import namespace
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.competitors.kinds.kinds import make_competitor
-from filtergym.evaluation.competitors.kinds.steered_filter import steer, trace_policy
+from filtergym.evaluation.competitors.kinds import make_competitor
+from filtergym.evaluation.competitors.steered_filter import steer, trace_policy
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
 

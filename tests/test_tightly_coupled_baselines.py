@@ -17,7 +17,7 @@ from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LIN
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.filters import gnss_ins
 from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
 from filtergym.papers.quantities import Quantity

@@ -20,8 +20,8 @@ from filtergym.envs.uav_autopilot.level_bank import Kind
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
-from filtergym.evaluation.statistics.statistic.statistic import reduce_run
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.statistic import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
 from filtergym.papers.uav_autopilot_kalman import experiment
 from models import make_model

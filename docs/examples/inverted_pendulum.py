@@ -22,7 +22,7 @@ from filtergym.envs.contract.filter import Bank, Initial
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.task import Component, PaperPolicy, Scenario, Task
 from filtergym.envs.contract.world import World
-from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy, Policy, RandomPolicy
+from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from filtergym.filters import kalman
 
 import filtergym

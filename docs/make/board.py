@@ -9,9 +9,9 @@ from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.rollout import ProcessorTime
 from filtergym.evaluation.running.times import PYTHON_MARK, time_text
 from filtergym.papers.grid import markdown_table
-from filtergym.reports.tables.terminal_tables.ranking import HARM
 from records import short_name
 
+from filtergym.reports.tables.ranking import HARM
 from filtergym.submission import (
     TIME,
     TOLERANCE,

@@ -11,13 +11,11 @@ import typer
 from filtergym.agents.export import export_run
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import find_scenario
-from filtergym.evaluation.figures.curve_figures.print_layout import check_columns, check_formats, save
+from filtergym.evaluation.figures.print_layout import check_columns, check_formats, save
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.parallel import Workers
 from filtergym.evaluation.storage.files import writable_file, write_text
 from filtergym.evaluation.storage.store import UNFINISHED, Store
-from filtergym.reports.tables.terminal_tables.records import write_records
-from filtergym.reports.tables.terminal_tables.results import read_results, settings_of
 from front import draw_fronts, panels_of
 from readme import with_numbers, with_printed
 from records import (
@@ -52,6 +50,8 @@ from filtergym.commands.terminal import (
     console,
     progress_bar,
 )
+from filtergym.reports.tables.records import write_records
+from filtergym.reports.tables.results import read_results, settings_of
 
 PROGRAM = "python docs/make"
 

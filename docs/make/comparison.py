@@ -5,20 +5,21 @@ from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem
-from filtergym.evaluation.competitors.kinds.kinds import RANKED
+from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
-from filtergym.reports.tables.terminal_tables.ranking import HARM, ranking, ranking_sentence, who_is_best
-from filtergym.reports.tables.terminal_tables.terminal_tables import (
+from pictures import draw_differences
+from records import BenchmarkRecords, ResultRecord, short_name
+
+from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
+from filtergym.reports.tables.terminal_tables import (
     INCONSISTENT,
     against_paper,
     consistency,
     score_text,
     with_interval,
 )
-from pictures import draw_differences
-from records import BenchmarkRecords, ResultRecord, short_name
 
 STRONGEST = 4
 """Classical competitors that the page shows."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.evaluation.competitors.kinds.kinds import RANKED
-from filtergym.evaluation.figures.curve_figures.front_figure import Panel, draw_panel, legend_of, name_points
-from filtergym.evaluation.figures.curve_figures.print_layout import figure_with_pairs, in_print
+from filtergym.evaluation.competitors.kinds import RANKED
+from filtergym.evaluation.figures.front_figure import Panel, draw_panel, legend_of, name_points
+from filtergym.evaluation.figures.print_layout import figure_with_pairs, in_print
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import points_of_records, times_of_records
 from filtergym.papers.grid import markdown_table

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
-from filtergym.evaluation.figures.curve_figures.looks import styles
-from filtergym.evaluation.figures.curve_figures.print_layout import (
+from filtergym.evaluation.figures.looks import styles
+from filtergym.evaluation.figures.print_layout import (
     add_title,
     figure_with_axes,
     in_print,

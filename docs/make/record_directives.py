@@ -16,7 +16,7 @@ from docutils.parsers.rst import directives
 from docutils.statemachine import StringList
 from environment_page import environment_table
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.figures.curve_figures.print_layout import save
+from filtergym.evaluation.figures.print_layout import save
 from filtergym.papers.grid import markdown_table
 from front import budgets_markdown, draw_fronts, panels_of
 from records import (

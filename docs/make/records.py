@@ -18,7 +18,8 @@ from filtergym.envs.engine.catalogue import catalogue, nearest
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.storage.files import write_text
 from filtergym.evaluation.storage.stored import read_json
-from filtergym.reports.tables.terminal_tables.terminal_tables import main_components
+
+from filtergym.reports.tables.terminal_tables import main_components
 
 FOLDER = Path(__file__).parent.parent / "records"
 BENCHMARK, SEEDS = "benchmark", "seeds"

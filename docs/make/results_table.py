@@ -5,8 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
 from filtergym.papers.grid import markdown_table
-from filtergym.reports.tables.terminal_tables.ranking import ranking_sentence
-from filtergym.reports.tables.terminal_tables.terminal_tables import (
+from records import BenchmarkRecords, ResultRecord, short_name
+
+from filtergym.reports.tables.ranking import ranking_sentence
+from filtergym.reports.tables.terminal_tables import (
     INCONSISTENT,
     against_paper,
     consistency,
@@ -15,7 +17,6 @@ from filtergym.reports.tables.terminal_tables.terminal_tables import (
     score_text,
     with_interval,
 )
-from records import BenchmarkRecords, ResultRecord, short_name
 
 COLUMNS = ("difference", "median", "wins", "ns", "control", "cost", "rmse", "anees", "score")
 """Of the table, in their order; a page may choose."""

@@ -22,12 +22,13 @@ from typing import Any
 
 import numpy
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap, Estimate, percentile_interval
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, percentile_interval
 from filtergym.papers.grid import markdown_table
-from filtergym.reports.tables.terminal_tables.terminal_tables import with_interval
 from pictures import draw_profiles
 from records import ResultRecord, short_name
 from sentence_numbers import Number
+
+from filtergym.reports.tables.terminal_tables import with_interval
 
 RESAMPLES = 10_000
 Scores = Mapping[str, Mapping[str, numpy.ndarray]]

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.times import ProcessorTime, time_text
-from filtergym.reports.tables.terminal_tables.terminal_tables import with_interval
 from records import BENCHMARK, FOLDER, SEEDS, read_record, short_name, table_cell
+
+from filtergym.reports.tables.terminal_tables import with_interval
 
 
 class Number(NamedTuple):

@@ -18,25 +18,25 @@ import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.evaluation.competitors.kinds.kinds import kind_of
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import check_sendable
 from filtergym.evaluation.running.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.running.parallel import Workers, check_workers
 from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
-from filtergym.evaluation.statistics.statistic.bootstrap import CONFIDENCE, Bootstrap, Estimate
-from filtergym.evaluation.statistics.statistic.statistic import ALL, Statistic
+from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, Estimate
+from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
 from filtergym.evaluation.storage.dataset import groups_of, windows_of
 from filtergym.evaluation.storage.store import Store, Work
 from filtergym.papers.grid import Grid, markdown_table
-from filtergym.reports.tables.terminal_tables.terminal_tables import select_components, with_interval
-from filtergym.reports.tables.terminal_tables.work import meaning_of, stem_of
 from pictures import draw_learning_curves
 from records import ResultRecord, round_number, short_name
 from scipy.special import stdtrit
 from sentence_numbers import Number
 
 from filtergym.names import find_competitor
+from filtergym.reports.tables.terminal_tables import select_components, with_interval
+from filtergym.reports.tables.work import meaning_of, stem_of
 
 
 class Comparison(NamedTuple):

@@ -6,7 +6,7 @@ import numpy
 from filtergym.baselines.table import Baselines, tunable
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Array
-from filtergym.evaluation.competitors.kinds.kinds import ConstantPolicy, Policy, RandomPolicy
+from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 
 from . import gradient_filters, quaternions, vqf
 from .metrics import METRICS

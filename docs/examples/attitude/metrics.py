@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy
-from filtergym.evaluation.statistics.statistic.bootstrap import Bootstrap
+from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.storage.dataset import slices_of
 from filtergym.evaluation.running.metrics import Measure
 from filtergym.evaluation.running.own_metrics import MetricInputs, OwnMetrics
