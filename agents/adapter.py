@@ -16,7 +16,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..envs.engine.environment import TaskEnv, TaskVectorEnv
+from ..envs.interface.environment import TaskEnv
+from ..envs.interface.vector_environment import TaskVectorEnv
 from .gate import Gate
 from .residual import check_residual
 

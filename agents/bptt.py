@@ -29,8 +29,8 @@ import torch
 from ..envs.contract.model import Model
 from ..envs.contract.parameters import check_integer
 from ..envs.engine.catalogue import nearest
-from ..envs.engine.environment import TaskVectorEnv
 from ..envs.engine.scenario_choice import find_mixture
+from ..envs.interface.vector_environment import TaskVectorEnv
 from ..evaluation.competitors.kinds import Policy
 from ..evaluation.running.seeds import episode_seeds
 from ..filters.array_namespace import host_array

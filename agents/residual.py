@@ -12,7 +12,7 @@ import numpy
 
 from ..baselines.problem import Problem
 from ..envs.contract.model import Model
-from ..envs.engine.environment import TaskEnv
+from ..envs.interface.environment import TaskEnv
 from ..evaluation.competitors.kinds import Policy, expose_spaces, kind_of, make_competitor, says_traceable
 
 

@@ -20,7 +20,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from ..envs.engine.environment import TaskEnv, TaskVectorEnv
+from ..envs.interface.environment import TaskEnv
+from ..envs.interface.vector_environment import TaskVectorEnv
 from .eager_optimiser import exclude_from_compilation
 from .training_run import check_trust
 

@@ -37,9 +37,9 @@ from ..envs.engine.catalogue import (
     parameter_names,
     task_class,
 )
-from ..envs.engine.environment import DTYPES
 from ..envs.engine.reward import REWARDS
 from ..envs.engine.scenario_choice import find_mixture, find_scenario
+from ..envs.interface.requests import DTYPES
 from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.running.rollout import run_competitor
 from ..evaluation.running.seeds import episode_seeds

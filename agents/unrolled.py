@@ -11,8 +11,8 @@ from typing import Any
 import numpy
 import torch
 
-from ..envs.engine.environment import TaskVectorEnv
 from ..envs.engine.rollout import Rollout
+from ..envs.interface.vector_environment import TaskVectorEnv
 from .gate import Gate
 
 LIMIT = 10.0

@@ -18,7 +18,7 @@ import gymnasium
 import numpy
 import torch
 from filtergym.agents import to_sb3
-from filtergym.envs.engine.environment import TaskEnv
+from filtergym.envs.interface.environment import TaskEnv
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3 import PPO

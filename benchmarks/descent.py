@@ -24,7 +24,7 @@ from filtergym.agents.training_run import RunOptions, TrainingRun, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from rich.console import Console
 from rich.table import Table
 

@@ -15,7 +15,8 @@ from .envs.contract.model import Model
 from .envs.data.recording import Recording
 from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
-from .envs.engine.environment import TaskEnv, TaskVectorEnv
+from .envs.interface.environment import TaskEnv
+from .envs.interface.vector_environment import TaskVectorEnv
 from .evaluation.competitors.kinds import check_competitor, kind_of, make_competitor
 from .evaluation.competitors.stepping import SteppingPolicy
 from .evaluation.running import metrics

@@ -5,7 +5,8 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 pytest.importorskip("stable_baselines3")
 from filtergym.agents import to_sb3

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 from filtergym import evaluate
 from filtergym.names import competitor, tidy_records

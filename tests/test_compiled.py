@@ -14,7 +14,8 @@ from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.engine import compiled as compiled_tasks
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.compiled import CompiledModel
-from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
 from filtergym.evaluation.running.recording import NoFilter

@@ -11,7 +11,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine.catalogue import catalogue, register
-from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.evaluation.running.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 from models import make_model

@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import catalogue, task_class
-from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 

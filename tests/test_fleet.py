@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.engine.fleet import Course
 from filtergym.envs.engine.scenario_choice import find_mixture
+from filtergym.envs.interface.fleet import Course
 
 ID = "filtergym/ManeuveringTarget-v0"
 MIXTURE = {"random": 0.6, "paper": 0.4}

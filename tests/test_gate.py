@@ -512,7 +512,7 @@ def test_gradient_through_the_gate_is_that_of_torch():
     pytest.importorskip("llvmlite")
     from filtergym.agents.bptt import NetworkPolicy, descend_episodes
     from filtergym.agents.unrolled import Unrolled
-    from filtergym.envs.engine.environment import TaskVectorEnv
+    from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
     keywords = {"control": "gain", "horizon": 12, "reward": "cost", "autoreset_mode": "Disabled"}
     envs = [TaskVectorEnv(ID, 6, backend=backend, **keywords) for backend in ("torch", "compiled")]

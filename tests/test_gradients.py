@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import backend
-from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 pytest.importorskip("torch")
 pytest.importorskip("llvmlite")

@@ -24,7 +24,7 @@ ROOMS = (
 )
 """The last two are not installed, so nothing in the package may import them."""
 INNER_ROOMS = {
-    "envs": ("contract", "data", "drawing", "engine", "linear", *folders().values()),
+    "envs": ("contract", "data", "drawing", "engine", "interface", "linear", *folders().values()),
     "evaluation": ("storage", "statistics", "competitors", "running", "figures"),
     "filtergym/reports": ("tables", "pages"),
 }

@@ -16,7 +16,7 @@ from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import REWARDS, reference
 from filtergym.envs.engine.scenario_choice import find_scenario
-from filtergym.envs.engine.step_report import step_report
+from filtergym.envs.interface.step_report import step_report
 from models import make_model
 
 ENDLESS = {float: (-1e6, -1e-6, 1e-6, 1e6), int: (1, 2, 300)}

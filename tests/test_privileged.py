@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filtergym.envs.contract.world import World
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.engine.privileged import context_shapes
+from filtergym.envs.interface.privileged import context_shapes
 from models import make_model
 
 from filtergym import evaluate, make_policy

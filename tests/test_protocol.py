@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from filtergym.envs.data.trajectory import Trajectory
 from filtergym.envs.drawing import rendering
-from filtergym.envs.engine.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit

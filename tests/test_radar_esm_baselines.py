@@ -565,7 +565,7 @@ def test_reproduction_refuses_too_few_episodes():
 
 
 def test_picture_shows_accelerations_decisions_and_the_change():
-    from filtergym.envs.engine.environment import TaskEnv
+    from filtergym.envs.interface.environment import TaskEnv
 
     world = TaskEnv(ID, "weights", "class-change", render_mode="rgb_array", decision_interval=1)
     world.reset(seed=2)

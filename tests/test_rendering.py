@@ -10,7 +10,7 @@ import pytest
 from filtergym.envs.contract.model import Model
 from filtergym.envs.drawing import estimate_picture, rendering
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.engine.environment import TaskEnv
+from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
 from filtergym.evaluation.figures.animation import episode_frames, write_animation
 

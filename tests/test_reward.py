@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.engine.environment import TaskVectorEnv
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import reference
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from models import make_model
 
 import filtergym

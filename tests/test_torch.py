@@ -7,8 +7,8 @@ import gymnasium
 import numpy
 import pytest
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.engine.environment import TaskVectorEnv
 from filtergym.envs.engine.reward import charge
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from models import make_model, short_episodes
 from rounding import assert_same, flown_side_by_side
 

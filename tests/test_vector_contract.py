@@ -5,7 +5,7 @@ import copy
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.engine.environment import TaskVectorEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.vector import AutoresetMode
 
 import filtergym  # noqa: F401  (registers the environments)

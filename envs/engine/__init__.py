@@ -1,5 +1,5 @@
-"""What runs a task: episodes side by side, steps in NumPy or compiled, noise by counter, Gymnasium's classes.
+"""What runs a task: episodes side by side, steps in NumPy or compiled, noise by counter, names and scenarios of tasks.
 
-Knows the contract, the data and the drawing. Begin with :mod:`.environment`, the Gymnasium classes; under them
-:mod:`.lanes` runs N episodes, and :mod:`.compiled` makes their steps code of the processor.
+Knows the contract and the data. Begin with :mod:`.lanes`, which runs N episodes; :mod:`.compiled` makes their steps
+code of the processor, and :mod:`.backend` chooses between that, NumPy and torch.
 """

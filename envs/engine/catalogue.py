@@ -238,8 +238,8 @@ def register() -> None:
         if id not in gymnasium.registry:
             gymnasium.register(
                 id,
-                entry_point="filtergym.envs.engine.environment:TaskEnv",
-                vector_entry_point="filtergym.envs.engine.environment:TaskVectorEnv",
+                entry_point="filtergym.envs.interface.environment:TaskEnv",
+                vector_entry_point="filtergym.envs.interface.vector_environment:TaskVectorEnv",
                 # A spawned process gets no more than this, and must find the environment by it.
                 kwargs={"task": importable_name(USER_TASKS[id]) if id in USER_TASKS else id},
             )

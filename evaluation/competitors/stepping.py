@@ -7,7 +7,7 @@ import numpy
 
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Model
-from ...envs.engine.environment import check_action
+from ...envs.interface.requests import check_action
 from .kinds import Policy
 from .steered_filter import compile_policy, trace_decision
 

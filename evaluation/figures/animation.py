@@ -11,9 +11,9 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.parameters import check_integer
 from ...envs.contract.task import Task
 from ...envs.engine.backend import make_model
-from ...envs.engine.environment import TaskEnv
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.scenario_choice import find_scenario
+from ...envs.interface.environment import TaskEnv
 from ..competitors.kinds import kind_of, make_competitor
 from ..competitors.stepping import SteppingPolicy
 from ..running.evaluate import control_of

@@ -8,7 +8,7 @@ import numpy
 from ...filters.array_namespace import host_array
 from ..contract.observation import Array
 from ..drawing.rendering import EpisodePicture
-from .lanes import Lanes
+from ..engine.lanes import Lanes
 
 
 class LatePicture:

@@ -21,8 +21,8 @@ import numpy
 from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
-from .lanes import Lanes
-from .reward import reference
+from ..engine.lanes import Lanes
+from ..engine.reward import reference
 from .specification import plain
 
 ROOM = 8

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from .compiled import Report
-from .reward import OWN_PAY
+from ..engine.compiled import Report
+from ..engine.reward import OWN_PAY
 
 
 class StepReport(NamedTuple):

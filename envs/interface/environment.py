@@ -1,0 +1,186 @@
+"""One episode of a task as a Gymnasium environment; many are in :mod:`.vector_environment`."""
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy
+
+from ..engine.backend import make_model
+from ..engine.catalogue import nearest
+from ..engine.scenario_choice import ScenarioChoice
+from .environment_base import FRAMES_PER_SECOND, EnvBase
+from .requests import EnvOptions, check_action, check_options, check_seed
+
+if TYPE_CHECKING:
+    from ..drawing.rendering import EpisodePicture
+    from .late_picture import LatePicture
+
+
+class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
+    """One episode of a task at a time.
+
+    Args:
+        task: environment id.
+        control: what the action steers; default: the first of the environment's controls.
+        scenario: name of a scenario, a :class:`~filtergym.envs.data.trajectory.Trajectory` or a dictionary of its
+            fields, or the path of a file with one; a :class:`~filtergym.envs.data.recording.Recording`, or its file; or
+            a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these
+            weights from ``np_random``.
+        reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative", see :mod:`.reward`; default: the
+            environment's own, and zero on a recording without truth.
+        render_mode: None, "rgb_array" or "human".
+        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
+            cost and what else an evaluation records.
+        backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
+        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
+            given out.
+        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+            (:meth:`.Task.context`), at resets and steps.
+        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
+            and of what is "privileged", the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may be shown that where it is judged.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for an unknown name or a value out of its limits; an unknown keyword is a TypeError too.
+        ImportError: for the compiled backend without llvmlite.
+    """
+
+    metadata = {  # noqa: RUF012 (as in gymnasium.Env)
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": FRAMES_PER_SECOND,
+    }
+
+    def __init__(
+        self,
+        task: str,
+        control: str | None = None,
+        scenario: ScenarioChoice = None,
+        reward: str | None = None,
+        render_mode: str | None = None,
+        detailed_info: bool = False,
+        backend: str = "auto",
+        dtype: str = "float64",
+        context: bool = False,
+        observation: str = "measured",
+        **keywords: Any,
+    ) -> None:
+        self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
+        if backend == "torch":
+            raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise nearest("render_mode", render_mode, self.metadata["render_modes"])
+        self._open(
+            functools.partial(make_model, self._class, control, backend=backend), scenario, keywords, 1, None
+        )
+        self.render_mode = render_mode
+        self._late: LatePicture | None = None
+        if render_mode is not None:
+            self._picture_of(self._first_course.names[0])
+        self.observation_space = self._observation_space()
+        self.action_space = self.model.action_space
+
+    def _picture_of(self, scenario: str) -> None:
+        """Draw episodes of the present task, of a scenario of this name."""
+        # Only here: matplotlib takes longer to import than an episode takes to run.
+        from ..drawing.rendering import EpisodePicture
+        from .late_picture import LatePicture
+
+        assert self.render_mode is not None
+        self._late = LatePicture(EpisodePicture(self.model, scenario, self.render_mode, FRAMES_PER_SECOND))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode and show its first measurement.
+
+        ``options["scenario"]``: what ``scenario`` of the environment takes; None is the environment's own again.
+        ``options["parameters"]``: parameters that go before those of the environment; ``{}`` for none. Each holds until
+        a reset names another.
+
+        Raises:
+            ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them,
+                and for a scenario or parameters that would change the spaces.
+        """
+        wanted, seed = check_options(options, self.reset_options), check_seed(seed)
+        self._apply_reset_options(wanted, [0])
+        super().reset(seed=seed)
+        self.fleet.seed(0, self.np_random)
+        self.fleet.restart()
+        self._forget_errors([0])
+        self.model = self.fleet.model_of(0)
+        if self._late is not None and self._late.model is not self.model:
+            self._late.close()
+            self._picture_of(self.fleet.scenario_of(0))
+        if self._late is not None:
+            self._late.begin(self.fleet.identity_of(0))
+            self._show()
+        return self._single_observation(), self._with_context({})
+
+    def _single_observation(self) -> Any:
+        """Observation of the one episode."""
+        if not self.privileged:
+            return self._to_dtype(self.fleet.observe()[0])
+        return {name: values[0] for name, values in self._observations().items()}
+
+    def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
+        if self.options.context:
+            info["context"] = {name: values[0] for name, values in self._context()[0].items()}
+        return info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Apply the action to the measurement just shown, then show the next one."""
+        if not self.fleet.has_episodes:
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
+        if self.fleet.done[0]:
+            raise gymnasium.error.ResetNeeded("the episode has ended: call reset before the next step")
+        array = check_action(self.action_space, action, None)
+        info: dict[str, Any] = {}
+        reward = self._step_lanes(array[None], info)
+        if self._late is not None:
+            self._late.keep(array)
+            self._show()
+        if info:
+            info = {name: values[0] for name, values in info.items()}
+        if self.options.context:
+            self._with_context(info)
+        reward = float(self._to_dtype(reward)[0])
+        return self._single_observation(), reward, False, bool(self.fleet.done[0]), info
+
+    def _show(self) -> None:
+        """Draw into the window of render mode "human"."""
+        if self._late is not None and self.render_mode == "human":
+            self._late.show()
+
+    @property
+    def picture(self) -> "EpisodePicture | None":
+        """What keeps and draws the episode, up to date; None without a render mode."""
+        return None if self._late is None else self._late.picture
+
+    def render(self) -> numpy.ndarray | None:
+        """Draw the episode so far.
+
+        Returns:
+            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
+            every reset and step anyway.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._late is None:
+            gymnasium.logger.warn(
+                'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
+            )
+            return None
+        if not self.fleet.has_episodes:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        if self.render_mode == "human":
+            self._show()
+            return None
+        return self._late.frame()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._late is not None:
+            self._late.close()

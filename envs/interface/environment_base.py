@@ -1,0 +1,312 @@
+"""What both Gymnasium classes share: lanes of a task or of several, what is shown of them, and the reward."""
+
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy
+from gymnasium.envs.registration import EnvSpec
+
+from ..contract.model import Model
+from ..contract.observation import Array, Field
+from ..contract.task import Task
+from ..engine.catalogue import check_names, nearest, task_class
+from ..engine.lanes import Lanes, mean_of
+from ..engine.reward import REWARDS
+from ..engine.scenario_choice import find_mixture, find_scenario
+from .fleet import Course, Fleet, check_alike
+from .privileged import context_shapes, in_sigmas
+from .requests import EnvOptions
+from .specification import with_episode_length
+from .step_report import step_report
+
+FRAMES_PER_SECOND = 10
+
+
+def _no_truth(course: Course) -> str:
+    known = any(model.task.has_truth for model in course.models)
+    lacks = "lacks some of the truth, so the reward" if known else "has no truth, so the cost"
+    return f"recording {course.names[0]!r} {lacks} of an estimate is not known"
+
+
+class EnvBase:
+    """What both environments share: a task, its spaces, and the reward."""
+
+    model: Model
+    """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
+    fleet: Fleet
+    options: EnvOptions
+    reward_kind: str
+    last_decision: int
+    """Actions after which an episode is truncated, where scenarios differ in length the longest one."""
+    reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
+    """Names that ``options`` of a reset may have."""
+    _spec: EnvSpec | None = None
+
+    @property
+    def task(self) -> Task:
+        """What the model is of."""
+        return self.model.task
+
+    def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
+        """Keep the options; refuse an unknown environment or parameter before anything is made."""
+        self._class = task_class(task)
+        check_names(self._class, names, inspect.signature(type(self)).parameters)
+        self.options = options
+        self.reward_kind = self._class.reward if options.reward is None else options.reward
+        if self.reward_kind not in REWARDS:
+            raise nearest("reward", self.reward_kind, REWARDS)
+        self._rewards_only = not (options.detailed_info or options.privileged)
+        if self.privileged:
+            self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.options.privileged
+
+    def _open(
+        self,
+        make: Callable[..., Model],
+        scenario: Any,
+        keywords: Mapping[str, Any],
+        count: int,
+        longest: int | None,
+    ) -> None:
+        """Make the lanes.
+
+        Args:
+            make: makes a model of a scenario and parameters.
+            scenario: as the user has named it.
+            keywords: parameters of the task.
+            count: number of lanes.
+            longest: decisions after which an episode ends at the latest.
+        """
+        self._make, self._keywords = make, dict(keywords)
+        course = self._course(scenario, {})
+        if not all(model.task.has_whole_truth for model in course.models):
+            self._disable_reward(course)
+        self.model, self._first_course = course.models[0], course
+        self.fleet = Fleet(count, course, self.reward_kind, longest)
+        self.last_decision = self.fleet.decisions_per_episode
+        self._scaled_errors: Array = None
+        """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
+        if self.privileged:
+            self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
+
+    def _disable_reward(self, course: Course) -> None:
+        """Set every reward to zero, where the truth is not known.
+
+        Raises:
+            ValueError: if a reward was asked for, or what is privileged.
+        """
+        wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
+        wanted = "observation='asymmetric'" if self.privileged else wanted
+        if wanted:
+            raise ValueError(f"{_no_truth(course)}: leave out {wanted}; rewards are zero")
+        self.reward_kind = "none"
+
+    # --- scenarios
+
+    def _course(self, scenario: Any, parameters: Mapping[str, Any]) -> Course:
+        """Make the tasks of a scenario or a mixture, with parameters beside those of the environment.
+
+        Raises:
+            ValueError: for an unknown name, a value out of its limits, or what would change the spaces.
+        """
+        keywords = {**self._keywords, **parameters}
+        mixture = find_mixture(self._class, scenario)
+        choices = [scenario] if mixture is None else list(mixture)
+        found = [find_scenario(self._class, choice, keywords) for choice in choices]
+        models = tuple(self._make(one, **keywords) for one in found)
+        names = tuple(one.name for one in found)
+        course = Course(
+            scenario,
+            dict(parameters),
+            models,
+            names,
+            (1.0,) if mixture is None else tuple(mixture.values()),
+        )
+        if (
+            hasattr(self, "model")
+            and self.reward_kind != "none"
+            and not all(t.task.has_whole_truth for t in models)
+        ):
+            raise ValueError(
+                f"{_no_truth(course)}, and this environment gives rewards: make another one of it"
+            )
+        first = getattr(self, "model", models[0])
+        for model, name in zip(models, names, strict=True):
+            check_alike(first, model, name)
+            if self.privileged and context_shapes(model.task) != context_shapes(first.task):
+                raise ValueError(
+                    f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
+                    "it out, or make the environment without observation='asymmetric'"
+                )
+        return course
+
+    def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
+        """Apply the scenario and the parameters of a reset to the coming episodes of these lanes."""
+        if not {"scenario", "parameters"} & wanted.keys():
+            return
+        parameters = wanted.get("parameters")
+        if parameters is not None and not (
+            isinstance(parameters, Mapping) and all(isinstance(name, str) for name in parameters)
+        ):
+            raise ValueError(f"options['parameters'] maps names of parameters to values, got {parameters!r}")
+        known = [self._first_course, *self.fleet.courses()]
+        courses = []
+        for lane in chosen:
+            now = self.fleet.course_of(lane)
+            asked = now.scenario, now.parameters
+            if "scenario" in wanted:
+                scenario = wanted["scenario"]
+                asked = (self._first_course.scenario if scenario is None else scenario), asked[1]
+            if "parameters" in wanted:
+                asked = asked[0], dict(parameters or {})
+            found = next((course for course in known if course.is_of(*asked)), None)
+            if found is None:
+                found = self._course(*asked)
+                known.append(found)
+            courses.append(found)
+        for lane, course in zip(chosen, courses, strict=True):
+            self.fleet.send(lane, course)
+        self.last_decision = self.fleet.decisions_per_episode
+
+    # --- what is shown
+
+    def _observation_space(self) -> gymnasium.Space:
+        dtype = numpy.dtype(self.options.dtype).type
+        low, high = (limits.astype(dtype) for limits in self.model.observation_limits)
+        measured = gymnasium.spaces.Box(low, high, dtype=dtype)
+        if not self.privileged:
+            return measured
+        context = sum(math.prod(shape) for shape in context_shapes(self.task).values())
+        return gymnasium.spaces.Dict(
+            {
+                "observation": measured,
+                "privileged": gymnasium.spaces.Box(
+                    -numpy.inf, numpy.inf, (context + len(self.task.components),), dtype
+                ),
+            }
+        )
+
+    def _to_dtype(self, values: Array) -> Array:
+        """Numbers in the type that was asked for."""
+        if self.options.dtype == "float64":
+            return values
+        return self.task.xp.astype(values, self.task.xp.float32)
+
+    def _observations(self) -> Any:
+        """Observations of all lanes, batch first."""
+        shown = self._to_dtype(self.fleet.observe())
+        if not self.privileged:
+            return shown
+        xp, count = self.task.xp, self.fleet.count
+        flat = [xp.reshape(values, (count, -1)) for values in self._context()[0].values()]
+        return {
+            "observation": shown,
+            "privileged": self._to_dtype(xp.concat([*flat, self._scaled_errors], axis=1)),
+        }
+
+    def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
+        """Context of all lanes, batch first, and which of them has each part of it."""
+        found = []
+        for (part,) in self.fleet.parts():
+            context, xp = part.model.context(part.state), part.task.xp
+            found.append({name: xp.moveaxis(v[..., : part.count], -1, 0) for name, v in context.items()})
+        return self._gather_reports(found)
+
+    def _gather_reports(
+        self, found: Sequence[Mapping[str, Array]]
+    ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
+        """Put together what the lanes of several tasks report, and say who reports each part of it.
+
+        Where one reports more numbers than another, and where one reports nothing, NaN stands for what is missing.
+        """
+        xp, values, present = self.task.xp, {}, {}
+        counts = [part.count for (part,) in self.fleet.parts()]
+        for name in dict.fromkeys(name for one in found for name in one):
+            shapes = [tuple(one[name].shape[1:]) for one in found if name in one]
+            largest = tuple(map(max, zip(*shapes, strict=True)))
+            padded = []
+            for one, count in zip(found, counts, strict=True):
+                full = self.task.constant(numpy.full((count, *largest), numpy.nan))
+                if name in one:
+                    if tuple(one[name].shape[1:]) == largest:
+                        full = one[name]
+                    else:
+                        full[tuple(slice(size) for size in one[name].shape)] = xp.astype(
+                            one[name], xp.float64
+                        )
+                padded.append(full)
+            values[name] = self.fleet.gather(padded)
+            has = [numpy.full(count, name in one) for one, count in zip(found, counts, strict=True)]
+            present[name] = self.fleet.gather(has)
+        return values, present
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made this from; its ``max_episode_steps`` is the length of an episode in decisions."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = None if spec is None else with_episode_length(spec, self.last_decision)
+
+    @property
+    def backend(self) -> str:
+        """What computes the steps: "compiled", "numpy" or "torch"."""
+        return self.model.backend
+
+    # --- a step
+
+    def _step_lanes(
+        self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
+    ) -> Array:
+        """Step the lanes and return the mean reward over the measurements of this decision, ``(count,)``.
+
+        ``watch`` is called with the state after the action, once for each measurement.
+        """
+        if self._rewards_only and watch is None:
+            return self.fleet.pay(action, self.reward_kind)
+        infos: list[dict[str, Array]] = []
+        answers = []
+        for part, own in self.fleet.parts(action):
+            infos.append({})
+            answers.append(self._step_part(part, own, infos[-1], watch))
+        if self.privileged:
+            self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
+        info.update(self._gather_reports(infos)[0])
+        return self.fleet.gather([reward for reward, _ in answers])
+
+    def _step_part(
+        self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
+    ) -> tuple[Array, Array]:
+        """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
+        task, count = lanes.task, lanes.count
+        asked = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
+        answers = lanes.decide(action, asked)
+        if watch is not None:
+            for own, _ in answers:
+                watch(own.episode)
+        last = answers[-1][0]
+        for name, values in (last.details or {}).items():
+            info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
+        rewards = [own.reward if other is None else own.reward - other.reward for own, other in answers]
+        scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
+        return mean_of(rewards)[:count], scaled
+
+    def _forget_errors(self, lanes: Sequence[int]) -> None:
+        """Episodes that begin have no estimate yet that could be wrong."""
+        if self.privileged:
+            keep = numpy.ones((self.fleet.count, 1))
+            keep[list(lanes)] = 0.0
+            self._scaled_errors = self.task.xp.where(self.task.constant(keep) > 0.0, self._scaled_errors, 0.0)
+
+    @property
+    def observation_fields(self) -> tuple[Field, ...]:
+        """Name, unit and scale of every component of the observation."""
+        return self.model.fields

@@ -1,0 +1,110 @@
+"""What the callers of an environment give, checked: options, seeds, options of a reset, actions."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy
+
+from ...filters.array_namespace import host_array, is_tensor
+from ..contract.observation import Array
+from ..contract.parameters import Limits, check
+from ..engine.catalogue import nearest
+
+DTYPES = ("float64", "float32")
+"""Types of observations and rewards; inside everything is float64."""
+OBSERVATIONS = ("measured", "asymmetric")
+"""What an observation holds: what can be known; or beside it, for critics in training, what cannot."""
+
+
+def check_seed(seed: Any) -> int | None:
+    """Return the seed of a reset, or raise ValueError where it is none."""
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | numpy.integer) or seed < 0:
+        raise ValueError(f"a seed is None or an integer of at least 0, got {seed!r}")
+    return int(seed)
+
+
+def check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
+    """Return the options of a reset, or raise ValueError for what is none, and for a name that is not known."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options of a reset are a dictionary or None, got {options!r}")
+    for name in options:
+        if name not in known:
+            raise nearest("option of a reset", name, known)
+    return options
+
+
+FEW = 16
+"""Numbers that are looked at one by one sooner than by NumPy."""
+
+
+def _all_finite(values: Array) -> bool:
+    if isinstance(values, numpy.ndarray) and values.size <= FEW:
+        return all(map(math.isfinite, values.ravel().tolist()))
+    # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
+    with numpy.errstate(over="ignore", invalid="ignore"):
+        return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
+
+
+def check_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
+    """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
+    if is_tensor(action):
+        array, values = action, action.detach()
+        floating, real = (
+            values.is_floating_point(),
+            str(values.dtype) != "torch.bool" and not values.is_complex(),
+        )
+    else:
+        array = values = numpy.asarray(action)
+        floating, real = values.dtype.kind == "f", values.dtype.kind in "fiu"
+    if isinstance(space, gymnasium.spaces.Discrete):
+        shape: tuple[int, ...] = () if count is None else (count,)
+        n = int(space.n)
+        if array.shape != shape or floating or not real or (values < 0).any() or (values >= n).any():
+            raise _action_error(f"integer actions from 0 to {n - 1} of shape {shape}", values)
+        return array
+    assert space.shape is not None
+    shape = space.shape if count is None else (count, *space.shape)
+    if array.shape != shape or not real or not _all_finite(values):
+        raise _action_error(f"finite actions of shape {shape}", values)
+    return array
+
+
+def _action_error(expected: str, action: Array) -> ValueError:
+    shown = numpy.array2string(host_array(action), threshold=8)
+    return ValueError(f"expected {expected}, got {action.dtype} of shape {tuple(action.shape)}: {shown}")
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """What a user of either environment may choose beside the task and its parameters; see :class:`.TaskEnv`.
+
+    Raises:
+        ValueError: for a value that is none of the choices.
+    """
+
+    reward: str | None = None
+    """Kind of reward; None: the environment's own."""
+    detailed_info: bool = False
+    dtype: str = "float64"
+    context: bool = False
+    observation: str = "measured"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dtype, str) or self.dtype not in DTYPES:  # a NumPy dtype equals its name
+            raise nearest("dtype", self.dtype, DTYPES)
+        if self.observation not in OBSERVATIONS:
+            raise nearest("observation", self.observation, OBSERVATIONS)
+        check("detailed_info", self.detailed_info, bool, Limits())
+        check("context", self.context, bool, Limits())
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.observation == "asymmetric"
