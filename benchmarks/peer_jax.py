@@ -14,8 +14,8 @@ import numpy
 from filtergym.compiler.functions import map_arrays
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine.catalogue import import_task
-from filtergym.envs.engine.compiled import step_episodes
 from filtergym.envs.engine.lanes import Lanes
+from filtergym.envs.engine.programs import step_episodes
 from filtergym.envs.engine.scenario_choice import make_task
 
 

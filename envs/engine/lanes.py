@@ -8,7 +8,7 @@ kernels by the width, and widths that are multiples of eight agree. So lane i of
 environment with the same seed bit for bit.
 
 **What steps them.** A compiled model whose report can be traced moves its episodes in memory of its own
-(:class:`~.compiled.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
+(:class:`~.stepper.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,9 +22,11 @@ from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from .compiled import Report, Stepper, can_step, share_world
+from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
+from .programs import Report
 from .reward import OWN_PAY, RewardBaseline
+from .stepper import Stepper
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
@@ -277,7 +279,7 @@ class Lanes:
 
         Args:
             report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
-            steering: as of :meth:`.compiled.Stepper.run`; None: the action is zero.
+            steering: as of :meth:`.stepper.Stepper.run`; None: the action is zero.
             measurements: after which they are left, a multiple of the decision interval; default: all.
 
         Returns:

@@ -14,7 +14,7 @@ from ...compiler import namespace as traced
 from ...compiler.functions import Specialised, address_of, empty_lanes, leaves, map_arrays
 from ...compiler.gradients import pullback
 from ..contract.model import Episode
-from .compiled import Programs, step_episodes
+from .programs import Programs, step_episodes
 
 ADDRESS_SLOTS = slice(1, 7, 2)
 """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of episodes, action and noise."""

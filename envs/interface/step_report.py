@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..engine.compiled import Report
+from ..engine.programs import Report
 from ..engine.reward import OWN_PAY
 
 

@@ -16,7 +16,7 @@ from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.parameters import check_integer
 from ...envs.data.recording import measure_examples
-from ...envs.engine.compiled import filter_stepper
+from ...envs.engine.stepper import filter_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .filters import find_fault, put_in_loop

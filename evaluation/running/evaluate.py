@@ -18,8 +18,8 @@ from ...envs.contract.task import Scenario, Task
 from ...envs.data.recording import Recording
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import importable_name, nearest, task_class
-from ...envs.engine.compiled import Report
 from ...envs.engine.episode_noise import uniforms_of_seeds
+from ...envs.engine.programs import Report
 from ...envs.engine.reward import charge
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
 from ...filters.gaussian import log_density

@@ -13,9 +13,10 @@ from ...compiler.functions import Specialised, round_up_lanes
 from ...compiler.native import optimised_code
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
-from ...envs.engine.compiled import CompiledModel, Report, can_step
+from ...envs.engine.compiled import CompiledModel, can_step
 from ...envs.engine.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ...envs.engine.lanes import Lanes, whole_episode
+from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
 from ..competitors.filters import put_in_loop
 from ..competitors.kinds import Kind, check_competitor, compilation_key, kind_of, make_competitor

@@ -1,0 +1,248 @@
+"""What is traced and compiled of a model: the parts of a step, and its reports.
+
+A step has four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
+what is long, world and filter, is compiled once for all of them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...compiler import namespace
+from ...compiler.functions import Function, Specialised, leaves
+from ...compiler.namespace import NotTraceable
+from ...compiler.program import Graph
+from ..contract.draws import Draws
+from ..contract.filter import Filter, Input
+from ..contract.model import Episode, Model
+from ..contract.observation import Array
+from .reward import OWN_PAY
+
+PROGRAM_CACHE_SIZE = 8
+"""Tasks whose programs a process keeps."""
+
+Report = Callable[[Model, Episode], Any]
+"""Function of a task and its episodes after the action: nested tuples or dictionaries of arrays."""
+
+
+def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
+    """Filter after the measurement, and what it gives back to the world."""
+    after = model.filter.update(state, Input(measurement, truth, action))
+    return after, model.filter.feedback(after, measurement)
+
+
+def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
+    """Truth at the next measurement, and the measurement."""
+    return model.task.world.advance(truth, noise, feedback)
+
+
+def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
+    """Filter at the measurement, and what is shown of it."""
+    predicted = model.filter.predict(state, measurement)
+    return predicted, model.observe(Episode(None, measurement, predicted))
+
+
+def _predict_unseen(model: Model, state: Any, measurement: Any) -> Any:
+    """Filter at the measurement, of which nothing is shown."""
+    return model.filter.predict(state, measurement)
+
+
+def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any]:
+    """Truth at the start of the track, and the initial estimate."""
+    return model.task.world.begin(Draws(uniforms, model.task.xp), normals)
+
+
+def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
+    """Filter at the start of the track, and what it gives back to the world."""
+    state = model.filter.begin(Input(initial, truth))
+    return state, model.filter.feedback(state, initial)
+
+
+def feedback_of(model: Model, state: Any, measurement: Any) -> Any:
+    """What a filter gives back to the world."""
+    return model.filter.feedback(state, measurement)
+
+
+class Parts(NamedTuple):
+    """Programs of a step, and what they are made for."""
+
+    update: Specialised
+    advance: Specialised
+    predict: Specialised
+    episode: Episode
+    """After the measurement, its arrays of the right shapes."""
+
+
+def step_episodes(
+    kind: str, model: Model, episode: Episode, action: Array, noise: Array
+) -> tuple[Episode, Array, Array]:
+    """A whole step: episodes at the next measurement, the reward of the action, and the observation."""
+    after = model.act(episode, action)
+    following = model.measure(after, noise)
+    return following, OWN_PAY[kind](model, after), model.observe(following)
+
+
+class _Once:
+    """A property that is computed once, as of functools from Python 3.12 on: before, it holds a lock that a fork would
+    leave to a child for ever.
+    """
+
+    def __init__(self, compute: Callable[[Any], Any]) -> None:
+        self.compute, self.__doc__ = compute, compute.__doc__
+
+    def __get__(self, holder: Any, owner: type) -> Any:
+        found = holder.__dict__[self.compute.__name__] = self.compute(holder)
+        return found
+
+
+class Programs:
+    """What is traced of a task, for all that have its parameters.
+
+    Args:
+        traced: the task on traced arrays.
+        graph: where its constants were made.
+        of_world: what is traced of the same task with another filter; the world is the same.
+    """
+
+    def __init__(self, traced: Model, graph: Graph, of_world: "Programs | None" = None) -> None:
+        self.traced = traced
+        self.graph = graph
+        self.refused: set[Any] = set()
+        """Functions that could not be traced."""
+        self._functions: dict[Any, Function] = {}
+        self._of_world = of_world or self
+        self._with_filter: dict[Any, Programs] = {}
+        self._kept: dict[Any, Any] = {}
+
+    def with_filter(self, make: Callable[[Model], Filter]) -> "Programs":
+        """Return what is traced of the task with another filter; kept for the next time.
+
+        Raises:
+            NotTraceable: if the filter is no straight line of arithmetic.
+        """
+        if make not in self._with_filter:
+            with namespace.tracing(self.graph):
+                programs = Programs(self.traced.with_filter(make), self.graph, self._of_world)
+            if not programs.traced.filter.in_python:
+                _ = programs.later
+            while len(self._with_filter) >= PROGRAM_CACHE_SIZE:
+                self._with_filter.pop(next(iter(self._with_filter)))
+            self._with_filter[make] = programs
+        return self._with_filter[make]
+
+    def keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what is compiled for the task beside it, made where there is none by this key; the last ones stay."""
+        if key not in self._kept:
+            made = make()
+            while len(self._kept) >= PROGRAM_CACHE_SIZE:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = made
+        return self._kept[key]
+
+    def function(self, function: Callable[..., Any], **options: Any) -> Function:
+        """Compiled form of ``function(task, ...)``."""
+        if function not in self._functions:
+            options = {"unchanged": 0, **options}
+            self._functions[function] = Function(
+                functools.partial(function, self.traced), self.graph, **options
+            )
+        return self._functions[function]
+
+    @_Once
+    def filter_update(self) -> Function:
+        """The filter with the measurement; a part of it that stays is not written again."""
+        return self.function(_update, unchanged=None)
+
+    @_Once
+    def world_advance(self) -> Function:
+        """The world; a part of the truth that stays is not written again."""
+        if self._of_world is not self:
+            return self._of_world.world_advance
+        return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
+
+    @_Once
+    def filter_prediction(self) -> Function:
+        """The filter at the next measurement."""
+        return self.function(_predict, turned=True)
+
+    @_Once
+    def world_start(self) -> Specialised:
+        """World at the start of the track."""
+        if self._of_world is not self:
+            return self._of_world.world_start
+        noise = self.traced.task.noise
+        uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
+        return self.function(begin_world).specialise(uniforms, normals)
+
+    @_Once
+    def start(self) -> tuple[Specialised, Specialised]:
+        """World and filter at the start of the track."""
+        truth, initial = self.world_start.example()
+        return self.world_start, self.function(start_filter).specialise(
+            initial, self.traced.truth_for_filter(truth)
+        )
+
+    @_Once
+    def first(self) -> Parts:
+        """Parts of the way from the start of the track over the first measurement."""
+        world, started = self.start
+        return self._parts(world.example()[0], *started.example())
+
+    @_Once
+    def later(self) -> Parts:
+        """Parts of the way from an action to the next.
+
+        Raises:
+            NotTraceable: if one is no straight line of arithmetic.
+        """
+        first = self.first
+        later = self._parts(first.advance.example()[0], *first.update.example())
+        shapes = [
+            [leaf.shape for leaf in (*parts.advance.inputs, *parts.predict.inputs, *parts.predict.outputs)]
+            for parts in (first, later)
+        ]
+        if shapes[0] != shapes[1] or first.advance.same != later.advance.same:
+            raise NotTraceable("the arrays of an episode change their shapes from step to step")
+        return later
+
+    @_Once
+    def unseen_predictions(self) -> tuple[Specialised, Specialised]:
+        """The filter at the first measurement and at later ones, where nobody looks at what it shows."""
+        states = self.start[1].example()[0], self.first.update.example()[0]
+        predict, measurement = self.function(_predict_unseen), self.later.episode.measurement
+        return predict.specialise(states[0], measurement), predict.specialise(states[1], measurement)
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether the filter gives nothing back to the world."""
+        started, first, later = self.start[1], self.first.update, self.later.update
+        states = len(leaves(self.later.episode.filter))
+        return all(len(program.outputs) == states for program in (started, first, later))
+
+    @property
+    def row(self) -> numpy.ndarray:
+        """Noise of a measurement."""
+        return numpy.zeros((self.traced.task.noise.normals + self.traced.task.noise.row_uniforms, 8))
+
+    def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:
+        space = self.traced.action_space
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
+        action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
+        advance = self.world_advance.specialise(truth, feedback, self.row)
+        following, measurement = advance.example()
+        predict = self.filter_prediction.specialise(state, measurement)
+        predicted = predict.example()[0]
+        known = self.traced.truth_for_filter(following)
+        update = self.filter_update.specialise(known, predicted, measurement, action)
+        return Parts(update, advance, predict, Episode(following, measurement, predicted))
+
+    def report_program(self, report: Report) -> Specialised:
+        """A report on an episode.
+
+        Raises:
+            NotTraceable: if it is no straight line of arithmetic.
+        """
+        return self.function(report).specialise(self.later.episode)
