@@ -249,6 +249,7 @@ def test_matrix_products_are_numpys(function):
         lambda xp, i: xp.take(xp.asarray(TABLE[:, :3]), i, axis=-1),
         lambda xp, i: xp.asarray(TABLE.reshape(2, 1, 4))[..., i],
         lambda xp, i: xp.asarray(TABLE.reshape(2, 2, 2))[..., 1, i % 2],
+        lambda xp, i: xp.asarray(TABLE.reshape(2, 2, 2))[..., i % 2, 1],
         lambda xp, i: xp.moveaxis(xp.asarray(TABLE.reshape(2, 2, 2))[:, i % 2], 1, -1),
         lambda xp, i: xp.moveaxis(xp.asarray(TABLE.reshape(2, 2, 2))[..., i % 2, :], 1, -1),
         lambda xp, i: xp.moveaxis(xp.take(xp.asarray(TABLE), i % 2, axis=0), 0, -1),

@@ -501,7 +501,7 @@ def test_node_four_is_white_for_the_paper_filter_alone() -> None:
 
 def test_lost_loops_are_counted_and_every_number_stays_finite() -> None:
     dataset = evaluate(
-        ID, ["kalman", "raw-sensors"], "paper-noise", 40, plant="P", sensors=("position",), horizon=3000
+        ID, ["kalman", "raw-sensors"], "paper-noise", 10, plant="P", sensors=("position",), horizon=3000
     )
     assert numpy.isfinite(dataset["cost"].values).all()
     assert numpy.abs(dataset["output"].values).max() == 1e4
