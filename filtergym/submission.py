@@ -1,4 +1,4 @@
-"""Submissions: a competitor, its card and its results on a protocol in one file that anybody can run again.
+"""Submissions: a competitor and its results on a protocol in one file that anybody can run again.
 
 A file is JSON of declared types. Nothing in it is compressed, so that it is as large as it looks, and nothing in it
 names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source
@@ -9,9 +9,6 @@ Processors and libraries agree on sums and products, and differ by some units in
 relative. A filter hands on what n measurements have left of an error times the condition number of what it inverts,
 kappa, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7. :data:`TOLERANCE` is the
 next power of ten.
-
-The episodes of a protocol are known beforehand. Those of a round are not: their seed is drawn from the digest of the
-file and a value that nobody knew when the file was handed in, see :func:`round_seed`.
 """
 
 import hashlib
@@ -45,8 +42,6 @@ TOLERANCE = 1e-6
 """Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""
 MOST_BYTES = 8_000_000
 """Of a file."""
-SUFFIX, VERIFIED = ".json", ".verified.json"
-"""Of a submission, and of what its verification has found."""
 OWN = "submission"
 """Name of a submission among the competitors of its evaluation."""
 TIME = "nanoseconds"
@@ -59,7 +54,6 @@ METRICS = ("cost", *RATIOS, TIME)
 Name = Annotated[str, msgspec.Meta(pattern=r"^[\w.:/+-]{1,100}\Z")]
 Title = Annotated[str, msgspec.Meta(pattern=r"^[\w .,:+()/&'-]{1,80}\Z")]
 """Words that mean nothing to a terminal, to Markdown or to HTML."""
-Line = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]{0,1000}\Z")]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
@@ -86,14 +80,6 @@ class Card(_Stored, frozen=True):
 
     title: Title
     author: Title = "-"
-    command: Line = ""
-    """That trained or tuned it."""
-    budget: Count = 0
-    """Decisions of its training, or measurements of its tuning; 0: neither."""
-    seeds: tuple[Count, ...] = ()
-    """Training seeds of which this is the best."""
-    scenarios: tuple[Name, ...] = ()
-    """That it was trained or tuned on."""
 
 
 class Figure(_Stored, frozen=True, omit_defaults=True):
@@ -142,27 +128,10 @@ class Submission(_Stored, frozen=True):
     format: Literal["filtergym submission 1"] = "filtergym submission 1"
 
 
-class Verification(_Stored, frozen=True):
-    """What has come out where a submission was run again."""
-
-    submission: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
-    """SHA-256 of its file."""
-    filtergym: Name
-    difference: float
-    """Largest difference of its results from those that were found here, in units of :data:`TOLERANCE`."""
-    round: Line
-    """Value of the round, which was not known when the file was handed in."""
-    seed: Annotated[int, msgspec.Meta(ge=0)] | None
-    """Number of the round's experiment, which follows from both; None: no round."""
-    results: tuple[Figure, ...]
-    """Over the episodes of the round; without a round over those of the protocol."""
-    format: Literal["filtergym verification 1"] = "filtergym verification 1"
-
-
 EPISODES: Mapping[str, int] = MappingProxyType({"filtergym/TightlyCoupledNavigation-v0": 100})
-"""Of the protocol ``board``, where they are not 500."""
-PROTOCOLS = ("board", "trial")
-"""Names: what the board takes, and a short one to try."""
+"""Of the protocol ``full``, where they are not 500."""
+PROTOCOLS = ("full", "trial")
+"""Names: the whole, and a short one to try."""
 
 
 def protocol_of(problem: Problem, name: str) -> Protocol:
@@ -170,7 +139,7 @@ def protocol_of(problem: Problem, name: str) -> Protocol:
 
     Args:
         problem: whose scenarios it has.
-        name: ``"board"``: every scenario, the training distribution first; or ``"trial"``: 32 episodes of that.
+        name: ``"full"``: every scenario, the training distribution first; or ``"trial"``: 32 episodes of that.
 
     Raises:
         ValueError: for another name.
@@ -200,25 +169,16 @@ def read_submission(path: Path) -> tuple[Submission, str]:
         ValueError: if it is none.
     """
     content = _read(path)
-    return _decode(path, content, Submission), hashlib.sha256(content).hexdigest()
+    return _decode(path, content), hashlib.sha256(content).hexdigest()
 
 
-def read_verification(path: Path) -> Verification:
-    """Read what a verification has found.
-
-    Raises:
-        ValueError: if the file holds none.
-    """
-    return _decode(path, _read(path), Verification)
-
-
-def write_stored(path: Path, stored: Submission | Verification) -> str:
-    """Write either, and return the SHA-256 digest of the file.
+def write_submission(path: Path, submission: Submission) -> str:
+    """Write a submission, and return the SHA-256 digest of the file.
 
     Raises:
         ValueError: if it cannot be written, or is larger than a reader takes.
     """
-    content = msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n"
+    content = msgspec.json.format(msgspec.json.encode(submission), indent=1) + b"\n"
     if len(content) > MOST_BYTES:
         raise ValueError(
             f"a submission is at most {MOST_BYTES / 1e6:g} MB, and this one has {len(content):,} bytes"
@@ -237,11 +197,11 @@ def _read(path: Path) -> bytes:
         raise ValueError(f"{path} is no submission: {error}") from error
 
 
-def _decode(path: Path, content: bytes, kind: Any) -> Any:
+def _decode(path: Path, content: bytes) -> Submission:
     try:
-        return msgspec.json.decode(content, type=kind)
+        return msgspec.json.decode(content, type=Submission)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} holds no {kind.__name__.lower()} of filtergym: {error}") from error
+        raise ValueError(f"{path} holds no submission of filtergym: {error}") from error
 
 
 # --- competitors
@@ -292,17 +252,12 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
         trust: run source.
 
     Raises:
-        ValueError: if it holds source and is not trusted, what is no competitor, or one that is told the truth; and of
-            an agent if its card does not say what its arrays say of its training.
+        ValueError: if it holds source and is not trusted, what is no competitor, one that is told the truth, or an
+            agent that was trained on what is held out.
     """
     held = submission.competitor
     if isinstance(held, Arrays):
-        found, training = _load_agent(problem, held, path)
-        card = submission.card
-        said = Training(card.command, card.budget, card.scenarios, card.seeds)
-        if said[:3] != training[:3] or not {*training.seeds} <= {*said.seeds}:
-            raise ValueError(f"{path}: its card says {said} of its training, and its arrays {training}")
-        return found
+        return _load_agent(problem, held, path)
     if isinstance(held, Source):
         if not trust:
             raise ValueError(
@@ -326,17 +281,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
     return found
 
 
-class Training(NamedTuple):
-    """What an agent's file says of its training."""
-
-    command: str
-    budget: int
-    scenarios: tuple[str, ...]
-    seeds: tuple[int, ...]
-
-
-def _load_agent(problem: Problem, held: Arrays, path: Path) -> tuple[Any, Training]:
-    """Load an agent and what its file says of its training.
+def _load_agent(problem: Problem, held: Arrays, path: Path) -> Any:
+    """Load an agent.
 
     Raises:
         ValueError: in one printable sentence that names the submission, if the arrays are no agent of the environment,
@@ -348,28 +294,24 @@ def _load_agent(problem: Problem, held: Arrays, path: Path) -> tuple[Any, Traini
         try:
             found = load_policy(problem.task, file)
             stored: Any = getattr(found, "policy", found)
-            run = stored.header["run"]
-            scenarios = check_trained(problem, run.get("scenario"))
-            steps, seed = int(run.get("steps") or 0), int(run.get("seed") or 0)
+            _check_trained(problem, stored.header["run"].get("scenario"))
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
             text = str(error).replace(str(file), "its agent")
             raise ValueError(f"{path}: {''.join(c if c.isprintable() else ' ' for c in text)}") from error
     stored.path = path  # in errors from now on; its own is gone
-    return found, Training(str(run.get("command", "")), steps, scenarios, (seed,))
+    return found
 
 
-def check_trained(problem: Problem, scenario: Any) -> tuple[str, ...]:
-    """Return the names of the scenarios that something was trained on; what a file says opens no other file.
+def _check_trained(problem: Problem, scenario: Any) -> None:
+    """Check the scenario, or the mixture of some, that an agent was trained on; what a file says opens no other file.
 
     Raises:
         ValueError: for a scenario that is held out, or none.
     """
-    names = tuple(find_mixture(problem.task, scenario) or [scenario or problem.task.default_scenario])
-    for name in names:
+    for name in find_mixture(problem.task, scenario) or [scenario or problem.task.default_scenario]:
         if not (isinstance(name, str) and name in problem.task.scenarios):
             raise nearest("scenario", name, problem.task.scenarios)
         training_scenarios(problem.task, name)
-    return names
 
 
 def _run_source(held: Source, path: Path) -> Any:
@@ -405,7 +347,7 @@ def make_submission(
         problem: that is solved.
         name: of the competitor, see :func:`pack`.
         protocol: name of the protocol.
-        card: what the author says; of an agent what its arrays say of its training goes before.
+        card: what the author says.
         workers: who shares the work.
         progress: told of measurements done.
 
@@ -415,14 +357,11 @@ def make_submission(
     from . import __version__
 
     held, own, path = pack(problem, name), protocol_of(problem, protocol), Path(name)
-    if isinstance(held, Arrays):
-        training = _load_agent(problem, held, path)[1]
-        card = msgspec.structs.replace(card, **{**training._asdict(), "seeds": card.seeds or training.seeds})
     submission = Submission(problem.id, problem.task.interface, __version__, own, card, held, ())
-    submission = _decode(path, msgspec.json.encode(submission), Submission)  # of its declared types
+    submission = _decode(path, msgspec.json.encode(submission))  # of its declared types
     check_submission(problem, submission, path)
     maker = unpack(problem, submission, path, trust=True)
-    results = run_protocol(problem, maker, own, own.seed, workers, progress)
+    results = run_protocol(problem, maker, own, workers, progress)
     return msgspec.structs.replace(submission, results=results)
 
 
@@ -430,7 +369,7 @@ def check_submission(problem: Problem, submission: Submission, path: Path) -> No
     """Check what a submission says against what this package knows, and run nothing.
 
     Raises:
-        ValueError: for another interface, an altered protocol, or training on a held-out scenario.
+        ValueError: for another interface or an altered protocol.
     """
     if submission.interface != problem.task.interface:
         raise ValueError(
@@ -440,15 +379,12 @@ def check_submission(problem: Problem, submission: Submission, path: Path) -> No
     known = protocol_of(problem, submission.protocol.name)
     if submission.protocol != known:
         raise ValueError(f"{path}: its protocol {known.name!r} is not that of this package: {known}")
-    for scenario in submission.card.scenarios:
-        check_trained(problem, scenario)
 
 
 def run_protocol(
     problem: Problem,
     maker: Any,
     protocol: Protocol,
-    seed: int,
     workers: Workers,
     progress: Progress | None = None,
 ) -> tuple[Figure, ...]:
@@ -458,7 +394,6 @@ def run_protocol(
         problem: whose scenarios these are.
         maker: of the competitor.
         protocol: which episodes.
-        seed: number of the experiment, the protocol's or a round's.
         workers: who shares the work.
         progress: told of measurements done.
     """
@@ -469,7 +404,9 @@ def run_protocol(
     requests = []
     for scenario in protocol.scenarios:
         timed = scenario == protocol.scenarios[0]
-        experiment = problem.experiment(scenario, protocol.episodes, seed, protocol.split, timed=timed)
+        experiment = problem.experiment(
+            scenario, protocol.episodes, protocol.seed, protocol.split, timed=timed
+        )
         horizon = experiment.make_task().horizon
         requests += [
             EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
@@ -544,39 +481,28 @@ def _number(value: float | None) -> str:
     return "not known" if value is None else f"{value:.9g}"
 
 
-def round_seed(digest: str, value: str) -> int:
-    """Return the number of a round's experiment: the first 64 bits of a SHA-256 digest.
-
-    Args:
-        digest: SHA-256 of the submission's file, 64 hexadecimal digits.
-        value: drawn after all files were handed in, such as a pulse of a public beacon.
-    """
-    return int.from_bytes(hashlib.sha256(f"{digest} {value}".encode()).digest()[:8], "big")
-
-
-class Outcome(NamedTuple):
-    """What a verification has found."""
+class Verification(NamedTuple):
+    """What has come out where a submission was run again."""
 
     submission: Submission
+    digest: str
+    """SHA-256 of its file."""
     deviation: Deviation
     """Of the results of the file from those over the same episodes here."""
     again: tuple[Figure, ...]
     """Those."""
-    verification: Verification
 
 
 def verify(
     path: Path,
-    value: str | None = None,
     trust: bool = False,
     workers: Workers | None = None,
     progress: Progress | None = None,
-) -> Outcome:
-    """Run the protocol of a submission again; of one whose numbers hold also over the episodes of a round.
+) -> Verification:
+    """Run the protocol of a submission again.
 
     Args:
         path: of the file.
-        value: of the round; None: no round.
         trust: run source.
         workers: who shares the work; default: this process.
         progress: told of measurements done.
@@ -585,19 +511,9 @@ def verify(
         ValueError: if it is no submission, not of this package's protocol and interface, or holds source and is not
             trusted.
     """
-    from . import __version__
-
     submission, digest = read_submission(path)
     problem = problem_of(submission.environment)
     check_submission(problem, submission, path)
     maker = unpack(problem, submission, path, trust)
-    workers, protocol = workers or Workers(), submission.protocol
-    again = run_protocol(problem, maker, protocol, protocol.seed, workers, progress)
-    found = deviation(submission.results, again)
-    results, seed = again, None
-    if value is not None and found.holds:
-        seed = round_seed(digest, value)
-        results = run_protocol(problem, maker, protocol, seed, workers, progress)
-    size = min(found.size, 1e300)  # JSON has no infinity
-    verification = Verification(digest, __version__, size, value or "", seed, results)
-    return Outcome(submission, found, again, verification)
+    again = run_protocol(problem, maker, submission.protocol, workers or Workers(), progress)
+    return Verification(submission, digest, deviation(submission.results, again), again)

@@ -10,7 +10,7 @@ Sage and Husa, "Adaptive filtering with unknown prior statistics", Joint Automat
 with the innovation ``nu = z - H x'``, the residual ``epsilon = z - H x``, P' and P the covariances before and
 after the update, b the forgetting factor. (2) is what the paper's estimate becomes when the filtered state
 stands in for the smoothed one; its samples have the mean R only where the filter already believes R, so it comes
-nearer by a fraction of the error, where (1) has no bias.
+nearer by a fraction of the error, where (1) has no bias: it is not used here.
 
 Mehra, "Approaches to adaptive filtering", IEEE Transactions on Automatic Control 17(5), 1972, covariance
 matching over the last W measurements (after "On the identification of variances and adaptive Kalman filtering",
@@ -84,21 +84,6 @@ def sage_husa(
     """
     after = fading_mean(level, innovation**2 - predicted, forgetting, available)
     return after._replace(value=namespace(after.value).clip(after.value, least, None))
-
-
-def sage_husa_positive(
-    level: Level, residual: Array, updated: Array, forgetting: float, available: Array | float = 1.0
-) -> Level:
-    """Variance of a measurement's noise by equation (2), positive by itself.
-
-    Args:
-        level: before.
-        residual: epsilon.
-        updated: variance of the measured quantity after the update, ``H P H^T``.
-        forgetting: b.
-        available: whether there is a measurement.
-    """
-    return fading_mean(level, residual**2 + updated, forgetting, available)
 
 
 def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:

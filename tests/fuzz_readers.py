@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES, LONGEST = 20, 1024, 200_000
 ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
 TABLES = (".csv", ".json", ".json.gz", ".nc", ".parquet", ".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap")
-WHOLE = ("filter.json", "safetensors", "submission", "verification", "results", "run.json", "settings.yml")
+WHOLE = ("filter.json", "safetensors", "submission", "results", "run.json", "settings.yml")
 READERS = (*(f"recording{suffix}" for suffix in TABLES), *(f"flights{s}" for s in TABLES[:5]), *WHOLE)
 
 
@@ -30,13 +30,16 @@ def write_seeds(reader: str, place: Path) -> None:
     import numpy
     import pandas
     import test_receiver_logs as logs
+    from filtergym.baselines.problem import problem_of
+    from filtergym.evaluation.running.parallel import Workers
+
+    from filtergym.submission import Card, make_submission, write_submission
 
     time = numpy.arange(0.0, 80.0, 2.0)
     columns = pandas.DataFrame({"time": time, "x": 2e4 + 100.0 * time, "y": 1e4 - 50.0 * time})
     path, suffix = place / "seed", reader.partition(".")[2]
     rows = [(round(1e6 * t), *map(float, p), 2.0, 3) for t, p in zip(logs.TIME, logs.places().T, strict=True)]
     pretrained = ROOT / "agents" / "pretrained" / "ManeuveringTarget-v0"
-    leader = ROOT / "leaderboard" / "ManeuveringTarget-semi-markov"
     tracked = {"track": columns.to_dict("records")}
     make = {
         "csv": lambda: columns.to_csv(path, index=False),
@@ -60,8 +63,9 @@ def write_seeds(reader: str, place: Path) -> None:
         make = {
             "filter.json": lambda: path.write_text(json.dumps(filter)),
             "safetensors": lambda: shutil.copy(pretrained / "bptt-small.safetensors", path),
-            "submission": lambda: shutil.copy(leader.with_suffix(".json"), path),
-            "verification": lambda: shutil.copy(leader.with_suffix(".verified.json"), path),
+            "submission": lambda: write_submission(
+                path, make_submission(problem_of(ENVIRONMENT), "imm", "trial", Card("IMM"), Workers())
+            ),
             "results": lambda: path.write_text(json.dumps({"settings": {}, "results": []})),
             "run.json": lambda: shutil.copy(pretrained / "bptt-small.json", path),
             "settings.yml": lambda: path.write_text(
@@ -82,7 +86,7 @@ def reading(reader: str, place: Path):
 
     from filtergym import read_flights, read_recording
     from filtergym.reports.tables.results import read_results
-    from filtergym.submission import check_submission, read_submission, read_verification
+    from filtergym.submission import check_submission, read_submission
 
     problem = problem_of(ENVIRONMENT)
     name = reader if reader.startswith(("recording", "flights")) else f"a.{reader}"
@@ -96,7 +100,6 @@ def reading(reader: str, place: Path):
         "filter.json": lambda: read_artefact(path, problem),
         "safetensors": lambda: load_policy(problem.task, path),
         "submission": submission,
-        "verification": lambda: read_verification(path),
         "results": lambda: read_results(path),
         "run.json": lambda: load_run(place),
         "settings.yml": lambda: read_config(path, ENVIRONMENT),

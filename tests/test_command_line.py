@@ -86,7 +86,7 @@ REFUSED = {
     "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
     "submit": (ENV, "nobody", "--out", "new/mine.json"),
-    "verify": ("missing.json", "--out", "new/mine.verified.json"),
+    "verify": ("missing.json",),
 }
 
 

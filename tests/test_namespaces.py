@@ -84,7 +84,6 @@ CALLS = [
     (kalman.update, (X4, P4, Z2, H24, R2)),
     (noise_adaptation.fading_mean, (LEVEL, Z2, 0.9, THERE)),
     (noise_adaptation.sage_husa, (LEVEL, Z2, LEVEL.value, 0.9, 0.1, THERE)),
-    (noise_adaptation.sage_husa_positive, (LEVEL, Z2, LEVEL.value, 0.9, THERE)),
     (noise_adaptation.process_noise_factor, (Z2, LEVEL.value, LEVEL.weight, LEVEL.value)),
     (noise_adaptation.start_window, (Z2, 3)),
     (noise_adaptation.mehra, (WINDOW, Z2, LEVEL.value, 0.1, THERE)),

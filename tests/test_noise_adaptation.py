@@ -21,19 +21,15 @@ def fading_weights(count, b):
 
 
 @pytest.mark.parametrize("b", [1.0, 0.9])
-@pytest.mark.parametrize("positive", [False, True])
-def test_sage_husa_is_the_weighted_mean_of_the_available_samples(b, positive):
+def test_sage_husa_is_the_weighted_mean_of_the_available_samples(b):
     innovations, variances, available = data(0)
     level = adaptation.Level(np.full((2, BATCH), 1.5), np.ones((2, BATCH)))
     for nu, P, a in zip(innovations, variances, available, strict=True):
-        if positive:
-            level = adaptation.sage_husa_positive(level, nu, P, b, a)
-        else:
-            level = adaptation.sage_husa(level, nu, P, b, -100.0, a)
+        level = adaptation.sage_husa(level, nu, P, b, -100.0, a)
     for i in np.ndindex(2, BATCH):
         there = available[(slice(None), *i)] > 0
         nu, P = innovations[(slice(None), *i)][there], variances[(slice(None), *i)][there]
-        samples = [1.5, *(nu**2 + P if positive else nu**2 - P)]
+        samples = [1.5, *(nu**2 - P)]
         # Sums of sixty terms in two orders.
         assert level.value[i] == pytest.approx(fading_weights(there.sum(), b) @ samples, rel=1e-13)
 
@@ -124,9 +120,9 @@ def test_every_method_finds_the_noise_of_a_long_run():
     rng = np.random.default_rng(3)
     steps, R = 1000, 5.0
     truth, unit = np.zeros(2), np.ones(1)
-    runs = {name: (np.zeros(2), np.eye(2)) for name in ("unbiased", "positive", "mehra", "bayes")}
+    runs = {name: (np.zeros(2), np.eye(2)) for name in ("unbiased", "mehra", "bayes")}
     believed = dict.fromkeys(runs, 2.0 * unit)
-    level = dict.fromkeys(("unbiased", "positive"), adaptation.Level(2.0 * unit, unit))
+    level = adaptation.Level(2.0 * unit, unit)
     window, noise = adaptation.start_window(2.0 * unit, 500), adaptation.InverseGamma(unit, 2.0 * unit)
     for _ in range(steps):
         truth = F @ truth + np.sqrt(np.diag(Q)) * rng.normal(size=2)
@@ -146,14 +142,9 @@ def test_every_method_finds_the_noise_of_a_long_run():
             innovation, variance = z - H @ predicted, np.diag(H @ prior @ H.T)
             if name == "mehra":
                 believed[name], window = adaptation.mehra(window, innovation, variance, 1e-3)
-            elif name == "unbiased":
-                level[name] = adaptation.sage_husa(level[name], innovation, variance, 0.998, 1e-3)
             else:
-                level[name] = adaptation.sage_husa_positive(
-                    level[name], z - H @ m, np.diag(H @ C @ H.T), 0.998
-                )
-            if name in level:
-                believed[name] = level[name].value
+                level = adaptation.sage_husa(level, innovation, variance, 0.998, 1e-3)
+                believed[name] = level.value
     # Five hundred measurements leave the mean square of the innovation 6 % uncertain, and R more so.
     for name, variance in believed.items():
         assert variance[0] == pytest.approx(R, rel=0.2), name

@@ -79,11 +79,9 @@ def test_recipe_runs(recipe, tmp_path):
     assert -60.0 < float(costs[0]) < 150.0
 
 
-def test_page_shows_every_recipe():
+def test_page_names_every_recipe():
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^```{literalinclude} recipes/(with_\S+)\n:language: (\w+)\n```$", page, re.M)
-    assert sorted(name for name, _ in shown) == RECIPES
-    assert {language for name, language in shown if name.endswith(".py")} == {"python"}
+    assert sorted(set(re.findall(r"\bwith_\w+\.(?:py|sh)\b", page))) == RECIPES
     for file in FOLDER.glob("*.txt"):
         assert f"--install {file.stem}" in page or f"`{file.stem}`" in page, file
 

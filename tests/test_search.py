@@ -145,7 +145,16 @@ def test_another_search_is_refused(tmp_path, monkeypatch):
         search_hyperparameters(search(), tmp_path, 1, pretended)
 
 
-@pytest.mark.parametrize("algorithm", training_run.FILES)
+WITHOUT_SPACE = ("recurrent-ppo", "sac", "dqn")
+
+
+@pytest.mark.parametrize("algorithm", WITHOUT_SPACE)
+def test_an_algorithm_without_a_shipped_space_asks_for_one(algorithm):
+    with pytest.raises(ValueError, match=f"no search space of {algorithm} is shipped: write one"):
+        read_space(ID, algorithm)
+
+
+@pytest.mark.parametrize("algorithm", [name for name in training_run.FILES if name not in WITHOUT_SPACE])
 def test_shipped_spaces_are_of_settings_that_there_are(algorithm):
     trained = [id for id, cls in catalogue().items() if algorithm in cls.trained_banks]
     for id in trained or [*catalogue(), "some/Other-v0"]:

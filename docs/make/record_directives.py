@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import comparison
-from board import board_markdown, read_entries
 from command_line import command_line_markdown
 from docutils import nodes
 from docutils.parsers.rst import directives
@@ -36,8 +35,6 @@ from sentence_numbers import number_text, record_of
 from sphinx.addnodes import download_reference
 from sphinx.util.docutils import SphinxDirective, SphinxRole
 from training_seeds import learning_curves, seeds_markdown, seeds_overview
-
-SUBMISSIONS = Path(__file__).parent.parent.parent / "leaderboard"
 
 
 def _words(text: str) -> list[str]:
@@ -253,16 +250,6 @@ class CommandLine(_Rendered):
         return command_line_markdown()
 
 
-class Leaderboard(_Rendered):
-    """``{leaderboard}``: verified submissions, of the files in ``leaderboard/``."""
-
-    with_headings: ClassVar[bool] = True
-
-    def markdown(self) -> str:
-        """Return the tables."""
-        return board_markdown(read_entries(SUBMISSIONS))
-
-
 class NumberRole(SphinxRole):
     """``{number}`PATH```: a number of a record with its interval; ``{value}`PATH``` without."""
 
@@ -316,7 +303,6 @@ DIRECTIVES = {
     "record-table": RecordTable,
     "environment-table": EnvironmentTable,
     "command-line": CommandLine,
-    "leaderboard": Leaderboard,
 }
 
 

@@ -219,7 +219,10 @@ def search(
         ),
     ] = None,
     space: Annotated[
-        Path | None, typer.Option(help="YAML file of what is searched; default: that of the algorithm.")
+        Path | None,
+        typer.Option(
+            help="YAML file of what is searched; default: the shipped one of ppo, bptt, its kin or kalman-net."
+        ),
     ] = None,
 ) -> None:
     """Search hyperparameters on the validation split with Optuna; afterwards train --config OUT/best.yml uses them.

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from .. import __version__
 from ..baselines.problem import problem_of
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, write_text
@@ -13,7 +14,6 @@ from ..submission import (
     PROTOCOLS,
     TIME,
     TOLERANCE,
-    VERIFIED,
     Card,
     Figure,
     Source,
@@ -22,19 +22,17 @@ from ..submission import (
     protocol_of,
     read_submission,
     verify,
-    write_stored,
+    write_submission,
 )
 from .terminal import (
     Environment,
     Jobs,
     Trust,
     complete_policy,
-    complete_training_scenario,
     console,
     import_environments,
     one_of,
     progress_bar,
-    whole_numbers,
 )
 
 
@@ -52,29 +50,13 @@ def submit(
     protocol: Annotated[
         str,
         typer.Option(
-            help="board: 500 episodes of every scenario, 100 in TightlyCoupledNavigation; trial: 32 of the training "
+            help="full: 500 episodes of every scenario, 100 in TightlyCoupledNavigation; trial: 32 of the training "
             "distribution.",
             autocompletion=one_of(*PROTOCOLS),
         ),
-    ] = "board",
-    title: Annotated[str | None, typer.Option(help="On the board; default: the name.")] = None,
-    author: Annotated[str, typer.Option(help="On the board.")] = "-",
-    trained_by: Annotated[
-        str, typer.Option(help="Command that trained or tuned it; an agent's own file says so.")
-    ] = "",
-    budget: Annotated[
-        int, typer.Option(help="Decisions or measurements that this took; an agent's own file says so.")
-    ] = 0,
-    seeds: Annotated[
-        str | None, typer.Option(help="Training seeds of which it is the best, such as 0-4.")
-    ] = None,
-    trained_on: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Training scenario; repeatable; an agent's own file says so.",
-            autocompletion=complete_training_scenario,
-        ),
-    ] = None,
+    ] = "full",
+    title: Annotated[str | None, typer.Option(help="Of the competitor; default: the name.")] = None,
+    author: Annotated[str, typer.Option(help="Who hands it in.")] = "-",
     jobs: Jobs = 1,
 ) -> None:
     """Run a protocol, and write competitor, card and results into one file.
@@ -85,37 +67,19 @@ def submit(
     """
     problem = problem_of(environment)
     writable_file(out)
-    card = Card(
-        title or Path(name).stem.rpartition(":")[2],
-        author,
-        trained_by,
-        budget,
-        tuple(whole_numbers("--seeds", seeds)) if seeds else (),
-        tuple(trained_on or ()),
-    )
+    card = Card(title or Path(name).stem.rpartition(":")[2], author)
     with Workers(jobs) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements_of(problem, protocol_of(problem, protocol)))
         made = make_submission(
             problem, name, protocol, card, workers, lambda done: bar.update(line, advance=done)
         )
-    digest = write_stored(out, made)
+    digest = write_submission(out, made)
     console.print(_results_table(made.card.title, {"": made.results}))
     console.print(f"saved in {out}, SHA-256 {digest}", soft_wrap=True)
 
 
 def verify_file(
     file: Annotated[Path, typer.Argument(help="A submission.")],
-    value: Annotated[
-        str | None,
-        typer.Option(
-            "--round",
-            metavar="VALUE",
-            help="Value that nobody knew when the file was handed in; fresh episodes follow from it and the file.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help=f"File for what is found, which the board takes: NAME{VERIFIED}.")
-    ] = None,
     source: Annotated[
         Path | None,
         typer.Option(help="Write the source code of the submission, to read it, and run nothing."),
@@ -131,7 +95,7 @@ def verify_file(
 
     Costs repeat but for rounding, whatever the processor; times are not compared. What holds source code needs --trust.
 
-    Example: filtergym verify leaderboard/ManeuveringTarget-bptt-small.json --round 2c7f
+    Example: filtergym verify bptt.json
     """
     if source is not None:
         held = read_submission(file)[0].competitor
@@ -140,34 +104,23 @@ def verify_file(
         write_text(source, held.text)
         console.print(f"source code in {source}, its class {held.name}", soft_wrap=True)
         return
-    if out is not None:
-        writable_file(out)
     with Workers(jobs) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
-        found = verify(file, value, trust, workers, lambda done: bar.update(line, advance=done))
-    own, verification, holds = found.submission, found.verification, found.deviation.holds
+        found = verify(file, trust, workers, lambda done: bar.update(line, advance=done))
+    own = found.submission
     columns = {"it says": own.results}
-    if not holds:
+    if not found.deviation.holds:
         columns["here"] = found.again
-    elif verification.seed is not None:
-        columns["fresh episodes"] = verification.results
     console.print(_results_table(f"{own.card.title}, by {own.card.author}", columns))
-    console.print(f"SHA-256 {verification.submission}", soft_wrap=True)
-    versions = f"made by filtergym {own.filtergym}, verified by {verification.filtergym}"
-    if not holds:
+    console.print(f"SHA-256 {found.digest}", soft_wrap=True)
+    versions = f"made by filtergym {own.filtergym}, verified by {__version__}"
+    if not found.deviation.holds:
         raise ValueError(f"the numbers of {file} do not hold: {found.deviation.sentence} ({versions})")
     console.print(
         f"the numbers hold: they differ by {found.deviation.size * TOLERANCE:.1e} at most, and rounding explains "
         f"{TOLERANCE:.0e}; {versions}",
         soft_wrap=True,
     )
-    if verification.seed is not None:
-        console.print(
-            f"fresh episodes: experiment {verification.seed}, of this file and {value!r}", soft_wrap=True
-        )
-    if out is not None:
-        write_stored(out, verification)
-        console.print(f"saved in {out}", soft_wrap=True)
 
 
 def _results_table(title: str, columns: dict[str, tuple[Figure, ...]]) -> Table:
