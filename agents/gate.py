@@ -340,13 +340,9 @@ class GatedEstimator:
     def update(self, measurement: Any, memory: GatedMemory) -> tuple[Array, Array, GatedMemory]:
         """Let both take the measurement in, and answer with the estimate of the one that is trusted."""
         xp = self.xp
-        mean, covariance, agent = self.agent.update(measurement, memory.agent)
+        mean, covariance, agent, own = self.agent.update(measurement, memory.agent)
         other_mean, other_covariance, fallback, *told = self.fallback.update(measurement, memory.fallback)
-        own = self.agent.likelihood(agent, measurement)
-        if isinstance(self.fallback, LearnedEstimator):
-            other = self.fallback.likelihood(fallback, measurement)
-        else:
-            other = Likelihood.of(*told) if told else Likelihood(None)
+        other = Likelihood.of(*told) if told else Likelihood(None)
         # A track that is lost altogether, so that its estimate is no number, is no answer either.
         odds, sound = memory.odds, xp.all(xp.isfinite(mean), axis=0)
         if other.log_likelihood is not None:

@@ -38,16 +38,15 @@ class LearnedEstimator:
         """Start the filter where everyone starts."""
         return self.filter.start(initial)
 
-    def update(self, measurement: Any, memory: Steered) -> tuple[Array, Array, Steered]:
-        """Predict, show the network what comes of it, and update as it answers."""
+    def update(self, measurement: Any, memory: Steered) -> tuple[Array, Array, Steered, Likelihood]:
+        """Predict, show the network what comes of it, and update as it answers; what the bank does not tell of the
+        likelihood is None.
+        """
         measurement = fill_missing(measurement)
         state = self.filter.update(self.filter.predict(memory, measurement), Input(measurement))
-        return self.filter.mean(state), self.filter.covariance(state), state
-
-    def likelihood(self, memory: Steered, measurement: Any) -> Likelihood:
-        """How well the measurement last taken in was predicted; None for what the bank does not tell."""
-        records = self.filter.records(memory, fill_missing(measurement))
-        return Likelihood(*(records.get(name) for name in Likelihood._fields))
+        records = self.filter.records(state, measurement)
+        likelihood = Likelihood(*(records.get(name) for name in Likelihood._fields))
+        return self.filter.mean(state), self.filter.covariance(state), state, likelihood
 
 
 def fill_missing(measurement: Any) -> Any:

@@ -316,12 +316,27 @@ def test_the_estimator_is_the_policy_in_its_bank(id):
     )
     memory, state, hidden = estimator.start(initial, 8), model.filter.start(initial), None
     for measurement in measurements:
-        mean, covariance, memory = estimator.update(measurement, memory)
+        mean, covariance, memory, likelihood = estimator.update(measurement, memory)
         episode = Episode(None, measurement, model.filter.predict(state, measurement))
         action, hidden = policy.predict(model.observe(episode).T, hidden)
         state = model.act(episode, action.T.astype(float)).filter
         np.testing.assert_array_equal(mean, model.filter.mean(state))
         np.testing.assert_array_equal(covariance, model.filter.covariance(state))
+        told = model.filter.records(state, measurement)
+        for name, values in likelihood._asdict().items():
+            assert (values is None) == (name not in told)
+            if values is not None:
+                np.testing.assert_array_equal(values, told[name])
+
+
+@pytest.mark.parametrize("id", [FUSION, ESM, AIRCRAFT])
+def test_an_evaluation_keeps_how_well_a_network_inside_a_filter_predicted(id):
+    """Log-likelihood and normalised innovation squared of every measurement that was received."""
+    found = filtergym.evaluate(id, {"net": EstimatorMaker(NAME, network)}, episodes=16, **SHORT.get(id, {}))
+    told = found[["log_likelihood", "nis", "nis_degrees"]].to_array().values
+    received = found["nis_degrees"].values > 0.0
+    assert received.any()
+    assert np.isfinite(told[:, received]).all()
 
 
 @pytest.fixture

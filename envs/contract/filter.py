@@ -77,7 +77,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     def start(self, initial: Any) -> State:
         """State at the start of the track, of the task's :class:`Initial`."""
 
-    def begin(self, given: Input) -> State:
+    def initialise(self, given: Input) -> State:
         """State at the start of the track, of all that the filter is given: the initial estimate as measurement."""
         return self.start(given.measurement)
 

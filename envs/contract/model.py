@@ -130,7 +130,7 @@ class Model:
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
         """State of the filter at the start of the track."""
-        return self.filter.begin(Input(initial, truth))
+        return self.filter.initialise(Input(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
         """State of the filter when a measurement has come, before it is taken in."""

@@ -104,7 +104,7 @@ class CompiledModel(Model):
                 return self.programs.function(function)(*parts, threads=self.threads)
             except NotTraceable as error:
                 self.programs.refused.add(function)
-                warn_of(f"{function.__qualname__} of {self.task.id}", error)
+                warn_of(f"{_name_of(function)} of {self.task.id}", error)
         return function(self._plain, *parts)
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
@@ -155,6 +155,11 @@ def _hashes(value: Any) -> bool:
     return True
 
 
+def _name_of(function: Callable[..., Any]) -> str:
+    """Name of a function, or of the class of an object that is called."""
+    return getattr(function, "__qualname__", type(function).__name__)
+
+
 def warn_of(what: str, error: BaseException) -> None:
     """Warn that something runs with NumPy, and name the line that is to blame."""
     found: BaseException = error.__cause__ or error
@@ -180,6 +185,6 @@ def can_step(model: Any, report: Report) -> bool:
         model.programs.report_program(report)
     except NotTraceable as error:
         model.programs.refused.add(report)
-        warn_of(f"{report.__qualname__} of {model.task.id}", error)
+        warn_of(f"{_name_of(report)} of {model.task.id}", error)
         return False
     return True

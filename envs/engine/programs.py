@@ -57,7 +57,7 @@ def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any
 
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
-    state = model.filter.begin(Input(initial, truth))
+    state = model.filter.initialise(Input(initial, truth))
     return state, model.filter.feedback(state, initial)
 
 

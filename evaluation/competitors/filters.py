@@ -4,7 +4,6 @@ What says that it is ``traceable`` is compiled like a bank. The rest runs as Pyt
 world, and keeps its memory to itself: it may be anything.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -65,23 +64,23 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
         self.own, self.in_python = own, in_python  # type: ignore[misc]  # of this filter, not of the class
         self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
 
-    def begin(self, given: Input) -> Estimated:
+    def initialise(self, given: Input) -> Estimated:
         """Start where everyone starts, with the truth."""
         return self._start_state(given.measurement, self.own.start(given.measurement, given.truth))
 
     def start(self, initial: Any) -> Estimated:
         """Start without the truth."""
-        return self.begin(Input(initial))
+        return self.initialise(Input(initial))
 
     def _start_state(self, initial: Any, memory: Any) -> Estimated:
         zero = 0.0 * initial.mean[0]
-        nothing = Likelihood(zero + math.nan).fill_unknown()
+        nothing = Likelihood(None).fill_unknown(zero)
         return Estimated(initial.mean, initial.covariance, memory, nothing, zero, zero)
 
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Take its answer as it is."""
         mean, covariance, memory, *reported = self.own.update(given.measurement, given.truth, state.memory)
-        likelihood = Likelihood.of(*reported).fill_unknown() if reported else state.likelihood
+        likelihood = Likelihood.of(*reported).fill_unknown(mean[0]) if reported else state.likelihood
         return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
 
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
@@ -101,7 +100,7 @@ class EstimatorFilter(ReferenceFilter):
         super().__init__(task, own, in_python)
         self.knows = ""  # type: ignore[misc]  # nothing, whatever it says
 
-    def begin(self, given: Input) -> Estimated:
+    def initialise(self, given: Input) -> Estimated:
         """Start where everyone starts."""
         initial = given.measurement
         return self._start_state(initial, self.own.start(initial, initial.mean.shape[-1]))
@@ -117,7 +116,7 @@ class EstimatorFilter(ReferenceFilter):
             self._held(lost, state.mean, mean),
             self._held(lost, state.covariance, covariance),
             memory,
-            Likelihood.of(*reported).fill_unknown() if reported else state.likelihood,
+            Likelihood.of(*reported).fill_unknown(mean[0]) if reported else state.likelihood,
             fault,
             missed,
         )
@@ -203,14 +202,14 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         self.own, self.bank, self.in_python = own, bank, in_python  # type: ignore[misc]
         self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
 
-    def begin(self, given: Input) -> LimitState:
+    def initialise(self, given: Input) -> LimitState:
         """Start where everyone starts, with the truth."""
         initial = given.measurement
         return LimitState(self.bank.start(initial), 0.0 * initial.mean, self.own.start(initial, given.truth))
 
     def start(self, initial: Any) -> LimitState:
         """Start without the truth."""
-        return self.begin(Input(initial))
+        return self.initialise(Input(initial))
 
     def predict(self, state: LimitState, measurement: Any) -> LimitState:
         """Predict in the bank."""

@@ -276,9 +276,9 @@ class Likelihood(NamedTuple):
         """Take a log-likelihood alone for one."""
         return cls(*values) if isinstance(values, tuple) else cls(values)
 
-    def fill_unknown(self) -> "Likelihood":
-        """Put NaN in place of what is not known."""
-        none = math.nan + 0.0 * self.log_likelihood
+    def fill_unknown(self, like: Array) -> "Likelihood":
+        """Put NaN in place of what is not known, in the shape of an array ``(N,)``."""
+        none = math.nan + 0.0 * like
         return Likelihood(*(none if values is None else values for values in self))
 
 

@@ -131,44 +131,27 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
     return {"nees": xp.where(degrees > 0.0, squared, math.nan), "nees_degrees": degrees}
 
 
-def _expectation_report(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept where the truth is not known."""
-    return model.records(episode)
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of every measurement of a competitor, as a report on a model and its episodes."""
 
+    tracks: bool = False
+    """What a track is drawn from, too."""
+    drawings: bool = False
+    """What a picture of a track shows, too, under names that begin with :data:`DRAWN_PREFIX`."""
 
-def _expectation_and_track(model: Model, episode: Episode) -> dict[str, Any]:
-    return {**_expectation_report(model, episode), **model.track(episode)}
-
-
-def _measurement_and_track(model: Model, episode: Episode) -> dict[str, Any]:
-    return {**_measurement_report(model, episode), **model.track(episode)}
-
-
-def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept of every measurement, and what is kept of the first episodes only."""
-    kept = (
-        _measurement_report(model, episode) if model.task.has_truth else _expectation_report(model, episode)
-    )
-    return {
-        **kept,
-        **{f"{DRAWN_PREFIX}{name}": values for name, values in model.picture_track(episode).items()},
-    }
-
-
-def _track_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
-    return {**_measurement_and_drawing(model, episode), **model.track(episode)}
+    def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
+        """Report it, arrays ``(..., N)``; of the truth nothing where it is not known."""
+        found = _measurement_report(model, episode) if model.task.has_truth else model.records(episode)
+        if self.drawings:
+            shown = model.picture_track(episode)
+            found |= {f"{DRAWN_PREFIX}{name}": values for name, values in shown.items()}
+        return {**found, **model.track(episode)} if self.tracks else found
 
 
 def _limits(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept of a bound."""
     return model.filter.records(episode.filter, episode.measurement)
-
-
-def _report(model: Model, tracks: bool) -> Report:
-    """What is kept of every measurement of a task."""
-    if model.task.has_truth:
-        return _measurement_and_track if tracks else _measurement_report
-    return _expectation_and_track if tracks else _expectation_report
 
 
 OPTIONS = (
@@ -332,12 +315,11 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    report, drawn = _limits if kind == "bound" else _report(model, experiment.tracks), None
+    kept, drawn = Kept(experiment.tracks), None
+    report: Report = _limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
-        drawn = More(
-            _track_and_drawing if experiment.tracks else _measurement_and_drawing, most, DRAWN_PREFIX
-        )
+        drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
     flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
