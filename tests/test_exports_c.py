@@ -228,6 +228,40 @@ def test_networks_of_every_form_are_written(own):
     compile_and_test(writer, given, compiler(), (*FLAGS, *SANITIZERS))
 
 
+REJECTION = """#include <math.h>
+#include <string.h>
+#include "rows.h"
+#include "vectors.h"
+int main(void) {{
+    static {own}_state state, before;
+    {own}_initial initial;
+    {own}_measurement measurement;
+    {own}_estimate estimate;
+    set_initial(&initial, initials[0]);
+    {own}_start(&state, &initial);
+    before = state;
+    set_measurement(&measurement, measurements[0]);
+    measurement.{spoilt} = NAN;
+    if ({own}_update(&state, &measurement, &estimate) != {upper}_REJECTED) return 1;
+    if (memcmp(&state, &before, sizeof state) != 0) return 2;
+    set_measurement(&measurement, measurements[0]);
+    if ({own}_update(&state, &measurement, &estimate) != {upper}_TAKEN) return 3;
+    return memcmp(&state, &before, sizeof state) != 0 ? 0 : 4;
+}}
+"""
+
+
+@pytest.mark.parametrize("spoilt", ["position[1]", "variance[0]"])
+def test_a_measurement_that_makes_the_estimate_no_number_leaves_the_state_alone(spoilt, tmp_path):
+    writer, given = writer_of("ManeuveringTarget", "kalman-imm")
+    own = REJECTION.format(own=writer.name, upper=writer.name.upper(), spoilt=spoilt)
+    for file, text in {**files_of(writer, given), "own.c": own}.items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, *SANITIZERS, "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "own"], check=False).returncode == 0
+
+
 def test_a_table_of_another_form_is_refused(tmp_path):
     writer, given = writer_of("ManeuveringTarget", "fixed-low")
     for file, text in files_of(writer, given).items():

@@ -203,14 +203,21 @@ class Writer:
     def _guard(self) -> list[str]:
         """Statements that leave the state alone where the estimate is no finite number."""
         zero = literal(0.0, self.scalar)
-        rows = [
-            row for row, member in enumerate(self.traced.estimate) if member.name in ("mean", "covariance")
+        C = len(self.components)
+        mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
+        terms = [
+            f"sum += {zero} * estimate->mean{mean};",
+            f"for (j = 0; j < {C}; ++j) sum += {zero} * estimate->covariance{covariance};",
         ]
-        places = self.structs["estimate"].places
-        terms = " + ".join(f"{zero} * estimate->{places[row]}" for row in rows)
         return [
-            "/* Zero times what is not finite is not zero. */",
-            f"if (!({terms} == {zero})) return {self.name.upper()}_REJECTED;",
+            "{ /* Zero times what is not finite is not zero. */",
+            f"    {self.scalar.name} sum = {zero};",
+            "    int i, j;",
+            f"    for (i = 0; i < {C}; ++i) {{",
+            *(f"        {term}" for term in terms),
+            "    }",
+            f"    if (!(sum == {zero})) return {self.name.upper()}_REJECTED;",
+            "}",
         ]
 
     def _taken(self) -> str:
