@@ -373,6 +373,17 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     assert "double" not in (folder / "kalman_imm.c").read_text()
 
 
+def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_path, monkeypatch):
+    monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
+    problem = problem_of("filtergym/ManeuveringTarget-v0")
+    # 14 numbers are shown, 6 units, 2 answers: a product and a sum for each weight, and the biases.
+    request = ExportRequest(problem, "own", OwnNetwork("mode", "", "argmax", "tanh", 2))
+    figures = export_c(request, tmp_path / "own")
+    assert figures.network_operations == 2 * (14 * 6 + 6 * 2) + 6 + 2
+    words = " ".join((tmp_path / "own" / "own.h").read_text().split())
+    assert f"{figures.operations:,} operations an update and 200 of the network where it is asked" in words
+
+
 def test_files_of_a_filter_are_not_those_of_the_programs_around_it():
     for name in ("test", "main", "rows", "vectors", "time", "int"):
         assert f"{c_source.file_stem(name)}.h" not in {"rows.h", "vectors.h", "time.h"}

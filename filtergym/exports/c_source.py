@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy
 
@@ -28,9 +28,10 @@ from ..compiler.c_source import (
     write_program,
 )
 from ..evaluation.files import whole_files
-from .c_network import memory_size, network_text
+from .c_network import memory_size, network_operations, network_text, scratch_size
 from .c_programs import LOG, MAIN, TEST
 from .c_structs import struct_text, structure
+from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
 from .traced_filter import (
@@ -60,24 +61,6 @@ VECTORS = 2, 50
 def file_stem(name: str) -> str:
     """Return what the files and functions of a filter are called."""
     return identifier(name, TAKEN)
-
-
-class Figures(NamedTuple):
-    """What is known of an exported filter."""
-
-    operations: int
-    """Of an update, without those of a network."""
-    state_bytes: int
-    constant_bytes: int
-    """Of a network's weights."""
-    scratch_bytes: int
-    """On the stack, beside the state."""
-    difference: float
-    """Largest one to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
-    replaced: tuple[float, ...]
-    """Constants that float does not have."""
-    test: str = ""
-    """What the compiled test has said; empty without a compiler."""
 
 
 class Writer:
@@ -235,8 +218,14 @@ class Writer:
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = (len(self.traced.state) + self.memory) * size
-        scratch = (self.update_source.scratch + self.traced.shown) * size + after
+        asked = 0 if network is None else scratch_size(network) + count_answers(network)
+        scratch = (self.update_source.scratch + self.traced.shown + asked) * size + after
         return self.update_source.operations, after, weights, scratch
+
+    @property
+    def network_operations(self) -> int:
+        """Operations of a network, where it is asked."""
+        return 0 if self.traced.network is None else network_operations(self.traced.network)
 
     @property
     def replaced(self) -> tuple[float, ...]:
@@ -479,7 +468,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
         )
     writer = Writer(request.name, traced, scalar, replayed.components)
     writer.about = _about(request, writer, precision, command)
-    figures = Figures(*writer.sizes, difference, writer.replaced)
+    figures = Figures(*writer.sizes, difference, writer.replaced, writer.network_operations)
     large = figures.operations > MOST_OPTIMISED
     test = compile_and_test(writer, replayed, flags=(*FLAGS, "-O0") if large else FLAGS)
     if test and large:
@@ -547,7 +536,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
 def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
     T, E = len(replayed.measurements), replayed.initial.shape[1]
     notes = [
-        f"{figures.operations:,} operations an update; bytes: {figures.state_bytes:,} of state"
+        f"{operation_words(figures)}; bytes: {figures.state_bytes:,} of state"
         + (f", {figures.constant_bytes:,} of weights" if figures.constant_bytes else "")
         + f", about {figures.scratch_bytes:,} of stack.",
         f"Largest difference to the competitor in {E} episodes of {T} measurements, computed in {precision}: "
