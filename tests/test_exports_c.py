@@ -228,6 +228,40 @@ def test_networks_of_every_form_are_written(own):
     compile_and_test(writer, given, compiler(), (*FLAGS, *SANITIZERS))
 
 
+REJECTION = """#include <math.h>
+#include <string.h>
+#include "rows.h"
+#include "vectors.h"
+int main(void) {{
+    static {own}_state state, before;
+    {own}_initial initial;
+    {own}_measurement measurement;
+    {own}_estimate estimate;
+    set_initial(&initial, initials[0]);
+    {own}_start(&state, &initial);
+    before = state;
+    set_measurement(&measurement, measurements[0]);
+    measurement.{spoilt} = NAN;
+    if ({own}_update(&state, &measurement, &estimate) != {upper}_REJECTED) return 1;
+    if (memcmp(&state, &before, sizeof state) != 0) return 2;
+    set_measurement(&measurement, measurements[0]);
+    if ({own}_update(&state, &measurement, &estimate) != {upper}_TAKEN) return 3;
+    return memcmp(&state, &before, sizeof state) != 0 ? 0 : 4;
+}}
+"""
+
+
+@pytest.mark.parametrize("spoilt", ["position[1]", "variance[0]"])
+def test_a_measurement_that_makes_the_estimate_no_number_leaves_the_state_alone(spoilt, tmp_path):
+    writer, given = writer_of("ManeuveringTarget", "kalman-imm")
+    own = REJECTION.format(own=writer.name, upper=writer.name.upper(), spoilt=spoilt)
+    for file, text in {**files_of(writer, given), "own.c": own}.items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, *SANITIZERS, "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "own"], check=False).returncode == 0
+
+
 def test_a_table_of_another_form_is_refused(tmp_path):
     writer, given = writer_of("ManeuveringTarget", "fixed-low")
     for file, text in files_of(writer, given).items():
@@ -337,6 +371,17 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     ):
         assert words in text
     assert "double" not in (folder / "kalman_imm.c").read_text()
+
+
+def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_path, monkeypatch):
+    monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
+    problem = problem_of("filtergym/ManeuveringTarget-v0")
+    # 14 numbers are shown, 6 units, 2 answers: a product and a sum for each weight, and the biases.
+    request = ExportRequest(problem, "own", OwnNetwork("mode", "", "argmax", "tanh", 2))
+    figures = export_c(request, tmp_path / "own")
+    assert figures.network_operations == 2 * (14 * 6 + 6 * 2) + 6 + 2
+    words = " ".join((tmp_path / "own" / "own.h").read_text().split())
+    assert f"{figures.operations:,} operations an update and 200 of the network where it is asked" in words
 
 
 def test_files_of_a_filter_are_not_those_of_the_programs_around_it():

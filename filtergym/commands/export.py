@@ -133,6 +133,7 @@ def export(
 def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
     """Write a filter as C99, and say what it costs."""
     from ..exports.c_source import export_c, file_stem
+    from ..exports.figures import operation_words
 
     stem = file_stem(request.name)
     folder = out or Path(stem)
@@ -140,7 +141,7 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
     figures = export_c(request, folder, precision, command_line())
     for line in (
         f"saved in {folder}: {stem}.h, {stem}.c",
-        f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "
+        f"{operation_words(figures)}, {figures.state_bytes:,} bytes of state; largest difference to "
         f"{request.name} {figures.difference:.1e} standard deviations",
         f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",

@@ -55,6 +55,25 @@ def memory_size(network: LearnedPolicy) -> int:
     return 2 * int(arrays["lstm_memory_weight"].shape[1]) if "lstm_memory_weight" in arrays else 0
 
 
+def network_operations(network: LearnedPolicy) -> int:
+    """Multiplications and additions of a network's layers; its activations are not counted."""
+    sizes = {key: int(values.size) for key, values in network.arrays.items()}
+    return sum(2 * size for key, size in sizes.items() if "weight" in key) + sum(
+        size for key, size in sizes.items() if "bias" in key
+    )
+
+
+def scratch_size(network: LearnedPolicy) -> int:
+    """Numbers that a network holds on the stack while it answers."""
+    return _width(network) * (3 if memory_size(network) else 2)
+
+
+def _width(network: LearnedPolicy) -> int:
+    """Numbers of its widest layer, or of what it is shown."""
+    outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
+    return max([len(network.arrays["observation_mean"]), *outputs])
+
+
 def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str, int]:
     """Write a network as ``NAME_network(shown, memory, answer)``.
 
@@ -75,7 +94,7 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     }
     fields = len(arrays["observation_mean"])
     unit = next((kind for kind in ("gru", "lstm") if f"{kind}_memory_weight" in arrays), None)
-    width = max([fields, *(values.shape[-1] for key, values in arrays.items() if "weight" in key)])
+    width = _width(network)
     words: dict[str, Any] = {"name": name, "real": scalar.name, "f": scalar.suffix}
     words |= {key: literal(value, scalar) for key, value in (("zero", 0.0), ("half", 0.5), ("one", 1.0))}
     body = [f"{scalar.name} x[{width}], a[{width}]{f', b[{width}]' if unit else ''};", "int i;"]

@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy
 
@@ -28,7 +28,10 @@ from ..compiler.c_source import (
     write_program,
 )
 from ..evaluation.storage.files import whole_files
-from .c_network import memory_size, network_text
+from .c_network import memory_size, network_operations, network_text, scratch_size
+from .c_programs import LOG, MAIN, TEST
+from .c_structs import struct_text, structure
+from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
 from .traced_filter import (
@@ -36,7 +39,6 @@ from .traced_filter import (
     LIKELIHOODS,
     SHOWN,
     STATE,
-    Member,
     TracedFilter,
     count_answers,
 )
@@ -59,77 +61,6 @@ VECTORS = 2, 50
 def file_stem(name: str) -> str:
     """Return what the files and functions of a filter are called."""
     return identifier(name, TAKEN)
-
-
-class Figures(NamedTuple):
-    """What is known of an exported filter."""
-
-    operations: int
-    """Of an update, without those of a network."""
-    state_bytes: int
-    constant_bytes: int
-    """Of a network's weights."""
-    scratch_bytes: int
-    """On the stack, beside the state."""
-    difference: float
-    """Largest one to the competitor itself, in its standard deviations, see :func:`~.replay.run_filter`."""
-    replaced: tuple[float, ...]
-    """Constants that float does not have."""
-    test: str = ""
-    """What the compiled test has said; empty without a compiler."""
-
-
-class Structure(NamedTuple):
-    """A struct of C."""
-
-    name: str
-    arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
-    """Of every array its name, its shape, what it is, and the rows of the argument in its order."""
-    places: dict[int, str]
-    """Row of the argument to the expression that follows the variable."""
-    columns: dict[int, str]
-    """Row of the argument to a name in a table."""
-
-
-def structure(name: str, members: Sequence[Member]) -> Structure:
-    """Give numbers their places in a struct: an array of which every entry is there stays one, of others the entries
-    that are there get names of their own.
-    """
-    groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
-    for row, member in enumerate(members):
-        groups.setdefault((member.name, member.shape), []).append(row)
-    arrays: list[tuple[str, tuple[int, ...], str, list[int]]] = []
-    places, columns = {}, {}
-    taken: set[str] = set()
-    for (words, shape), rows in groups.items():
-        whole = len(rows) == int(numpy.prod(shape, dtype=int))
-        if whole:
-            own = identifier(words, taken)
-            taken.add(own)
-            arrays.append((own, shape, members[rows[0]].words, rows))
-        for row in rows:
-            index = [int(i) for i in numpy.unravel_index(members[row].place, shape)] if shape else []
-            if not whole:
-                own = identifier("_".join([words, *map(str, index)]), taken)
-                taken.add(own)
-                arrays.append((own, (), members[row].words, [row]))
-            places[row] = own + ("".join(f"[{i}]" for i in index) if whole else "")
-            columns[row] = "_".join([own, *map(str, index)]) if whole else own
-    return Structure(name, arrays, places, columns)
-
-
-def _struct_text(struct: Structure, scalar: Scalar, title: str, extra: Sequence[str] = ()) -> str:
-    lines = [comment(title), "typedef struct {"]
-    words = ""
-    for name, shape, text, _ in struct.arrays:
-        if text and text != words:
-            lines.append(comment(text, indent="    "))
-        words = text
-        lines.append(f"    {scalar.name} {name}{''.join(f'[{size}]' for size in shape)};")
-    lines += [f"    {line}" for line in extra]
-    if not struct.arrays and not extra:
-        lines.append("    char nothing; /* C has no empty struct */")
-    return "\n".join([*lines, f"}} {struct.name};\n"])
 
 
 class Writer:
@@ -255,14 +186,21 @@ class Writer:
     def _guard(self) -> list[str]:
         """Statements that leave the state alone where the estimate is no finite number."""
         zero = literal(0.0, self.scalar)
-        rows = [
-            row for row, member in enumerate(self.traced.estimate) if member.name in ("mean", "covariance")
+        C = len(self.components)
+        mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
+        terms = [
+            f"sum += {zero} * estimate->mean{mean};",
+            f"for (j = 0; j < {C}; ++j) sum += {zero} * estimate->covariance{covariance};",
         ]
-        places = self.structs["estimate"].places
-        terms = " + ".join(f"{zero} * estimate->{places[row]}" for row in rows)
         return [
-            "/* Zero times what is not finite is not zero. */",
-            f"if (!({terms} == {zero})) return {self.name.upper()}_REJECTED;",
+            "{ /* Zero times what is not finite is not zero. */",
+            f"    {self.scalar.name} sum = {zero};",
+            "    int i, j;",
+            f"    for (i = 0; i < {C}; ++i) {{",
+            *(f"        {term}" for term in terms),
+            "    }",
+            f"    if (!(sum == {zero})) return {self.name.upper()}_REJECTED;",
+            "}",
         ]
 
     def _taken(self) -> str:
@@ -280,8 +218,14 @@ class Writer:
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = (len(self.traced.state) + self.memory) * size
-        scratch = (self.update_source.scratch + self.traced.shown) * size + after
+        asked = 0 if network is None else scratch_size(network) + count_answers(network)
+        scratch = (self.update_source.scratch + self.traced.shown + asked) * size + after
         return self.update_source.operations, after, weights, scratch
+
+    @property
+    def network_operations(self) -> int:
+        """Operations of a network, where it is asked."""
+        return 0 if self.traced.network is None else network_operations(self.traced.network)
 
     @property
     def replaced(self) -> tuple[float, ...]:
@@ -310,10 +254,10 @@ class Writer:
             comment(*self.about, *notes),
             f"#ifndef {guard}\n#define {guard}\n",
             '#ifdef __cplusplus\nextern "C" {\n#endif\n',
-            _struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
-            _struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
-            _struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
-            _struct_text(
+            struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
+            struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
+            struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
+            struct_text(
                 structs["state"],
                 scalar,
                 "What is kept from one measurement to the next, one struct for each track; members are named by what "
@@ -384,7 +328,7 @@ class Writer:
             *(f"estimate_{n}" for n in names),
             *(f"sigma_{n}" for n in names),
         ]
-        return _MAIN.format(
+        return MAIN.format(
             own=self.name,
             columns=_string(",".join(given)),
             header=_string(",".join(header)),
@@ -434,7 +378,7 @@ class Writer:
         ]
         shown = [identifier(name) for name, _ in self.components]
         header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
-        return _LOG.format(
+        return LOG.format(
             own=self.name,
             columns=", ".join(_string(name) for name in columns),
             header=_string(",".join(header)),
@@ -452,7 +396,7 @@ class Writer:
 
     def test(self) -> str:
         """Text of a program that compares the filter with the vectors."""
-        return _TEST.format(
+        return TEST.format(
             own=self.name,
             limit=literal(self.limit),
             C=len(self.components),
@@ -501,287 +445,6 @@ def _without_blank_runs(text: str) -> str:
     return re.sub(r"\n{3,}", "\n\n", text)
 
 
-_MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
-   A row whose initial columns are filled begins a new track. */
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "rows.h"
-
-#define COLUMNS {count}
-static const char columns[] =
-    {columns};
-
-static char line[32 * COLUMNS + sizeof columns];
-
-/* The numbers of a line; an empty one is NaN. Returns how many there are. */
-static int numbers(const char *text, double *row) {{
-    int count = 0;
-    for (;;) {{
-        char *end;
-        double value = strtod(text, &end);
-        if (end == text) value = (double)NAN;
-        if (count < COLUMNS) row[count] = value;
-        ++count;
-        while (*end != ',' && *end != '\\0' && *end != '\\n' && *end != '\\r') ++end;
-        if (*end != ',') return count;
-        text = end + 1;
-    }}
-}}
-
-int main(int argc, char **argv) {{
-    static {own}_state state;
-    static double row[COLUMNS];
-    long track = 0, measurement = 0, number = 1;
-    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
-    if (file == NULL) {{
-        fprintf(stderr, "cannot read %s\\n", argv[1]);
-        return 2;
-    }}
-    if (fgets(line, (int)sizeof line, file) == NULL || strncmp(line, columns, strlen(columns)) != 0 ||
-        strcspn(line, "\\r\\n") != strlen(columns)) {{
-        fprintf(stderr, "the first line must be %s\\n", columns);
-        return 2;
-    }}
-    puts({header});
-    while (fgets(line, (int)sizeof line, file) != NULL) {{
-        {own}_measurement measurement_now;
-        {own}_estimate estimate;
-        int i;
-        ++number;
-        if (line[strspn(line, "\\r\\n")] == '\\0') continue;
-        if (numbers(line, row) != COLUMNS) {{
-            fprintf(stderr, "line %ld must have %d numbers\\n", number, COLUMNS);
-            return 2;
-        }}
-        if (row[0] == row[0]) {{
-            {own}_initial initial;
-            set_initial(&initial, row);
-            {own}_start(&state, &initial);
-            ++track;
-            measurement = 0;
-        }}
-        if (track == 0) {{
-            fprintf(stderr, "line 2 must begin a track\\n");
-            return 2;
-        }}
-        set_measurement(&measurement_now, row + {initial});
-        {own}_update(&state, &measurement_now, &estimate);
-        printf("%ld,%ld", track, ++measurement);{told}
-        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", (double)estimate.mean{mean});
-        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", sqrt((double)estimate.covariance{covariance}));
-        putchar('\\n');
-    }}
-    if (file != stdin) fclose(file);
-    return 0;
-}}
-"""
-_LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an
-   estimate for each row: the track starts from the first two plots, and scans without a row have missed the target. */
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "{own}.h"
-
-#define INTERVAL {interval} /* s */
-#define DEGREE (3.14159265358979323846 / 180.0)
-
-/* Time, two coordinates, and their deviations, which a log may lack. */
-static const char *const names[5] = {{{columns}}};
-static const double usual[2] = {{{first}, {second}}};
-static int place[5] = {{-1, -1, -1, -1, -1}};
-static char line[65536];
-
-static {own}_state state;
-static double p0[2], v0[2], last, last_plot, scan;
-
-/* Number in a column of a row; NaN where there is none. */
-static double number(const char *row, int column) {{
-    char *end;
-    double value;
-    if (column < 0) return (double)NAN;
-    for (; column > 0; --column) {{
-        row = strchr(row, ',');
-        if (row == NULL) return (double)NAN;
-        ++row;
-    }}
-    value = strtod(row, &end);
-    return end == row ? (double)NAN : value;
-}}
-
-/* Finds the columns in the first line; names are read without regard to case. */
-static void find_columns(char *row) {{
-    int column = 0;
-    char *word = row;
-    for (;; ++column) {{
-        size_t length = strcspn(word, ",\\r\\n"), i;
-        const char after = word[length];
-        int k;
-        word[length] = '\\0';
-        for (i = 0; i < length; ++i)
-            if (word[i] >= 'A' && word[i] <= 'Z') word[i] = (char)(word[i] - 'A' + 'a');
-        for (k = 0; k < 5; ++k)
-            if (strcmp(word, names[k]) == 0) place[k] = column;
-        if (after != ',') return;
-        word += length + 1;
-    }}
-}}
-
-/* Position and variances of a row, in metres east and north; returns whether there is a plot. */
-static int read_plot(const char *row, double *p, double *v) {{
-    const double a = number(row, place[1]), b = number(row, place[2]);
-    double s = number(row, place[3]), r = number(row, place[4]);
-    if (!(a - a == 0.0 && b - b == 0.0)) return 0;
-    if (!(s > 0.0)) s = usual[0];
-    if (!(r > 0.0)) r = usual[1];
-    p[0] = {polar} ? a * sin(b * DEGREE) : a;
-    p[1] = {polar} ? a * cos(b * DEGREE) : b;
-    v[0] = s * s;
-    v[1] = r * r;
-    if ({stated_polar}) {{
-        /* Range and azimuth, rotated into east and north; the diagonal of the covariance. */
-        const double square = p[0] * p[0] + p[1] * p[1];
-        const double along = square > 0.0 ? p[0] * p[0] / square : 0.5;
-        const double across = square * (r * DEGREE) * (r * DEGREE);
-        v[0] = along * s * s + (1.0 - along) * across;
-        v[1] = (1.0 - along) * s * s + along * across;
-    }}
-    return 1;
-}}
-
-static int step(double at, double available, const double *p, const double *v, {own}_estimate *estimate) {{
-    {own}_measurement m;
-    const double interval = at - last, elapsed = at - last_plot;
-    int status;
-    scan += 1.0;
-    (void)interval;
-    (void)elapsed;
-    (void)available;
-    (void)p;
-    (void)v;
-    {fill}
-    status = {own}_update(&state, &m, estimate);
-    if (status == {upper}_REFUSED) return status;
-    last = at;
-    if (available > 0.0) last_plot = at;
-    return status;
-}}
-
-int main(int argc, char **argv) {{
-    static const char *const words[4] = {{"taken", "missed", "rejected", "refused"}};
-    static const double none[2] = {{0.0, 0.0}}, one[2] = {{1.0, 1.0}};
-    long plots = 0;
-    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
-    if (file == NULL) {{
-        fprintf(stderr, "cannot read %s\\n", argv[1]);
-        return 2;
-    }}
-    if (fgets(line, (int)sizeof line, file) != NULL) find_columns(line);
-    if (place[0] < 0 || place[1] < 0 || place[2] < 0) {{
-        fprintf(stderr, "the first line must name %s, %s and %s, separated by commas\\n", names[0], names[1], names[2]);
-        return 2;
-    }}
-    puts({header});
-    while (fgets(line, (int)sizeof line, file) != NULL) {{
-        double p[2] = {{0.0, 0.0}}, v[2] = {{1.0, 1.0}};
-        const double at = number(line, place[0]);
-        const int there = read_plot(line, p, v);
-        {own}_estimate estimate;
-        double scans, k;
-        int i, status;
-        if (!(at - at == 0.0)) continue;
-        if (plots < 2) {{
-            if (!there) continue;
-            if (plots == 1) {{
-                const double lasted = at - last;
-                {own}_initial initial;
-                if (!(lasted > 0.0)) continue;
-                {start}
-                {own}_start(&state, &initial);
-            }}
-            ++plots;
-            memcpy(p0, p, sizeof p0);
-            memcpy(v0, v, sizeof v0);
-            last = last_plot = at;
-            continue;
-        }}
-        scans = floor((at - last) / INTERVAL + 0.5);
-        if (scans > 1.0 && scans <= 1001.0) {{
-            const double begun = last;
-            for (k = 1.0; k < scans; k += 1.0) (void)step(begun + (at - begun) * k / scans, 0.0, none, one, &estimate);
-        }}
-        status = step(at, there ? 1.0 : 0.0, p, v, &estimate);
-        printf("%.17g,%s", at, words[status]);
-        for (i = 0; i < {C}; ++i)
-            if (status < 2)
-                printf(",%.{digits}g", (double)estimate.mean[i]);
-            else
-                printf(",");
-        for (i = 0; i < {C}; ++i)
-            if (status < 2)
-                printf(",%.{digits}g", sqrt((double)estimate.covariance[i][i]));
-            else
-                printf(",");
-        putchar('\\n');
-    }}
-    if (file != stdin) fclose(file);
-    return 0;
-}}
-"""
-_TEST = """/* Compares the filter with what the competitor itself estimated, and says how long an update takes. */
-#include <math.h>
-#include <stdio.h>
-#include <time.h>
-
-#include "rows.h"
-#include "vectors.h"
-
-#define LIMIT {limit} /* standard deviations */
-
-static double run(double worst) {{
-    int track, k, i;
-    for (track = 0; track < TRACKS; ++track) {{
-        {own}_state state;
-        {own}_initial initial;
-        set_initial(&initial, initials[track]);
-        {own}_start(&state, &initial);
-        for (k = track * MEASUREMENTS; k < (track + 1) * MEASUREMENTS; ++k) {{
-            {own}_measurement measurement;
-            {own}_estimate estimate;
-            set_measurement(&measurement, measurements[k]);
-            {own}_update(&state, &measurement, &estimate);
-            for (i = 0; i < {C}; ++i) {{
-                const double off = fabs((double)estimate.mean{mean} - means[k][i]);
-                const double difference = off == 0.0 ? 0.0 : off / sigmas[k][i];
-                if (!(difference <= worst)) worst = difference;
-            }}
-        }}
-    }}
-    return worst;
-}}
-
-int main(void) {{
-    const double worst = run(0.0);
-    const clock_t begin = clock();
-    long updates = 0;
-    double seconds;
-    volatile double kept;
-    do {{
-        kept = run(0.0);
-        updates += TRACKS * MEASUREMENTS;
-        seconds = (double)(clock() - begin) / CLOCKS_PER_SEC;
-    }} while (seconds < 0.2);
-    (void)kept;
-    printf("largest difference %.1e standard deviations, %.0f ns an update\\n", worst, 1e9 * seconds / (double)updates);
-    return worst <= LIMIT ? 0 : 1;
-}}
-"""
-
-
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
     """Write a competitor as C99 into a folder, after its programs were compared with the competitor itself.
 
@@ -805,7 +468,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
         )
     writer = Writer(request.name, traced, scalar, replayed.components)
     writer.about = _about(request, writer, precision, command)
-    figures = Figures(*writer.sizes, difference, writer.replaced)
+    figures = Figures(*writer.sizes, difference, writer.replaced, writer.network_operations)
     large = figures.operations > MOST_OPTIMISED
     test = compile_and_test(writer, replayed, flags=(*FLAGS, "-O0") if large else FLAGS)
     if test and large:
@@ -873,7 +536,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
 def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
     T, E = len(replayed.measurements), replayed.initial.shape[1]
     notes = [
-        f"{figures.operations:,} operations an update; bytes: {figures.state_bytes:,} of state"
+        f"{operation_words(figures)}; bytes: {figures.state_bytes:,} of state"
         + (f", {figures.constant_bytes:,} of weights" if figures.constant_bytes else "")
         + f", about {figures.scratch_bytes:,} of stack.",
         f"Largest difference to the competitor in {E} episodes of {T} measurements, computed in {precision}: "

@@ -1,0 +1,284 @@
+"""Programs of C around an exported filter, with fields for what differs from filter to filter."""
+
+MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
+   A row whose initial columns are filled begins a new track. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "rows.h"
+
+#define COLUMNS {count}
+static const char columns[] =
+    {columns};
+
+static char line[32 * COLUMNS + sizeof columns];
+
+/* The numbers of a line; an empty one is NaN. Returns how many there are. */
+static int numbers(const char *text, double *row) {{
+    int count = 0;
+    for (;;) {{
+        char *end;
+        double value = strtod(text, &end);
+        if (end == text) value = (double)NAN;
+        if (count < COLUMNS) row[count] = value;
+        ++count;
+        while (*end != ',' && *end != '\\0' && *end != '\\n' && *end != '\\r') ++end;
+        if (*end != ',') return count;
+        text = end + 1;
+    }}
+}}
+
+int main(int argc, char **argv) {{
+    static {own}_state state;
+    static double row[COLUMNS];
+    long track = 0, measurement = 0, number = 1;
+    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
+    if (file == NULL) {{
+        fprintf(stderr, "cannot read %s\\n", argv[1]);
+        return 2;
+    }}
+    if (fgets(line, (int)sizeof line, file) == NULL || strncmp(line, columns, strlen(columns)) != 0 ||
+        strcspn(line, "\\r\\n") != strlen(columns)) {{
+        fprintf(stderr, "the first line must be %s\\n", columns);
+        return 2;
+    }}
+    puts({header});
+    while (fgets(line, (int)sizeof line, file) != NULL) {{
+        {own}_measurement measurement_now;
+        {own}_estimate estimate;
+        int i;
+        ++number;
+        if (line[strspn(line, "\\r\\n")] == '\\0') continue;
+        if (numbers(line, row) != COLUMNS) {{
+            fprintf(stderr, "line %ld must have %d numbers\\n", number, COLUMNS);
+            return 2;
+        }}
+        if (row[0] == row[0]) {{
+            {own}_initial initial;
+            set_initial(&initial, row);
+            {own}_start(&state, &initial);
+            ++track;
+            measurement = 0;
+        }}
+        if (track == 0) {{
+            fprintf(stderr, "line 2 must begin a track\\n");
+            return 2;
+        }}
+        set_measurement(&measurement_now, row + {initial});
+        {own}_update(&state, &measurement_now, &estimate);
+        printf("%ld,%ld", track, ++measurement);{told}
+        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", (double)estimate.mean{mean});
+        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", sqrt((double)estimate.covariance{covariance}));
+        putchar('\\n');
+    }}
+    if (file != stdin) fclose(file);
+    return 0;
+}}
+"""
+"""Reads a table of measurements and writes one of estimates."""
+LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an
+   estimate for each row: the track starts from the first two plots, and scans without a row have missed the target. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "{own}.h"
+
+#define INTERVAL {interval} /* s */
+#define DEGREE (3.14159265358979323846 / 180.0)
+
+/* Time, two coordinates, and their deviations, which a log may lack. */
+static const char *const names[5] = {{{columns}}};
+static const double usual[2] = {{{first}, {second}}};
+static int place[5] = {{-1, -1, -1, -1, -1}};
+static char line[65536];
+
+static {own}_state state;
+static double p0[2], v0[2], last, last_plot, scan;
+
+/* Number in a column of a row; NaN where there is none. */
+static double number(const char *row, int column) {{
+    char *end;
+    double value;
+    if (column < 0) return (double)NAN;
+    for (; column > 0; --column) {{
+        row = strchr(row, ',');
+        if (row == NULL) return (double)NAN;
+        ++row;
+    }}
+    value = strtod(row, &end);
+    return end == row ? (double)NAN : value;
+}}
+
+/* Finds the columns in the first line; names are read without regard to case. */
+static void find_columns(char *row) {{
+    int column = 0;
+    char *word = row;
+    for (;; ++column) {{
+        size_t length = strcspn(word, ",\\r\\n"), i;
+        const char after = word[length];
+        int k;
+        word[length] = '\\0';
+        for (i = 0; i < length; ++i)
+            if (word[i] >= 'A' && word[i] <= 'Z') word[i] = (char)(word[i] - 'A' + 'a');
+        for (k = 0; k < 5; ++k)
+            if (strcmp(word, names[k]) == 0) place[k] = column;
+        if (after != ',') return;
+        word += length + 1;
+    }}
+}}
+
+/* Position and variances of a row, in metres east and north; returns whether there is a plot. */
+static int read_plot(const char *row, double *p, double *v) {{
+    const double a = number(row, place[1]), b = number(row, place[2]);
+    double s = number(row, place[3]), r = number(row, place[4]);
+    if (!(a - a == 0.0 && b - b == 0.0)) return 0;
+    if (!(s > 0.0)) s = usual[0];
+    if (!(r > 0.0)) r = usual[1];
+    p[0] = {polar} ? a * sin(b * DEGREE) : a;
+    p[1] = {polar} ? a * cos(b * DEGREE) : b;
+    v[0] = s * s;
+    v[1] = r * r;
+    if ({stated_polar}) {{
+        /* Range and azimuth, rotated into east and north; the diagonal of the covariance. */
+        const double square = p[0] * p[0] + p[1] * p[1];
+        const double along = square > 0.0 ? p[0] * p[0] / square : 0.5;
+        const double across = square * (r * DEGREE) * (r * DEGREE);
+        v[0] = along * s * s + (1.0 - along) * across;
+        v[1] = (1.0 - along) * s * s + along * across;
+    }}
+    return 1;
+}}
+
+static int step(double at, double available, const double *p, const double *v, {own}_estimate *estimate) {{
+    {own}_measurement m;
+    const double interval = at - last, elapsed = at - last_plot;
+    int status;
+    scan += 1.0;
+    (void)interval;
+    (void)elapsed;
+    (void)available;
+    (void)p;
+    (void)v;
+    {fill}
+    status = {own}_update(&state, &m, estimate);
+    if (status == {upper}_REFUSED) return status;
+    last = at;
+    if (available > 0.0) last_plot = at;
+    return status;
+}}
+
+int main(int argc, char **argv) {{
+    static const char *const words[4] = {{"taken", "missed", "rejected", "refused"}};
+    static const double none[2] = {{0.0, 0.0}}, one[2] = {{1.0, 1.0}};
+    long plots = 0;
+    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
+    if (file == NULL) {{
+        fprintf(stderr, "cannot read %s\\n", argv[1]);
+        return 2;
+    }}
+    if (fgets(line, (int)sizeof line, file) != NULL) find_columns(line);
+    if (place[0] < 0 || place[1] < 0 || place[2] < 0) {{
+        fprintf(stderr, "the first line must name %s, %s and %s, separated by commas\\n", names[0], names[1], names[2]);
+        return 2;
+    }}
+    puts({header});
+    while (fgets(line, (int)sizeof line, file) != NULL) {{
+        double p[2] = {{0.0, 0.0}}, v[2] = {{1.0, 1.0}};
+        const double at = number(line, place[0]);
+        const int there = read_plot(line, p, v);
+        {own}_estimate estimate;
+        double scans, k;
+        int i, status;
+        if (!(at - at == 0.0)) continue;
+        if (plots < 2) {{
+            if (!there) continue;
+            if (plots == 1) {{
+                const double lasted = at - last;
+                {own}_initial initial;
+                if (!(lasted > 0.0)) continue;
+                {start}
+                {own}_start(&state, &initial);
+            }}
+            ++plots;
+            memcpy(p0, p, sizeof p0);
+            memcpy(v0, v, sizeof v0);
+            last = last_plot = at;
+            continue;
+        }}
+        scans = floor((at - last) / INTERVAL + 0.5);
+        if (scans > 1.0 && scans <= 1001.0) {{
+            const double begun = last;
+            for (k = 1.0; k < scans; k += 1.0) (void)step(begun + (at - begun) * k / scans, 0.0, none, one, &estimate);
+        }}
+        status = step(at, there ? 1.0 : 0.0, p, v, &estimate);
+        printf("%.17g,%s", at, words[status]);
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", (double)estimate.mean[i]);
+            else
+                printf(",");
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", sqrt((double)estimate.covariance[i][i]));
+            else
+                printf(",");
+        putchar('\\n');
+    }}
+    if (file != stdin) fclose(file);
+    return 0;
+}}
+"""
+"""Reads a log as it was read when the filter was advised, and writes an estimate for each row."""
+TEST = """/* Compares the filter with what the competitor itself estimated, and says how long an update takes. */
+#include <math.h>
+#include <stdio.h>
+#include <time.h>
+
+#include "rows.h"
+#include "vectors.h"
+
+#define LIMIT {limit} /* standard deviations */
+
+static double run(double worst) {{
+    int track, k, i;
+    for (track = 0; track < TRACKS; ++track) {{
+        {own}_state state;
+        {own}_initial initial;
+        set_initial(&initial, initials[track]);
+        {own}_start(&state, &initial);
+        for (k = track * MEASUREMENTS; k < (track + 1) * MEASUREMENTS; ++k) {{
+            {own}_measurement measurement;
+            {own}_estimate estimate;
+            set_measurement(&measurement, measurements[k]);
+            {own}_update(&state, &measurement, &estimate);
+            for (i = 0; i < {C}; ++i) {{
+                const double off = fabs((double)estimate.mean{mean} - means[k][i]);
+                const double difference = off == 0.0 ? 0.0 : off / sigmas[k][i];
+                if (!(difference <= worst)) worst = difference;
+            }}
+        }}
+    }}
+    return worst;
+}}
+
+int main(void) {{
+    const double worst = run(0.0);
+    const clock_t begin = clock();
+    long updates = 0;
+    double seconds;
+    volatile double kept;
+    do {{
+        kept = run(0.0);
+        updates += TRACKS * MEASUREMENTS;
+        seconds = (double)(clock() - begin) / CLOCKS_PER_SEC;
+    }} while (seconds < 0.2);
+    (void)kept;
+    printf("largest difference %.1e standard deviations, %.0f ns an update\\n", worst, 1e9 * seconds / (double)updates);
+    return worst <= LIMIT ? 0 : 1;
+}}
+"""
+"""Compares the filter with the vectors, and measures its time."""

@@ -1,0 +1,63 @@
+"""Structures of C for the numbers that a filter is given, keeps and answers."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy
+
+from ..compiler.c_source import Scalar, comment, identifier
+from .traced_filter import Member
+
+
+class Structure(NamedTuple):
+    """A struct of C."""
+
+    name: str
+    arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
+    """Of every array its name, its shape, what it is, and the rows of the argument in its order."""
+    places: dict[int, str]
+    """Row of the argument to the expression that follows the variable."""
+    columns: dict[int, str]
+    """Row of the argument to a name in a table."""
+
+
+def structure(name: str, members: Sequence[Member]) -> Structure:
+    """Give numbers their places in a struct: an array of which every entry is there stays one, of others the entries
+    that are there get names of their own.
+    """
+    groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    for row, member in enumerate(members):
+        groups.setdefault((member.name, member.shape), []).append(row)
+    arrays: list[tuple[str, tuple[int, ...], str, list[int]]] = []
+    places, columns = {}, {}
+    taken: set[str] = set()
+    for (words, shape), rows in groups.items():
+        whole = len(rows) == int(numpy.prod(shape, dtype=int))
+        if whole:
+            own = identifier(words, taken)
+            taken.add(own)
+            arrays.append((own, shape, members[rows[0]].words, rows))
+        for row in rows:
+            index = [int(i) for i in numpy.unravel_index(members[row].place, shape)] if shape else []
+            if not whole:
+                own = identifier("_".join([words, *map(str, index)]), taken)
+                taken.add(own)
+                arrays.append((own, (), members[row].words, [row]))
+            places[row] = own + ("".join(f"[{i}]" for i in index) if whole else "")
+            columns[row] = "_".join([own, *map(str, index)]) if whole else own
+    return Structure(name, arrays, places, columns)
+
+
+def struct_text(struct: Structure, scalar: Scalar, title: str, extra: Sequence[str] = ()) -> str:
+    """Return the definition of a struct; ``extra`` are lines of further members."""
+    lines = [comment(title), "typedef struct {"]
+    words = ""
+    for name, shape, text, _ in struct.arrays:
+        if text and text != words:
+            lines.append(comment(text, indent="    "))
+        words = text
+        lines.append(f"    {scalar.name} {name}{''.join(f'[{size}]' for size in shape)};")
+    lines += [f"    {line}" for line in extra]
+    if not struct.arrays and not extra:
+        lines.append("    char nothing; /* C has no empty struct */")
+    return "\n".join([*lines, f"}} {struct.name};\n"])
