@@ -391,6 +391,20 @@ class TestExamples:
         assert np.isfinite(filter.update(values=[np.nan] * count).mean).all()
 
 
+@pytest.mark.parametrize("time", [3.5, 52.0, 2.1])
+def test_another_interval_than_the_models_is_refused(make, time):
+    filter = filtergym.online(make().id, "kalman")
+    filter.start(mean=[0, 1], covariance=np.eye(2))
+    filter.update(1.0, values=[10.0])
+    before = filter.update(2.005, values=[20.0])  # the clock of a log is not exact
+    with pytest.raises(
+        ValueError, match=rf"moves by 1 s from one measurement to the next, got {time - 2.005:g} s"
+    ):
+        filter.update(time, values=[500.0])
+    np.testing.assert_array_equal(filter.predict(3.0).mean, F @ before.mean)  # nothing was taken in
+    assert filter.update(3.0, values=[30.0]).time == 3.0
+
+
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [

@@ -23,6 +23,7 @@ from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
+from .live import StateSpaceInput
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,6 +306,7 @@ class StateSpace(Task):
     paper_source = "none: a model of one's own"
     Parameters = StateSpaceParameters
     World = StateSpaceWorld
+    live_input = StateSpaceInput
     causes = (MISSED, OUTLIER)
     cost_description = "weighted squared error of the components"
     reward = "log-relative"
