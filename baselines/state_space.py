@@ -88,7 +88,7 @@ class Extended:
 
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
         self.xp, self.equations = task.xp, task.believed[0]
-        self.Q = process_noise * self.equations.Q[:, :, None]
+        self.factor = process_noise
         self.R = measurement_noise * self.equations.R[:, :, None]
 
     def start(self, initial: Initial, N: int) -> Initial:
@@ -97,8 +97,9 @@ class Extended:
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Predict and update."""
-        mean, carried = self.equations.carry(*memory)
-        result = _update(self.equations, mean, carried + self.Q, self.R, measurement, self.xp)
+        mean, carried = self.equations.carry(*memory, measurement.interval)
+        Q = self.factor * self.equations.process_noise(measurement.interval)
+        result = _update(self.equations, mean, carried + Q, self.R, measurement, self.xp)
         after = Initial(result.mean, result.covariance)
         return *after, after, _likelihood(result, measurement.available, self.xp)
 
@@ -114,15 +115,24 @@ def _update(
 class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`."""
 
+    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+        super().__init__(task, process_noise, measurement_noise)
+        usual = self.equations.model.process_noise(task.parameters.sampling_interval)
+        self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
+
     def start(self, initial: Initial, N: int) -> Initial:
         """Start where everyone starts, nowhere certain."""
-        return Initial(initial.mean, initial.covariance + UNCERTAIN * self.Q)
+        return Initial(initial.mean, initial.covariance + self.uncertain)
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Predict and update by sigma points."""
-        mean, spread = unscented.transform(memory.mean, memory.covariance, self.equations.move)
+        interval = measurement.interval
+        mean, spread = unscented.transform(
+            memory.mean, memory.covariance, lambda x: self.equations.move(x, interval)
+        )
+        Q = self.factor * self.equations.process_noise(interval)
         z, h = _numbers(measurement, self.xp), self.equations.measure
-        result = unscented_update(mean, spread + self.Q, z, h, self.R, measurement.available)
+        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available)
         after = Initial(result.mean, result.covariance)
         return *after, after, _likelihood(result, measurement.available, self.xp)
 
@@ -171,8 +181,8 @@ class KnownModel:
         xp, chosen = self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
-            mean, carried = equations.carry(*memory)
-            P = carried + truth.process_noise * equations.Q[:, :, None]
+            mean, carried = equations.carry(*memory, measurement.interval)
+            P = carried + truth.process_noise * equations.process_noise(measurement.interval)
             R = truth.measurement_noise * equations.R[:, :, None]
             result = _update(equations, mean, P, R, measurement, xp)
             held = truth.hypothesis == float(j)

@@ -19,6 +19,7 @@ import numpy
 from .program import COMPARISONS, Graph, without_collection
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
+finfo = numpy.finfo
 bool = numpy.dtype("bool")
 pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")

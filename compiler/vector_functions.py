@@ -32,12 +32,13 @@ class VectorFunction:
     """A function from n numbers to m numbers, and its Jacobian.
 
     Args:
-        function: takes an array ``(n,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
+        function: takes an array ``(n + g,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
         size: n.
+        given: further numbers that the function takes after these, without a derivative, g; at first there are none.
 
     Attributes:
         size: m.
-        matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None.
+        matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
 
     Raises:
@@ -45,10 +46,11 @@ class VectorFunction:
         ValueError: if the answer is no vector.
     """
 
-    def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int) -> None:
+    def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
         graph = Graph()
+        self._inputs = size
         with namespace.tracing(graph):
-            rows = [graph.input(0, row) for row in range(size)]
+            rows = [graph.input(0, row) for row in range(size + given)]
             x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)
             answer = namespace.asarray(function(x) if callable(function) else function @ x)
             shape = answer.shape
@@ -61,12 +63,12 @@ class VectorFunction:
                 f"must return a vector, such as a list of numbers, got an array of shape {shape}"
             )
         (self.size,) = shape
-        nodes = [node for gradient in gradients for node in gradient.nodes.tolist()]
+        nodes = [node for gradient in gradients for node in gradient.nodes[:size].tolist()]
         self._value = _program(graph, answer.nodes.tolist())
         self._jacobian = _program(graph, nodes)
         known = [graph.values[node] for node in nodes]
         self.matrix = self.offset = None
-        if None not in known:
+        if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
 
@@ -74,7 +76,7 @@ class VectorFunction:
         """Value at vectors.
 
         Args:
-            x: ``(n, N)``.
+            x: ``(n + g, N)``.
             xp: array namespace of x.
 
         Returns:
@@ -83,8 +85,11 @@ class VectorFunction:
         return xp.stack(_compute(self._value, x, xp))
 
     def jacobian(self, x: Any, xp: Any) -> Any:
-        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of x; arguments as of :meth:`value`."""
-        entries, n = _compute(self._jacobian, x, xp), len(x)
+        """Jacobian at vectors, ``(m, n, N)``: rows of the value, columns of the first n of x.
+
+        Arguments are those of :meth:`value`.
+        """
+        entries, n = _compute(self._jacobian, x, xp), self._inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 
 

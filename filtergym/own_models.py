@@ -1,6 +1,7 @@
 """An environment from a state-space model in a few lines."""
 
 import dataclasses
+import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,8 +23,9 @@ from .envs.linear.state_space import (
 )
 from .evaluation.running.seeds import episode_seeds
 
-Function = Callable[[Any], Any] | Sequence[Sequence[float]] | numpy.ndarray
-"""A function of the state ``(n,)`` that returns a list of numbers, or a matrix."""
+Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
+"""A function of the state ``(n,)`` that returns a list of numbers, or a matrix; of a timed model see
+:func:`state_space`."""
 EQUATIONS = ("f", "h", "Q", "R")
 TRIED = 32, 64
 """Episodes and measurements from which the unit of the reward is estimated."""
@@ -55,9 +57,11 @@ def state_space(
     Args:
         id: with your name and a version, such as ``"mine/Tracker-v0"``.
         f: the state at the next measurement, from the state ``(n,)`` to a list of n numbers, written with NumPy's
-            functions and without branches on numbers; or a matrix ``(n, n)``.
+            functions and without branches on numbers; or a matrix ``(n, n)``. With a second argument called ``dt``
+            it is the state that interval later, s: the model is timed, and measurements may come at any time.
         h: likewise what is measured, m numbers; or a matrix ``(m, n)``.
-        Q: covariance of the process noise, ``(n, n)``.
+        Q: covariance of the process noise, ``(n, n)``; of a timed model a function that returns that of an interval,
+            ``Q(dt)``.
         R: covariance of the measurement noise, ``(m, m)``, positive definite.
         mean: of the initial state, ``(n,)``.
         covariance: of the initial state, ``(n, n)``.
@@ -87,11 +91,14 @@ def state_space(
     n = len(mean)
     first = {"f": f, "h": h, "Q": Q, "R": R}
     given = [first, *({**first, **_known("hypotheses", one)} for one in hypotheses)]
-    world = tuple(_model(one, n) for one in given)
+    interval = float(parameters.get("sampling_interval", StateSpaceParameters.sampling_interval))
+    world = tuple(_model(one, n, interval) for one in given)
     mistaken = _known("filter_model", filter_model or {})
-    filters = tuple(_model({**one, **mistaken}, n) for one in given) if mistaken else world
+    filters = tuple(_model({**one, **mistaken}, n, interval) for one in given) if mistaken else world
     if len({model.h.size for model in (*world, *filters)}) > 1:
         raise ValueError("all models must measure as many numbers")
+    if len({model.timed for model in (*world, *filters)}) > 1:
+        raise ValueError("all models must take the interval, or none: write f(x, dt) and Q(dt) in each")
     count = len(world)
     definition = StateSpaceDefinition(
         world,
@@ -149,11 +156,13 @@ def _covariance(what: str, values: Any, size: int, definite: bool = False) -> nu
     return 0.5 * (matrix + matrix.T)
 
 
-def _function(what: str, function: Function, size: int, answers: int | None) -> VectorFunction:
+def _function(
+    what: str, function: Function, size: int, answers: int | None, given: int = 0
+) -> VectorFunction:
     if not callable(function):
         function = _array(what, function, (answers, size))
     try:
-        made = VectorFunction(function, size)
+        made = VectorFunction(function, size, given)
     except NotTraceable as error:
         raise ValueError(
             f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and let "
@@ -166,14 +175,48 @@ def _function(what: str, function: Function, size: int, answers: int | None) -> 
     return made
 
 
-def _model(given: Mapping[str, Any], size: int) -> StateSpaceModel:
+def _takes_interval(function: Any) -> bool:
+    """Whether a function's second argument is the interval."""
+    if not callable(function):
+        return False
+    try:
+        return list(inspect.signature(function).parameters)[1:2] == ["dt"]
+    except (TypeError, ValueError):
+        return False
+
+
+def _entries(matrix: Any) -> list[Any]:
+    """Numbers of a matrix, or of a list of its rows, row by row."""
+    try:
+        return [entry for row in matrix for entry in row]
+    except TypeError:
+        raise ValueError("must return a matrix, as a list of its rows") from None
+
+
+def _model(given: Mapping[str, Any], size: int, interval: float) -> StateSpaceModel:
+    """Trace a model; the covariance of a timed one is checked at its usual interval, s."""
     h = _function("h", given["h"], size, None)
-    return StateSpaceModel(
-        _function("f", given["f"], size, size),
+    f, Q = given["f"], given["Q"]
+    timed = _takes_interval(f)
+    noise: numpy.ndarray | VectorFunction
+    if timed != callable(Q):
+        raise ValueError(
+            "a timed model has f(x, dt) and Q(dt), any other takes the interval in neither: got "
+            f"{'f(x, dt)' if timed else 'f without dt'} and {'Q(dt)' if callable(Q) else 'Q as a matrix'}"
+        )
+    if not timed:
+        traced, noise = _function("f", f, size, size), _covariance("Q", Q, size)
+    else:
+        traced = _function("f", lambda v: f(v[:size], v[size]), size, size, given=1)
+        noise = _function("Q", lambda v: _entries(Q(v[0])), 1, size * size)
+    model = StateSpaceModel(
+        traced,
         h,
-        _covariance("Q", given["Q"], size),
+        noise,
         _covariance("R", given["R"], h.size, definite=True),
     )
+    _covariance("Q", model.process_noise(interval), size)
+    return model
 
 
 def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:

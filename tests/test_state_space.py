@@ -391,6 +391,144 @@ class TestExamples:
         assert np.isfinite(filter.update(values=[np.nan] * count).mean).all()
 
 
+def noise_of(dt):
+    """White acceleration."""
+    return [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]]
+
+
+def swing(x, dt):
+    return [x[0] + dt * x[1], x[1] - dt * 9.81 * np.sin(x[0])]
+
+
+MOVES = {
+    "linear": (lambda x, dt: [x[0] + dt * x[1], x[1]], lambda x, dt: np.array([[1.0, dt], [0.0, 1.0]])),
+    "nonlinear": (swing, lambda x, dt: np.array([[1.0, dt], [-dt * 9.81 * np.cos(x[0]), 1.0]])),
+}
+
+
+def naive_timed(f, F_of, mean, P, measurements):
+    """Extended Kalman filter of one episode of measurements ``(dt, z)`` with NumPy's inverse; R = 1, z is x[0]."""
+    for dt, z in measurements:
+        A = F_of(mean, dt)
+        mean, P = np.array(f(mean, dt), float), A @ P @ A.T + np.array(noise_of(dt))
+        if np.isfinite(z):
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+            mean, P = mean + K @ (z - mean[:1]), (np.eye(2) - K @ H) @ P
+    return mean, P
+
+
+@pytest.mark.parametrize("name", MOVES)
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+def test_a_timed_model_gives_the_filter_of_its_intervals(make, name, backend):
+    f, F_of = MOVES[name]
+    cls = make(f=f, Q=noise_of, covariance=0.1 * np.eye(2), sampling_interval=0.1)
+    start, kept = simulate(cls, 30, 8, backend=backend, jitter=0.9)
+    intervals = np.stack([m.interval for _, m, *_ in kept])
+    assert intervals.min() < 0.03
+    assert intervals.max() > 0.17
+    np.testing.assert_allclose(intervals.mean(), 0.1, atol=0.02)
+    for lane in range(8):
+        given = [(m.interval[lane], m.values[0, lane]) for _, m, *_ in kept]
+        mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
+        mean, P = naive_timed(f, F_of, mean, P, given)
+        np.testing.assert_allclose(kept[-1][2][:, lane], mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
+
+
+def test_the_world_of_a_timed_model_moves_by_its_intervals(make):
+    """The sum of normalised squared errors of M episodes is chi-square with 2 M degrees of freedom."""
+    M = 4000
+    _, kept = simulate(make(f=MOVES["linear"][0], Q=noise_of), 20, M, jitter=0.9)
+    truth, _, mean, P = kept[-1]
+    error = mean - truth.state
+    nees = np.einsum("in,nij,jn->n", error, np.linalg.inv(np.moveaxis(P, 2, 0)), error)
+    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 2 * M)
+    assert low < nees.sum() < high
+
+
+def test_filters_of_a_timed_model_agree_under_jitter(make):
+    """Estimators, bank and IMM of two equal hypotheses, on the scenario that the declaration brings."""
+    cls = make(f=MOVES["linear"][0], Q=noise_of, hypotheses=[{"Q": noise_of}])
+    names = ["kalman", "extended", "unscented", "imm", "kalman-imm", "known-model"]
+    dataset = filtergym.evaluate(cls.id, names, scenario="jitter", episodes=8, horizon=20)
+    first, *others = dataset.error.values
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("policy", ["kalman", "extended", "unscented"])
+def test_a_timed_model_takes_measurements_of_any_time(make, policy):
+    f, F_of = MOVES["linear"]
+    filter = filtergym.online(make(f=f, Q=noise_of).id, policy)
+    filter.start(mean=[0, 1], covariance=np.eye(2), time=5.0)
+    times, z = [6.0, 56.0, 56.1, 56.1, 56.100002, 60.0], [1.2, 48.0, np.nan, 49.5, 50.0, 55.0]
+    for time, value in zip(times, z, strict=True):
+        found = filter.update(time, values=[value])
+    steps = list(zip(np.diff([5.0, *times]), z, strict=True))
+    mean, P = naive_timed(f, F_of, np.array([0.0, 1.0]), np.eye(2), steps)
+    tolerance = 1e-6 if policy == "unscented" else 1e-12  # it starts with a little more covariance
+    np.testing.assert_allclose(found.mean, mean, rtol=tolerance)
+    np.testing.assert_allclose(found.covariance, P, rtol=tolerance)
+    with pytest.raises(ValueError, match="time must increase"):
+        filter.update(59.0, values=[1.0])
+    with pytest.raises(ValueError, match=r"at least 1e-06 s apart"):
+        filter.update(60.0 + 1e-7, values=[1.0])
+
+
+def test_a_timed_model_that_moves_in_no_time_takes_one_measurement_at_a_time(make):
+    filter = filtergym.online(make(f=lambda x, dt: [x[0] + dt * x[1] + 1.0, x[1]], Q=noise_of).id, "kalman")
+    filter.start(mean=[0, 1], covariance=np.eye(2))
+    filter.update(1.0, values=[1.0])
+    with pytest.raises(ValueError, match="time must increase"):
+        filter.update(1.0, values=[1.0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"f": MOVES["linear"][0]}, r"got f\(x, dt\) and Q as a matrix"),
+        ({"Q": noise_of}, r"got f without dt and Q\(dt\)"),
+        ({"f": MOVES["linear"][0], "Q": lambda dt: [[dt]]}, "Q must return 4 numbers, got 1"),
+        ({"f": MOVES["linear"][0], "Q": lambda dt: [[-dt, 0.0], [0.0, dt]]}, "Q must be symmetric and without"),
+        ({"f": MOVES["linear"][0], "Q": noise_of, "hypotheses": [{"f": F, "Q": Q}]}, "all models must take"),
+        ({"jitter": 0.5}, "knows no time, so jitter must be 0"),
+    ],
+)  # fmt: skip
+def test_what_is_no_timed_model_is_refused(make, wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make(**wrong)
+
+
+def test_the_page_on_time_runs(capsys):
+    try:
+        exec(compile(BLOCKS[3][1], "page", "exec"), {})
+    finally:
+        forget("mine/Irregular-v0")
+    assert len(capsys.readouterr().out.splitlines()) == 4
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no compiler")
+def test_a_timed_filter_is_exported(make, tmp_path):
+    problem = import_problem(make(f=swing, Q=noise_of, sampling_interval=0.1).id)
+    figures = export_c(request_export(problem, "extended"), tmp_path)
+    assert figures.difference < 1e-6
+    assert figures.test
+
+
+@pytest.mark.parametrize("time", [3.5, 52.0, 2.1])
+def test_another_interval_than_the_models_is_refused(make, time):
+    filter = filtergym.online(make().id, "kalman")
+    filter.start(mean=[0, 1], covariance=np.eye(2))
+    filter.update(1.0, values=[10.0])
+    before = filter.update(2.005, values=[20.0])  # the clock of a log is not exact
+    with pytest.raises(
+        ValueError, match=rf"moves by 1 s from one measurement to the next, got {time - 2.005:g} s"
+    ):
+        filter.update(time, values=[500.0])
+    np.testing.assert_array_equal(filter.predict(3.0).mean, F @ before.mean)  # nothing was taken in
+    assert filter.update(3.0, values=[30.0]).time == 3.0
+
+
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [

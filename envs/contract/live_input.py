@@ -86,7 +86,7 @@ class LiveInput:
 
     counter: ClassVar[str] = "number"
     """Array of the measurement that counts measurements."""
-    fuses: ClassVar[bool] = False
+    fuses: bool = False
     """Whether measurements may come at the same time."""
     values: Mapping[str, str]
     start_values: Mapping[str, str]

@@ -2,6 +2,9 @@ r"""A task made of a state-space model that somebody gives: what is declared, th
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
+A model may know the time: then f and Q are of the interval dt since the measurement before, ``x(k) = f(x(k-1), dt) +
+w``, ``w ~ N(0, Q(dt))``, and a measurement says its interval.
+
 The world obeys one model, or several between which it switches as a Markov chain from measurement to measurement. The
 filters may believe others. Functions are traced once, on vectors of symbols, and differentiated exactly
 (:mod:`..compiler.vector_functions`).
@@ -23,6 +26,7 @@ from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
+from .live import StateSpaceInput
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +35,31 @@ class StateSpaceModel:
 
     f: VectorFunction
     h: VectorFunction
-    Q: numpy.ndarray
-    """``(n, n)``."""
+    Q: numpy.ndarray | VectorFunction
+    """``(n, n)``; or a function from the interval, s, to the n^2 numbers of it, row by row: then f takes the interval
+    after the state, and the model is timed."""
     R: numpy.ndarray
     """``(m, m)``."""
+
+    @property
+    def timed(self) -> bool:
+        """Whether f and Q are functions of the interval between measurements."""
+        return isinstance(self.Q, VectorFunction)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether nothing happens in no time, as far as some states show: measurements may then come at one time."""
+        if not isinstance(self.Q, VectorFunction):
+            return False
+        x = numpy.linspace(-1.0, 2.0, 3 * self.f.size).reshape(self.f.size, 3)
+        moved = self.f.value(numpy.concatenate([x, numpy.zeros((1, 3))]), numpy)
+        return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.process_noise(0.0).any()
+
+    def process_noise(self, interval: float) -> numpy.ndarray:
+        """Q of an interval, s, ``(n, n)``; without time the same for all."""
+        if not isinstance(self.Q, VectorFunction):
+            return self.Q
+        return numpy.reshape(self.Q.value(numpy.array([[interval]]), numpy), (self.f.size, self.f.size))
 
     @property
     def is_linear(self) -> bool:
@@ -68,7 +93,9 @@ class StateSpaceParameters(TaskParameters):
     """Parameters of every task of state-space models."""
 
     sampling_interval: float = parameter(1.0, above=0.0)
-    """Time between measurements, s."""
+    """Time between measurements, s; of a timed model on average."""
+    jitter: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Share of the sampling interval by which the interval before a measurement differs at most, of a timed model."""
     process_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
     """Limits of the factor by which the true Q differs from the model's, drawn log-uniformly for every episode."""
     measurement_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
@@ -103,6 +130,8 @@ class Measurement(NamedTuple):
     """``(m, N)``; zero where nothing was received, where an estimator gets NaN."""
     available: Array
     """1 where a value was received, 0 where not, ``(m, N)``."""
+    interval: Array | None = None
+    """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
 
 
 class Equations:
@@ -115,14 +144,35 @@ class Equations:
 
     def __init__(self, task: Task, model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
-        self.Q, self.R = task.constant(model.Q), task.constant(model.R)
+        self.R = task.constant(model.R)
+        self._Q = None if model.timed else task.constant(model.Q)
         self._F, self._H = (
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
 
-    def move(self, x: Array) -> Array:
-        """State without noise at the next measurement, ``(n, ...)``."""
-        return self._value(self.model.f, x)
+    def move(self, x: Array, interval: Array | None) -> Array:
+        """State without noise at the next measurement, ``(n, ...)``.
+
+        Args:
+            x: ``(n, ...)``.
+            interval: until then, s, ``(N,)``; None where the model is not timed.
+        """
+        if interval is None:
+            return self._value(self.model.f, x)
+        return self._value(self.model.f, self._with_interval(x, interval))
+
+    def _with_interval(self, x: Array, interval: Array) -> Array:
+        """State with the interval as its last row, ``(n + 1, ...)``."""
+        return self.xp.concat([x, (0.0 * x[0] + interval)[None]])
+
+    def process_noise(self, interval: Array | None) -> Array:
+        """Q of an interval, ``(n, n, N)``, without time ``(n, n, 1)``."""
+        if self._Q is not None:
+            return self._Q[:, :, None]
+        assert isinstance(self.model.Q, VectorFunction)
+        assert interval is not None
+        n = self.model.f.size
+        return self.xp.reshape(self.model.Q.value(interval[None], self.xp), (n, n, *interval.shape))
 
     def measure(self, x: Array) -> Array:
         """Measurement without noise, ``(m, ...)``."""
@@ -132,18 +182,20 @@ class Equations:
         flat = self.xp.reshape(x, (x.shape[0], -1))
         return self.xp.reshape(function.value(flat, self.xp), (function.size, *x.shape[1:]))
 
-    def transition_matrix(self, x: Array) -> Array:
+    def transition_matrix(self, x: Array, interval: Array | None) -> Array:
         """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
+        if interval is not None:
+            return self.model.f.jacobian(self._with_interval(x, interval), self.xp)
         return self.model.f.jacobian(x, self.xp) if self._F is None else self._F[:, :, None]
 
     def measurement_matrix(self, x: Array) -> Array:
         """Jacobian of h, likewise."""
         return self.model.h.jacobian(x, self.xp) if self._H is None else self._H[:, :, None]
 
-    def carry(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Mean and covariance at the next measurement, without process noise."""
-        F = self.transition_matrix(mean)
-        return self.move(mean), product(product(F, covariance), transpose(F))
+    def carry(self, mean: Array, covariance: Array, interval: Array | None) -> tuple[Array, Array]:
+        """Mean and covariance at the next measurement, without process noise; ``interval`` as of :meth:`move`."""
+        F = self.transition_matrix(mean, interval)
+        return self.move(mean, interval), product(product(F, covariance), transpose(F))
 
 
 class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
@@ -156,17 +208,25 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         super().__init__(task)
         own = task.definition
         self.equations = [Equations(task, model) for model in own.world]
-        self.roots = [
-            tuple(task.constant(semidefinite_root(part[..., None])[..., 0]) for part in (model.Q, model.R))
-            for model in own.world
+        self.sensor_roots = [self._root(model.R) for model in own.world]
+        self.process_roots = [
+            None if isinstance(model.Q, VectorFunction) else self._root(model.Q) for model in own.world
         ]
+        self.timed, self.jitters = own.world[0].timed, self.parameters.jitter > 0.0
+        if self.jitters and not self.timed:
+            raise ValueError(
+                f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
+            )
         self.initial_root = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         n, m = len(own.mean), own.world[0].h.size
         self.initial_normals, self.normals = n, n + m
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
-        self.row_uniforms = int(self.switches) + int(self.loses)
+        self.row_uniforms = int(self.switches) + int(self.jitters) + int(self.loses)
         self.places = _components_measured(own.world[0].h)
+
+    def _root(self, covariance: numpy.ndarray) -> Array:
+        return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
@@ -192,11 +252,13 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         hypothesis = truth.hypothesis
         if self.switches:
             hypothesis = self._switch(hypothesis, uniforms[0])
+        interval = self._interval(truth, uniforms[int(self.switches)] if self.jitters else None)
         process = xp.sqrt(truth.process_noise) * noise[:n]
         sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.normals]
         moved, measured = [], []
-        for equations, (q, r) in zip(self.equations, self.roots, strict=True):
-            state = equations.move(truth.state) + apply(q[:, :, None], process)
+        for equations, q, r in zip(self.equations, self.process_roots, self.sensor_roots, strict=True):
+            root = semidefinite_root(equations.process_noise(interval)) if q is None else q[:, :, None]
+            state = equations.move(truth.state, interval) + apply(root, process)
             moved.append(state)
             measured.append(equations.measure(state) + apply(r[:, :, None], sensors))
         state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
@@ -205,7 +267,16 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             here = xp.where(uniforms[-1] < self.parameters.availability, 1.0, 0.0)
             available = available * here
             values = xp.where(here > 0.0, values, 0.0)
-        return truth._replace(state=state, hypothesis=hypothesis), Measurement(values, available)
+        return truth._replace(state=state, hypothesis=hypothesis), Measurement(values, available, interval)
+
+    def _interval(self, truth: Truth, uniform: Array | None) -> Array | None:
+        """Time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
+        if not self.timed:
+            return None
+        interval = self.parameters.sampling_interval + 0.0 * truth.process_noise
+        return (
+            interval if uniform is None else interval * (1.0 + self.parameters.jitter * (2.0 * uniform - 1.0))
+        )
 
     def _chosen(self, parts: Sequence[Array], hypothesis: Array) -> Array:
         """Of the arrays of all models that of the one in force."""
@@ -305,6 +376,7 @@ class StateSpace(Task):
     paper_source = "none: a model of one's own"
     Parameters = StateSpaceParameters
     World = StateSpaceWorld
+    live_input = StateSpaceInput
     causes = (MISSED, OUTLIER)
     cost_description = "weighted squared error of the components"
     reward = "log-relative"
@@ -321,6 +393,10 @@ class StateSpace(Task):
         count = len(own.filters)
         self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
         self.transition = self.constant([list(row) for row in own.transition])
+
+    def _sampling_interval(self) -> float | None:
+        """Return the time between measurements, s; None where it differs."""
+        return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
 
 
 def state_space_attributes(
@@ -339,6 +415,9 @@ def state_space_attributes(
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]
+    jitter = Scenario(
+        "jitter", "Held out: intervals from a tenth to 1.9 times the usual.", {**defaults, "jitter": 0.9}
+    )
     return {
         "definition": definition,
         "components": tuple(map(Component, names, units)),
@@ -355,6 +434,7 @@ def state_space_attributes(
                 "Held out: ten times the measurement noise.",
                 {**defaults, "measurement_noise": (10.0, 10.0)},
             ),
+            **({"jitter": jitter} if definition.world[0].timed else {}),
         },
         "paper_policy": PaperPolicy(control, (0.0,) * count),
     }

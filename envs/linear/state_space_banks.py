@@ -72,7 +72,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
         super().__init__(task, control)
         self.equations: Equations = task.believed[0]
         own = self.equations.model
-        self.states, self.sensors = len(own.Q), len(own.R)
+        self.states, self.sensors = own.f.size, len(own.R)
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -114,9 +114,9 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
             self.xp.stack([zero] * len(self.answers)),
         )
 
-    def process_noise(self, action: Array) -> Array:
+    def process_noise(self, action: Array, interval: Array | None) -> Array:
         """Covariance of the process noise under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
-        return self.equations.Q[:, :, None]
+        return self.equations.process_noise(interval)
 
     def sensor_noise(self, action: Array) -> Array:
         """Likewise of the measurement."""
@@ -124,14 +124,14 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
         """Predict, and compare under the noises of the last action."""
-        mean, carried = self.equations.carry(state.mean, state.covariance)
+        mean, carried = self.equations.carry(state.mean, state.covariance, measurement.interval)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: Any, measurement: Measurement) -> Any:
         """What is known of the measurement as it was predicted."""
         xp = self.xp
         received = self.received(state, measurement, state.action)
-        P = state.covariance + self.process_noise(state.action)
+        P = state.covariance + self.process_noise(state.action, measurement.interval)
         S = product(product(received.H, P), transpose(received.H)) + received.R
         sigma = xp.sqrt(xp.stack([S[j, j] for j in range(self.sensors)]))
         result = update_with_gain(state.mean, P, received, 0.0 * transpose(received.H))
@@ -170,9 +170,9 @@ class NoiseBank(KalmanBank):
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
-    def process_noise(self, action: Array) -> Array:
+    def process_noise(self, action: Array, interval: Array | None) -> Array:
         """Scaled Q."""
-        return self._scale(action, 0) * self.equations.Q[:, :, None]
+        return self._scale(action, 0) * self.equations.process_noise(interval)
 
     def sensor_noise(self, action: Array) -> Array:
         """Scaled R."""
@@ -182,7 +182,7 @@ class NoiseBank(KalmanBank):
         """Update with the noises that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
-        P = state.covariance + self.process_noise(action)
+        P = state.covariance + self.process_noise(action, measurement.interval)
         result = update_with_gain(state.mean, P, received, kalman_gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
@@ -199,7 +199,7 @@ class GainBank(KalmanBank):
         """Update with the gain that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
-        P = state.covariance + self.process_noise(action)
+        P = state.covariance + self.process_noise(action, measurement.interval)
         factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
         result = update_with_gain(state.mean, P, received, factor[:, None] * kalman_gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
@@ -237,7 +237,8 @@ class KalmanNetBank(KalmanBank):
 
     def __init__(self, task: StateSpace, control: str) -> None:
         super().__init__(task, control)
-        sigma = numpy.sqrt(numpy.diag(self.equations.model.Q))
+        usual = self.equations.model.process_noise(self.parameters.sampling_interval)
+        sigma = numpy.sqrt(numpy.diag(usual))
         self.deviations = task.constant(sigma)[:, None]
         self.scales = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
         self.sensor_scale = task.constant(1.0 / numpy.sqrt(numpy.diag(self.equations.model.R)))[:, None]
@@ -285,9 +286,9 @@ class KalmanNetBank(KalmanBank):
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
-    def process_noise(self, action: Array) -> Array:
+    def process_noise(self, action: Array, interval: Array | None) -> Array:
         """Q under the action."""
-        return self._scaled(self.equations.Q, NOISE_RANGE, self._part(action, 0))
+        return self._scaled(self.equations.process_noise(interval), NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, action: Array) -> Array:
         """R under the action."""
@@ -300,14 +301,14 @@ class KalmanNetBank(KalmanBank):
 
     def predict(self, state: KalmanNetTrack, measurement: Measurement) -> KalmanNetTrack:
         """Predict with the offset that was answered, and compare."""
-        mean, carried = self.equations.carry(state.mean, state.covariance)
+        mean, carried = self.equations.carry(state.mean, state.covariance, measurement.interval)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def act(self, state: KalmanNetTrack, measurement: Measurement, action: Array) -> KalmanNetTrack:
         """Update as the network answers."""
         action = self.xp.clip(action, -1.0, 1.0)
-        Q = self.process_noise(action)
+        Q = self.process_noise(action, measurement.interval)
         received = self.received(state, measurement, action)
         agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
         cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
@@ -429,8 +430,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         means, covariances = imm.mix(state.means, state.covariances, chain.mixing)
         updates = []
         for j, equations in enumerate(self.task.believed):
-            mean, carried = equations.carry(means[:, j], covariances[:, :, j])
-            P = carried + self.factors[0] * equations.Q[:, :, None]
+            mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement.interval)
+            P = carried + self.factors[0] * equations.process_noise(measurement.interval)
             received = keep_received(
                 measurement.values - equations.measure(mean),
                 equations.measurement_matrix(mean),
