@@ -43,7 +43,8 @@ import numpy
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
-from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Session, new_run
+from filtergym.agents.training_run import FILES, RunOptions, new_run
+from filtergym.agents.training_session import Bookkeeping, Session
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
