@@ -18,7 +18,8 @@ import numpy
 import xarray
 
 from ..envs.contract.task import Task
-from ..envs.data.recording import Recording, fill_arrays, measure_once
+from ..envs.data.recorded_world import fill_arrays, measure_once
+from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.statistics.bootstrap import Estimate
