@@ -6,7 +6,6 @@ validation cost) and the log.
 """
 
 import functools
-import importlib.metadata
 import json
 import shlex
 import sys
@@ -32,6 +31,7 @@ from ..envs.engine.catalogue import (
 from ..envs.engine.reward import REWARDS
 from ..envs.engine.scenario_choice import find_mixture, find_scenario
 from ..envs.interface.requests import DTYPES
+from ..evaluation.storage.code import library_versions
 from ..evaluation.storage.files import (
     claim_folder,
     find_folder,
@@ -63,6 +63,8 @@ FILES = {
     "kalman-net": "kalman_net",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
+LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
+"""What a run's result depends on, with the versions of those that are installed."""
 
 
 class ValidationEntry(TypedDict):
@@ -362,17 +364,6 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
     return LinearSchedule(start, 0.0, 1.0) if text.startswith("lin_") else ConstantSchedule(start)
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of what a run's result depends on."""
-    versions = {}
-    for name in ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib"):
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
-
-
 def check_trust(what: str, trust: bool) -> None:
     """Raise ValueError if something that can execute code is not trusted.
 
@@ -518,7 +509,7 @@ def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False)
             *_settings_in_words(run),
         ]
     )
-    run.versions = package_versions()
+    run.versions = library_versions(LIBRARIES)
     return run
 
 

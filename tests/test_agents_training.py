@@ -26,7 +26,7 @@ from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
-from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_header, write_arrays
+from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_arrays, write_arrays
 from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
 from filtergym.agents.sb3_training import train_sb3
@@ -220,7 +220,7 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     assert action.shape == expected.shape
     # float32 in both, with sums in another order.
     np.testing.assert_allclose(action, expected, atol=3e-6)
-    assert load_run(tmp_path).command == read_header(file)["run"]["command"]
+    assert load_run(tmp_path).command == read_arrays(file)[1]["run"]["command"]
 
 
 def test_an_exported_estimator_is_what_was_validated(tmp_path):
@@ -253,7 +253,7 @@ def test_exported_network_acts_like_the_trained_one(network, kept, tmp_path):
     path = tmp_path / "agent.safetensors"
     run = new_run(problem_of(ID), RunOptions("bptt", "weights"))
     write_arrays(path, trained.arrays(), run, "tanh", "relu", trained.fields(model))
-    assert read_header(path)["fields"] == [
+    assert read_arrays(path)[1]["fields"] == [
         field.name for field, used in zip(model.fields, trained.used, strict=True) if used
     ]
     policy = competitor(ID, str(path))(model)
