@@ -39,16 +39,8 @@ from .gate import Gate, as_trained
 from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
-from .training_run import (
-    Bookkeeping,
-    Session,
-    Trainee,
-    TrainingRun,
-    curves_beside,
-    interruption,
-    logger_in,
-    schedule,
-)
+from .training_run import TrainingRun, schedule
+from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
 from .unrolled import Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")

@@ -7,7 +7,8 @@ from ..evaluation.storage.files import whole_files, writable_file
 from .envelope import training_range
 from .learned_policy import load_policy, write_arrays, write_envelope
 from .named_policies import load_zipped_model
-from .training_run import TrainingEpisodes, TrainingRun, best_agent, load_run, save_run
+from .training_run import TrainingRun, best_agent, load_run, save_run
+from .validation import TrainingEpisodes
 
 CHECK_EPISODES = 32
 

@@ -202,16 +202,12 @@ def write_envelope(path: Path, low: numpy.ndarray, high: numpy.ndarray) -> None:
         partial.write_bytes(save(arrays, header))
 
 
-def read_header(path: Path) -> dict[str, Any]:
-    """Return the header of a learned policy's file; ``run`` and ``fields`` are parsed.
+def read_arrays(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
+    """Return the arrays of a learned policy's file, and its header, of which ``run`` and ``fields`` are parsed.
 
     Raises:
         ValueError: if the file is not one.
     """
-    return _read(path)[1]
-
-
-def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -295,7 +291,7 @@ class StoredPolicy:
     """Makes the policy of a file for a model; what an evaluation calls."""
 
     def __init__(self, path: Path) -> None:
-        self.arrays, self.header = _read(path)
+        self.arrays, self.header = read_arrays(path)
         ends = [self.arrays.pop(name) for name in ENVELOPE if name in self.arrays]
         self.envelope = (ends[0], ends[1]) if ends else None
         self.path = path

@@ -36,18 +36,8 @@ from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
 from .residual import policy_to_correct
 from .sb3_policy import Sb3Policy
-from .training_run import (
-    Bookkeeping,
-    Session,
-    Trainee,
-    TrainingRun,
-    check_trust,
-    curves_beside,
-    interruption,
-    logger_in,
-    save_run,
-    schedule,
-)
+from .training_run import TrainingRun, check_trust, save_run, schedule
+from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,

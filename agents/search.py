@@ -32,16 +32,8 @@ from ..envs.contract.parameters import check_integer
 from ..evaluation.storage.code import code_digest
 from ..evaluation.storage.files import writable_folder, write_text
 from .settings import merge_settings, read_section
-from .training_run import (
-    FILES,
-    RunOptions,
-    Session,
-    TrainingRun,
-    ValidationEntry,
-    load_run,
-    new_run,
-    open_run,
-)
+from .training_run import FILES, RunOptions, TrainingRun, ValidationEntry, load_run, new_run, open_run
+from .training_session import Session
 
 VALIDATIONS = 5
 """Of each run, after which a trial may be pruned."""

@@ -1,31 +1,22 @@
-"""What every training run has, whatever the algorithm: its folder, its record, and its validation.
+"""What every training run has, whatever the algorithm: what is asked of it, its record and its folder.
 
 A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
 one, from which ``--resume`` goes on, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
 validation cost) and the log.
 """
 
-import copy
 import functools
-import importlib.metadata
-import importlib.util
 import json
 import shlex
-import signal
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple, NotRequired, TypedDict
-
-import numpy
+from typing import Any, NotRequired, TypedDict
 
 from ..baselines.problem import Problem, problem_of
-from ..envs.contract.model import Episode, Model
+from ..envs.contract.model import Model
 from ..envs.contract.parameters import check_integer
 from ..envs.contract.task import Task
 from ..envs.engine.backend import make_model
@@ -40,15 +31,11 @@ from ..envs.engine.catalogue import (
 from ..envs.engine.reward import REWARDS
 from ..envs.engine.scenario_choice import find_mixture, find_scenario
 from ..envs.interface.requests import DTYPES
-from ..evaluation.competitors.kinds import kind_of
-from ..evaluation.running.rollout import run_competitor
-from ..evaluation.running.seeds import episode_seeds
-from ..evaluation.statistics.bootstrap import Bootstrap
+from ..evaluation.storage.code import library_versions
 from ..evaluation.storage.files import (
     claim_folder,
     find_folder,
     settle_folder,
-    whole_folder,
     writable_folder,
     write_text,
 )
@@ -76,7 +63,8 @@ FILES = {
     "kalman-net": "kalman_net",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
-VALIDATION_EPISODES = 512
+LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")
+"""What a run's result depends on, with the versions of those that are installed."""
 
 
 class ValidationEntry(TypedDict):
@@ -376,17 +364,6 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
     return LinearSchedule(start, 0.0, 1.0) if text.startswith("lin_") else ConstantSchedule(start)
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of what a run's result depends on."""
-    versions = {}
-    for name in ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib"):
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
-
-
 def check_trust(what: str, trust: bool) -> None:
     """Raise ValueError if something that can execute code is not trusted.
 
@@ -532,7 +509,7 @@ def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False)
             *_settings_in_words(run),
         ]
     )
-    run.versions = package_versions()
+    run.versions = library_versions(LIBRARIES)
     return run
 
 
@@ -552,285 +529,3 @@ def _settings_in_words(run: TrainingRun) -> Iterator[str]:
     values = dict(run.hyperparameters)
     yield from differing("env", values.pop("env_kwargs", {}), shipped.pop("env_kwargs", {}))
     yield from differing("algo", values, shipped)
-
-
-def _cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
-    return {"cost": model.cost(episode)}
-
-
-class TrainingEpisodes:
-    """Episodes of the validation split under what a run trains on; who flies them is scored.
-
-    Of a mixture, every scenario flies all episodes, and what is measured is weighted as they are: the same expectation
-    with less variance than drawing.
-
-    Args:
-        run: gives environment, scenario, and parameters of the task.
-        episodes: number of episodes.
-        backend: what computes the steps.
-    """
-
-    def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
-        self.problem, self.keywords, self.backend = run.problem, run.task_keywords, backend
-        self.weights = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
-        self.seeds = episode_seeds("validation", 0, episodes)
-        self._models: dict[tuple[str | None, str, str], Model] = {}
-
-    def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
-        """Return a model that is made once: compiling it takes time."""
-        key = control, scenario, repr(keywords)
-        if key not in self._models:
-            cls, parameters = self.problem.task, {**keywords, **self.keywords}
-            self._models[key] = make_model(cls, control, scenario, backend=self.backend, **parameters)
-        return self._models[key]
-
-    def means(
-        self,
-        competitor: Any,
-        control: str | None = None,
-        report: Callable[[Model, Episode], dict[str, numpy.ndarray]] = _cost,
-        episodes: int | None = None,
-    ) -> dict[str, numpy.ndarray]:
-        """Return what is reported, as means over every episode, ``(episodes,)``.
-
-        Args:
-            competitor: policy, estimator or reference, or what makes it.
-            control: in which it acts; default: its own.
-            report: as of :func:`.run_competitor`, with one number for every episode.
-            episodes: fly the first of them only.
-        """
-        kind = kind_of(competitor)
-        control = control or getattr(competitor, "control", None)
-        total: dict[str, Any] = {}
-        for scenario, weight in self.weights.items():
-            model = self._model(control, scenario, getattr(competitor, "task_keywords", {}))
-            series = run_competitor(model, competitor, kind, self.seeds[:episodes], report)
-            for name, values in series.items():
-                mean = numpy.ascontiguousarray(values).mean(axis=1)
-                total[name] = total.get(name, 0.0) + weight * mean
-        return total
-
-    def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
-        """Mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
-        return self.means(competitor, control)["cost"]
-
-
-def validation_backend(run: TrainingRun) -> str:
-    """What computes the steps of a run's validations: policies answer in NumPy arrays, not in torch's."""
-    return "auto" if run.backend == "torch" else run.backend
-
-
-class Validation:
-    """Scores an agent, and the paper's algorithm if there is one, on the same episodes of the validation split.
-
-    Args:
-        run: what is trained.
-    """
-
-    def __init__(self, run: TrainingRun) -> None:
-        self.run = run
-        problem = run.problem
-        self.paper = problem.baselines.score_paper
-        self.bootstrap = Bootstrap(VALIDATION_EPISODES)
-        self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
-        # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
-
-    def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
-        """Mean cost over the episodes and over every resample of them."""
-        return self.bootstrap.means(self.episodes.costs(policy, control))
-
-    def score(self, policy: Any) -> ValidationEntry:
-        """Return an entry of ``TrainingRun.validation``."""
-        acts = self.run.algorithm not in ESTIMATORS
-        # A maker of its own: what is compiled is kept by it, and the network has changed since the last validation.
-        cost = self._costs(copy.copy(policy), self.run.control if acts else None)
-        entry: ValidationEntry = {"steps": self.run.steps_done, "cost": float(cost[0])}
-        if self.paper is None or self.paper_cost is None:
-            return entry
-        return {
-            **entry,
-            "paper": self.paper,
-            "paper_cost": float(self.paper_cost[0]),
-            "relative_cost_difference": list(self.bootstrap.relative_difference(cost, self.paper_cost)),
-        }
-
-
-def _curve(entry: ValidationEntry) -> dict[str, float]:
-    """Numbers of a validation, as a log shows them over environment steps."""
-    curve = {"validation/cost": entry["cost"]}
-    if "paper_cost" in entry:
-        curve["validation/paper_cost"] = entry["paper_cost"]
-        curve["validation/cost_vs_paper"] = entry["relative_cost_difference"][0]
-    return curve
-
-
-def logger_in(folder: Path, steps_done: int) -> Any:
-    """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
-
-    Args:
-        folder: for the files.
-        steps_done: before; a resumed run writes files of its own.
-    """
-    from stable_baselines3.common.logger import Logger, make_output_format
-
-    formats = ["csv"] + (["tensorboard"] if importlib.util.find_spec("tensorboard") else [])
-    suffix = f"_{steps_done}"
-    return Logger(str(folder), [make_output_format(name, str(folder), suffix) for name in formats])
-
-
-def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
-    """Return what writes numbers at once where a logger writes, and leaves alone what that one has gathered."""
-    from stable_baselines3.common.logger import Logger
-
-    own = Logger(None, logger.output_formats)
-
-    def write(steps: int, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            own.record(name, value)
-        own.record("time/total_timesteps", steps, exclude="tensorboard")
-        own.dump(steps)
-
-    return write
-
-
-@contextmanager
-def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a wish to stop at the next safe point; the second stops at once."""
-    wished = False
-    if threading.current_thread() is not threading.main_thread():  # of a worker, which no signal reaches
-        yield lambda: False
-        return
-
-    def wish(*_: Any) -> None:
-        nonlocal wished
-        wished = True
-        restore()
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number in before:
-        signal.signal(number, wish)
-    try:
-        yield lambda: wished
-    finally:
-        restore()
-
-
-def _tell_nobody(news: Any) -> None:
-    """Do nothing."""
-
-
-def _go_on(entry: ValidationEntry) -> bool:
-    """Do not stop, whatever a validation says."""
-    return False
-
-
-@dataclass(frozen=True)
-class Session:
-    """How a run is trained, from its beginning or from where it stopped.
-
-    Raises:
-        ValueError: for less than one environment step between validations.
-    """
-
-    folder: Path
-    """Of the run; exists."""
-    resume: bool = False
-    """Go on from the folder's checkpoint."""
-    validate_every: int | None = None
-    """Environment steps between two validations; None: a twentieth of the run."""
-    trust: bool = False
-    """Load the checkpoint even if it can execute code; resuming a model of Stable-Baselines3 takes it."""
-    progress: Callable[[int], None] = _tell_nobody
-    """Told of all environment steps done so far."""
-    report: Callable[[str], None] = _tell_nobody
-    """Told of every validation in words."""
-    validated: Callable[[ValidationEntry], bool] = _go_on
-    """Told of every validation; returns whether to stop, with a checkpoint."""
-
-    def __post_init__(self) -> None:
-        if self.validate_every is not None:
-            check_integer("validate_every", self.validate_every, 1)
-
-    def steps_between_validations(self, run: TrainingRun) -> int:
-        """Return the environment steps between two validations of a run."""
-        return max(1, run.steps // 20) if self.validate_every is None else self.validate_every
-
-
-class Trainee(NamedTuple):
-    """An agent while it is trained."""
-
-    policy: Any
-    """For an evaluation."""
-    save_checkpoint: Callable[[Path], None]
-    """Writes all that training goes on from into an empty folder."""
-    save_agent: Callable[[Path], None]
-    """Writes the agent alone into an empty folder."""
-
-
-class Bookkeeping:
-    """Decides when a run is validated and checkpointed, and does what that takes.
-
-    Args:
-        run: the record, kept up to date.
-        session: how it is trained; every validation is followed by a checkpoint.
-        trainee: the agent.
-        stop: whether somebody wishes to stop.
-        log: writes numbers by name at so many environment steps.
-        began: when the run began to make its environments, of ``time.monotonic``.
-    """
-
-    def __init__(
-        self,
-        run: TrainingRun,
-        session: Session,
-        trainee: Trainee,
-        stop: Callable[[], bool],
-        log: Callable[[int, Mapping[str, float]], None] = lambda steps, values: None,
-        began: float | None = None,
-    ) -> None:
-        claim_folder(session.folder)
-        self.began = time.monotonic() if began is None else began
-        self.run, self.stop, self.log = run, stop, log
-        self.folder, self.interval = session.folder, session.steps_between_validations(run)
-        self.report, self.validated = session.report, session.validated
-        self.policy, self.save_checkpoint, self.save_agent = trainee
-        self.validation = Validation(run)
-        self.due = run.steps_done + self.interval
-        self.seconds_before = run.seconds
-
-    def safe_point(self, steps_done: int, last: bool = False) -> bool:
-        """Between two updates: validate and save if it is time; returns whether to stop."""
-        stopping = self.stop()
-        if not (stopping or last or steps_done >= self.due):
-            return False
-        self.due = steps_done + self.interval
-        run = self.run
-        run.steps_done = steps_done
-        entry = self.validation.score(self.policy)
-        is_best = run.best is None or entry["cost"] < run.best["cost"]
-        run.validation.append(entry)
-        self.log(steps_done, _curve(entry))
-        run.seconds = self.seconds_before + time.monotonic() - self.began
-        passed = run.beat_paper is None and entry.get("relative_cost_difference", [0.0, 0.0, 0.0])[2] < 0.0
-        if passed:
-            run.beat_paper = {"steps": steps_done, "seconds": round(run.seconds, 3)}
-        if is_best:
-            with whole_folder(self.folder / "best") as best:
-                self.save_agent(best)
-        with whole_folder(self.folder / "checkpoint") as checkpoint:
-            self.save_checkpoint(checkpoint)
-            save_run(run, checkpoint / "run.json")
-        save_run(run, self.folder / "run.json")
-        line = f"{steps_done:,} steps: validation cost {entry['cost']:.4g}"
-        if self.validation.paper:
-            value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
-            line += f", {entry['paper']} {entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
-        if passed:
-            line += f"; better than {entry['paper']} for the first time, after {run.seconds:.1f} s"
-        self.report(line)
-        return self.validated(entry) or stopping

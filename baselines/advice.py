@@ -18,7 +18,8 @@ import numpy
 import xarray
 
 from ..envs.contract.task import Task
-from ..envs.data.recording import Recording, fill_arrays, measure_once
+from ..envs.data.recorded_world import fill_arrays, measure_once
+from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.statistics.bootstrap import Estimate
@@ -260,7 +261,8 @@ def advise(
     brought = judgement.difference(dearer.name, chosen.name)
     anchor = None
     for name in anchored:
-        anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
+        both = {each: tunables[each] for each in (name, chosen.name)}
+        anchor = _compare_anchored(recording, task, share, both, fits[name], seed)
         if anchor.gain > 0.0:
             chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
@@ -428,13 +430,12 @@ def _compare_anchored(
     recording: Recording,
     task: Task,
     share: Share,
-    name: str,
-    other: str,
     tunables: Mapping[str, Tunable],
     fitted: Fit,
     seed: int,
 ) -> Anchor:
-    """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such.
+    """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such; the
+    former, which is ``fitted``, is the first of the two ``tunables``.
 
     That is the likelihood that both have in common: of the same measurements, given the same earlier ones. From one
     measurement to the next the other follows errors that last, and so predicts them well.
@@ -443,9 +444,10 @@ def _compare_anchored(
     def apart(spans: Sequence[Span], tunable: Tunable) -> WindowLikelihood:
         return _likelihood(recording, task, spans, share.warm_up, tunable, thinned=True)
 
-    rival = fit(apart(share.fitted, tunables[other]), tunables[other], seed)
+    (name, anchored), (other, best) = tunables.items()
+    rival = fit(apart(share.fitted, best), best, seed)
     means = []
-    for tunable, found in ((tunables[name], fitted), (tunables[other], rival)):
+    for tunable, found in ((anchored, fitted), (best, rival)):
         chosen = apart(share.chosen, dataclasses.replace(tunable, start=found.values))
         values = numpy.array([[value] for value in found.values.values()])
         means.append(float(chosen(values)[0]) / chosen.count)

@@ -289,9 +289,8 @@ def _search_profiles(
         places: list[_Place] = []
         drops: list[float] = []
         for sign in (-1.0, 1.0):
-            walked, lower, point = _walk_profile(
-                likelihood, limits, found, best, i, sign, float(deviation[i]), stop
-            )
+            first = _Place(i, sign, float(deviation[i]))
+            walked, lower, point = _walk_profile(likelihood, limits, found, best, first, stop)
             if stop and lower and lower[-1] < -HIGHER:
                 return {}, point
             places, drops = [*places, *walked], [*drops, *lower]
@@ -316,16 +315,16 @@ def _walk_profile(
     limits: numpy.ndarray,
     found: Fit,
     best: numpy.ndarray,
-    parameter: int,
-    sign: float,
-    deviation: float,
+    first: _Place,
     stop: bool,
 ) -> tuple[list[_Place], list[float], numpy.ndarray]:
     """Places on the way to a limit, up to where the likelihood has fallen far enough, how far it has at each, and the
-    last point; with ``stop`` no further than a point that is likelier than the fit.
+    last point; with ``stop`` no further than a point that is likelier than the fit. The way goes past ``first``, a
+    standard deviation away.
     """
     from scipy.optimize import minimize
 
+    parameter, sign, deviation = first
     room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
     others = numpy.delete(numpy.arange(len(best)), parameter)
     places: list[_Place] = []

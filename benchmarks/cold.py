@@ -27,6 +27,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rich.console import Console
+from rich.table import Table
+
 RECORD = Path(__file__).resolve().parent.parent / "docs" / "records" / "cold.json"
 COLUMNS = ["", "cold, s", "warm, s", "cold / warm", "cold, wall s", "warm, wall s"]
 LIBRARIES = ("filtergym", "numpy", "scipy", "gymnasium", "llvmlite")
@@ -115,18 +118,6 @@ def row(name: str, cold: Cost, warm: Cost) -> list[str]:
     return [name, *seconds, f"{cold.processor / warm.processor:.2f}", *wall]
 
 
-def table_text(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in columns of one width each."""
-    widths = [max(len(line[i]) for line in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in rows
-    )
-
-
 def write_record(rows: Sequence[Sequence[str]]) -> None:
     """Put rows into the record, in the order of :func:`commands`; see ``docs/make/records.py``."""
     known = json.loads(RECORD.read_text(encoding="utf-8"))["data"]["rows"] if RECORD.exists() else []
@@ -161,7 +152,12 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="cold-") as home:
             rows.append(row(name, measure(command, Path(home)), measure(command, Path(home))))
         print(" ".join(rows[-1]), file=sys.stderr, flush=True)
-    print(table_text([COLUMNS, *rows]))
+    table = Table()
+    for i, column in enumerate(COLUMNS):
+        table.add_column(column, justify="right" if i else "left")
+    for each in rows:
+        table.add_row(*each)
+    Console().print(table)
     if options.record:
         write_record(rows)
 

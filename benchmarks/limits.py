@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy
 import xarray
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import reduce_episodes
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
@@ -120,7 +120,7 @@ def main() -> None:
     ]
     rows = [
         [
-            each.environment.rpartition("/")[2].removesuffix("-v0"),
+            bare_name(each.environment),
             each.scenario,
             str(each.episodes),
             f"`{each.reference}`",

@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.engine.catalogue import bare_name
 from rich.console import Console
 from rich.table import Table
 
@@ -120,7 +121,7 @@ def table(runs: list[dict]) -> Table:
         median = 100.0 * numpy.median([found["median_difference"] for found in own])
         rate = numpy.median([found["steps"] / found["seconds"] for found in own])
         shown.add_row(
-            id.removeprefix("filtergym/").removesuffix("-v0"),
+            bare_name(id),
             own[0]["control"],
             f"{own[0]['steps']:,}",
             f"{each.mean():+.1f}",

@@ -43,11 +43,12 @@ import numpy
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
-from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Session, new_run
+from filtergym.agents.training_run import FILES, RunOptions, new_run
+from filtergym.agents.training_session import Bookkeeping, Session
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
-from filtergym.envs.engine.catalogue import catalogue, short_name
+from filtergym.envs.engine.catalogue import bare_name, catalogue, short_name
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.running.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.running.own_metrics import MetricInputs, OwnMetrics
@@ -477,10 +478,6 @@ def shipped_seconds(id: str, algorithm: str) -> str:
     return "" if run is None else number(run["seconds"]) + " (gated)" * bool(run.get("gated"))
 
 
-def short(id: str) -> str:
-    return id.removeprefix("filtergym/").removesuffix("-v0")
-
-
 def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
     """What was measured, and what follows for memory."""
     table = titled(
@@ -503,7 +500,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(
-            short(id),
+            bare_name(id),
             f"{len(found) - len(learned)} + {seeds} x {len(learned)}",
             spread([value for name, value in work.items() if name not in learned]),
             spread([work[name] for name in learned]),
@@ -512,11 +509,11 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         )
         held = max(u["held"] for u in found.values()) * T / GIB
         sizes = spread([size / GIB for size in sent.values()])
-        memory.add_row(short(id), str(T), *(number(held * e) for e in (block_of(T), episodes)), sizes)
+        memory.add_row(bare_name(id), str(T), *(number(held * e) for e in (block_of(T), episodes)), sizes)
         for name, u in learned.items():
             seconds = run_seconds(u)
             training.add_row(
-                short(id),
+                bare_name(id),
                 name,
                 f"{u['steps']:,}",
                 number(1e6 * u["decision"]),
@@ -536,7 +533,7 @@ def plan_tables(units: Units, episodes: int, seeds: int, cores: Sequence[int]) -
         own = [item for item in items if id in ("", item.environment)]
         kinds = [sum(i.seconds for i in own if i.kind == k) for k in ("tuning", "training", "evaluation")]
         hours.add_row(
-            short(id) or "all", *(number(s / 3600) for s in (*kinds, sum(item.parent for item in own)))
+            bare_name(id) or "all", *(number(s / 3600) for s in (*kinds, sum(item.parent for item in own)))
         )
     yield hours
     table = titled(
@@ -606,8 +603,8 @@ def main() -> None:
     long = max((item for item in items if item.kind == "training"), key=lambda item: item.seconds)
     print(
         f"{len(items):,} items of work. The longest, as it is: {dear.kind} of {dear.name} in "
-        f"{short(dear.environment)}, {dear.seconds / 3600:.2f} h; of training {long.name} in "
-        f"{short(long.environment)}, {long.seconds:.0f} s."
+        f"{bare_name(dear.environment)}, {dear.seconds / 3600:.2f} h; of training {long.name} in "
+        f"{bare_name(long.environment)}, {long.seconds:.0f} s."
     )
     print(
         f"A process begins with {start['imports']:.1f} s of imports and {start['resampling']:.1f} s of resampling "
@@ -615,8 +612,8 @@ def main() -> None:
     )
     for id, quarter in units["told of a quarter"].items():
         print(
-            f"Telling of a competitor of {short(id)} takes {units['told'][id] / quarter:.2f} times what it takes of a "
-            "quarter of the episodes."
+            f"Telling of a competitor of {bare_name(id)} takes {units['told'][id] / quarter:.2f} times what it takes "
+            "of a quarter of the episodes."
         )
 
 

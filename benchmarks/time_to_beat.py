@@ -39,7 +39,8 @@ def arguments() -> argparse.Namespace:
 def train_once(chosen: argparse.Namespace, folder: Path) -> None:
     """Train one seed in this process."""
     from filtergym.agents.settings import THROUGH_THE_FILTER, parse_settings
-    from filtergym.agents.training_run import RunOptions, Session, new_run
+    from filtergym.agents.training_run import RunOptions, new_run
+    from filtergym.agents.training_session import Session
     from filtergym.baselines.problem import problem_of
 
     if chosen.algo in THROUGH_THE_FILTER:

@@ -22,16 +22,17 @@ pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 import torch
-from filtergym.agents import training_run
+from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
-from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_header, write_arrays
+from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_arrays, write_arrays
 from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
 from filtergym.agents.sb3_training import train_sb3
 from filtergym.agents.settings import THROUGH_THE_FILTER
-from filtergym.agents.training_run import RunOptions, Session, Trainee, load_run, new_run, resume_run
+from filtergym.agents.training_run import RunOptions, load_run, new_run, resume_run
+from filtergym.agents.training_session import Session, Trainee
 from models import make_model
 from sb3_contrib import RecurrentPPO
 
@@ -53,7 +54,7 @@ CONTROL = {"dqn": "mode", "kalman-net": "kalman-net"}
 
 @pytest.fixture(autouse=True)
 def few_validation_episodes(monkeypatch):
-    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 16)
+    monkeypatch.setattr(validation, "VALIDATION_EPISODES", 16)
 
 
 def small_run(algorithm, steps, envs=4, **keywords):
@@ -165,9 +166,9 @@ def test_validation_is_that_of_evaluate(algorithm, tmp_path):
         (competitor(ID, agent), agent, "gain"),
         (competitor(ID, "imm"), "imm", None),
     ):
-        found = training_run.TrainingEpisodes(run, 16).costs(maker, control)
+        found = validation.TrainingEpisodes(run, 16).costs(maker, control)
         np.testing.assert_array_equal(found, each[name])
-    means = training_run.Bootstrap(16).means
+    means = validation.Bootstrap(16).means
     assert entry["cost"] == means(each[agent])[0]
     assert entry["paper_cost"] == means(each["imm"])[0]
     assert entry["relative_cost_difference"][0] == entry["cost"] / entry["paper_cost"] - 1.0
@@ -194,7 +195,7 @@ def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
     (entry,) = train(run, tmp_path).validation
     model = str(tmp_path / "best" / "model.zip")
     costs = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].values[0]
-    assert entry["cost"] == training_run.Bootstrap(16).means(costs.mean(axis=1))[0]
+    assert entry["cost"] == validation.Bootstrap(16).means(costs.mean(axis=1))[0]
 
 
 @pytest.mark.parametrize(
@@ -219,7 +220,7 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     assert action.shape == expected.shape
     # float32 in both, with sums in another order.
     np.testing.assert_allclose(action, expected, atol=3e-6)
-    assert load_run(tmp_path).command == read_header(file)["run"]["command"]
+    assert load_run(tmp_path).command == read_arrays(file)[1]["run"]["command"]
 
 
 def test_an_exported_estimator_is_what_was_validated(tmp_path):
@@ -252,7 +253,7 @@ def test_exported_network_acts_like_the_trained_one(network, kept, tmp_path):
     path = tmp_path / "agent.safetensors"
     run = new_run(problem_of(ID), RunOptions("bptt", "weights"))
     write_arrays(path, trained.arrays(), run, "tanh", "relu", trained.fields(model))
-    assert read_header(path)["fields"] == [
+    assert read_arrays(path)[1]["fields"] == [
         field.name for field, used in zip(model.fields, trained.used, strict=True) if used
     ]
     policy = competitor(ID, str(path))(model)
@@ -545,7 +546,7 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
     saved = []
     run = small_run("ppo", 100)
     save_agent = lambda _: saved.append(run.steps_done)  # noqa: E731
-    books = training_run.Bookkeeping(
+    books = training_session.Bookkeeping(
         run, Session(tmp_path, validate_every=10), Trainee(None, lambda _: None, save_agent), lambda: False
     )
     costs = iter([3.0, 5.0, 2.0, 2.0, 4.0])
@@ -561,7 +562,7 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
 
 def test_when_the_paper_was_beaten_is_noted(tmp_path):
     lines, run = [], small_run("ppo", 100)
-    books = training_run.Bookkeeping(
+    books = training_session.Bookkeeping(
         run,
         Session(tmp_path, validate_every=10, report=lines.append),
         Trainee(None, lambda _: None, lambda _: None),

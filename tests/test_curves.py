@@ -9,7 +9,7 @@ import pytest
 import xarray
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.curves import curves_of
-from filtergym.evaluation.running.evaluate import action_names
+from filtergym.evaluation.running.named_axes import action_names
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.storage.dataset import windows_of
 from models import make_model

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import command_line
 import pytest
-from environment_page import TABLES, environment_tables
+from environment_page import TABLES, environment_table
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import catalogue, parameter_names
+from filtergym.envs.engine.catalogue import bare_name, catalogue, parameter_names
 from models import make_model
-from records import FOLDER, read_record, short_name
+from records import FOLDER, read_record
 
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")
@@ -35,15 +35,14 @@ def page_file(id: str) -> Path:
 
 def page(id: str) -> str:
     """Text of that page, with the tables that are rendered of the code."""
-    return "\n".join(
-        [page_file(id).read_text(encoding="utf-8"), *environment_tables(problem_of(id)).values()]
-    )
+    tables = [environment_table(problem_of(id), name) for name in (*TABLES, "policies")]
+    return "\n".join([page_file(id).read_text(encoding="utf-8"), *tables])
 
 
 @pytest.mark.parametrize("id", catalogue())
 def test_page_has_the_usual_headings_and_tables(id):
     text = page_file(id).read_text(encoding="utf-8")
-    name = short_name(id)
+    name = bare_name(id)
     assert [h for h in HEADINGS if f"\n## {h}\n" not in text] == []
     assert f"```{{results-table}} {name}\n" in text
     for table in (*TABLES, "policies"):
@@ -165,7 +164,7 @@ def test_one_command_makes_all_that_is_shipped_and_published():
             f"--name {file.stem} " in done or made_of in done or any(name in made_of for name in foreign)
         ), file
     for id in catalogue():
-        assert f"runs/{short_name(id)}/*-? --scenario random" in done
+        assert f"runs/{bare_name(id)}/*-? --scenario random" in done
     assert (
         done.count("docs/make seeds runs/") == done.count("--into docs/records --trust") == len(catalogue())
     )

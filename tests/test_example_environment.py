@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from environment_page import environment_tables
+from environment_page import environment_table
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import registration
@@ -82,10 +82,12 @@ def test_torch(example):
 
 
 def test_tables_of_its_page(example):
-    tables = environment_tables(problem_of(ID))
-    assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in tables["fields"]
-    assert "Limits of its true factor" in tables["parameters"]
-    assert "Knows the factor on the gusts at every moment." in tables["policies"]
+    problem = problem_of(ID)
+    assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in environment_table(
+        problem, "fields"
+    )
+    assert "Limits of its true factor" in environment_table(problem, "parameters")
+    assert "Knows the factor on the gusts at every moment." in environment_table(problem, "policies")
     assert make_model(ID).task.noise.uniforms == 3
 
 

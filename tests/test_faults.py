@@ -7,17 +7,9 @@ import pathlib
 from dataclasses import replace
 
 import pytest
-from filtergym.agents import training_run
-from filtergym.agents.training_run import (
-    Bookkeeping,
-    RunOptions,
-    Session,
-    Trainee,
-    best_agent,
-    load_run,
-    new_run,
-    resume_run,
-)
+from filtergym.agents import training_session
+from filtergym.agents.training_run import RunOptions, best_agent, load_run, new_run, resume_run
+from filtergym.agents.training_session import Bookkeeping, Session, Trainee
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.storage.files import (
     find_folder,
@@ -165,7 +157,7 @@ class _Costs:
 @pytest.mark.parametrize("points", [1, 2])
 def test_a_run_is_resumed_after_a_fault_at_any_step(points, kind, monkeypatch, tmp_path):
     pytest.importorskip("yaml")
-    monkeypatch.setattr(training_run, "Validation", _Costs)
+    monkeypatch.setattr(training_session, "Validation", _Costs)
 
     wanted = new_run(problem_of("ManeuveringTarget"), RunOptions("bptt", steps=1000, envs=2))
 

@@ -419,11 +419,11 @@ def small(monkeypatch, tmp_path):
     """Train a few steps of an agent, as a function of the settings of the run."""
     pytest.importorskip("sb3_contrib")
     import torch
-    from filtergym.agents import training_run
+    from filtergym.agents import training_run, training_session, validation
     from filtergym.agents.sb3_training import train_sb3
 
     torch.set_num_threads(1)
-    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 16)
+    monkeypatch.setattr(validation, "VALIDATION_EPISODES", 16)
 
     def train(folder, steps, resume=False, progress=lambda done: None, **around):
         network = {"n_steps": 30, "batch_size": 60, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
@@ -431,7 +431,7 @@ def small(monkeypatch, tmp_path):
             problem_of(ID), training_run.RunOptions("ppo", None, steps, 4, overrides=network, **around)
         )
         run = training_run.open_run(tmp_path / folder, asked, resume)
-        session = training_run.Session(tmp_path / folder, resume, 10**9, True, progress)
+        session = training_session.Session(tmp_path / folder, resume, 10**9, True, progress)
         return train_sb3(run, session), tmp_path / folder
 
     return train

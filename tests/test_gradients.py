@@ -15,7 +15,8 @@ import array_api_compat.torch as torch_namespace
 import torch
 from filtergym.agents import bptt
 from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
-from filtergym.agents.training_run import RunOptions, Session, new_run
+from filtergym.agents.training_run import RunOptions, new_run
+from filtergym.agents.training_session import Session
 from filtergym.agents.unrolled import Unrolled
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Function
@@ -212,7 +213,7 @@ def test_without_llvmlite_training_learns_the_same_through_torch(tmp_path, monke
             problem_of("filtergym/ManeuveringTarget-v0"),
             RunOptions("bptt", "gain", 400, 4, overrides=overrides),
         )
-        monkeypatch.setattr("filtergym.agents.training_run.VALIDATION_EPISODES", 16)
+        monkeypatch.setattr("filtergym.agents.validation.VALIDATION_EPISODES", 16)
         train_bptt(run, Session(folder, validate_every=10**9))
         assert through_torch.called is not there
         learned[there] = torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 import xarray
-from filtergym.agents.learned_policy import PRETRAINED, read_header
+from filtergym.agents.learned_policy import PRETRAINED, read_arrays
 from filtergym.agents.training_run import load_run
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.summary import Summary
@@ -209,7 +209,7 @@ def agent_ways(folder, command):
         yield f"make_policy {path.name}", lambda path=path: make_policy(ENV, path)
         yield f"evaluate() {path.name}", lambda path=path: evaluate(ENV, [path], episodes=2, horizon=8)
         if path.suffix:
-            yield f"read_header {path.name}", lambda path=path: read_header(path)
+            yield f"read_arrays {path.name}", lambda path=path: read_arrays(path)
             continue
         for words in (
             ("export", path),

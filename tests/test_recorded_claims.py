@@ -2,8 +2,8 @@
 
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import catalogue
-from records import read_record, short_name
+from filtergym.envs.engine.catalogue import bare_name, catalogue
+from records import read_record
 
 pytestmark = pytest.mark.claims
 COMPETE = ("policy", "estimator")
@@ -20,7 +20,7 @@ def recorded_scenarios(name):
 
 def test_nobody_is_significantly_better_than_the_reference(env_id):
     """A score of one is the reference; its interval is that of paired differences over the same episodes."""
-    scenarios = recorded_scenarios(short_name(env_id))
+    scenarios = recorded_scenarios(bare_name(env_id))
     assert list(scenarios) == list(catalogue()[env_id].scenarios)
     judged = 0
     for scenario, competitors in scenarios.items():

@@ -17,7 +17,7 @@ import xarray
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.data.recorded_tables import Columns
-from filtergym.envs.data.recording import measure_once
+from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.compiled import AVAILABLE
 from filtergym.envs.engine.episode_noise import uniforms_of_seeds

@@ -9,7 +9,7 @@ pytest.importorskip("optuna")
 pytest.importorskip("yaml")
 pytest.importorskip("sb3_contrib")
 import optuna
-from filtergym.agents import training_run
+from filtergym.agents import training_run, validation
 from filtergym.agents.search import (
     VALIDATIONS,
     Search,
@@ -196,7 +196,7 @@ def test_spaces_of_another_form(text, message, tmp_path):
 def test_the_command_leaves_settings_to_train_with(monkeypatch, capsys, tmp_path):
     from filtergym.__main__ import main
 
-    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 8)
+    monkeypatch.setattr(validation, "VALIDATION_EPISODES", 8)
     (tmp_path / "space.yml").write_text("default: {hidden_size: [2, 3], learning_rate: [lin_0.01]}")
 
     def run(*words):

@@ -17,21 +17,15 @@ from filtergym import evaluate
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
-from filtergym.agents import training_run
+from filtergym.agents import training_run, validation
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
 from filtergym.agents.settings import merge_settings, parse_settings, read_config
-from filtergym.agents.training_run import (
-    RunOptions,
-    Session,
-    TrainingEpisodes,
-    load_run,
-    new_run,
-    open_run,
-    read_hyperparameters,
-)
+from filtergym.agents.training_run import RunOptions, load_run, new_run, open_run, read_hyperparameters
+from filtergym.agents.training_session import Session
+from filtergym.agents.validation import TrainingEpisodes
 
 ID = "filtergym/ManeuveringTarget-v0"
 SMALL = {
@@ -42,7 +36,7 @@ SMALL = {
 
 @pytest.fixture(autouse=True)
 def few_validation_episodes(monkeypatch):
-    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 8)
+    monkeypatch.setattr(validation, "VALIDATION_EPISODES", 8)
 
 
 @pytest.fixture

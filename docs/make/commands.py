@@ -10,6 +10,7 @@ import training_seeds
 import typer
 from filtergym.agents.export import export_run
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.envs.engine.scenario_choice import find_scenario
 from filtergym.evaluation.figures.print_layout import check_columns, check_formats, save
 from filtergym.evaluation.running.metrics import Record
@@ -28,7 +29,6 @@ from records import (
     read_benchmark,
     read_record,
     recorded_environments,
-    short_name,
     today,
     with_competitors,
     without_place,
@@ -86,7 +86,7 @@ def record(
         for id, records in found.items():
             data = benchmark_data(problem_of(id), records)
             made = ResultRecord(without_place(settings.command), today(), settings.versions, note, data)
-            name = f"{BENCHMARK}/{short_name(id)}"
+            name = f"{BENCHMARK}/{bare_name(id)}"
             if add:
                 whole = read_record(name, into)
                 made = whole._replace(note=note or whole.note, data=with_competitors(whole.data, data, add))
@@ -209,7 +209,7 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         data = training_seeds.seeds_data(study, records)
-        name = f"{SEEDS}/{short_name(problem.id)}"
+        name = f"{SEEDS}/{bare_name(problem.id)}"
         if add:
             data = training_seeds.with_runs(read_record(name, into).data, data)
         made = ResultRecord(command, today(), settings_of(command).versions, note, data)

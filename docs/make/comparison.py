@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_differences
-from records import BenchmarkRecords, ResultRecord, short_name
+from records import BenchmarkRecords, ResultRecord
 
 from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
 from filtergym.reports.tables.terminal_tables import (
@@ -88,7 +89,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
         for origin, name in best.items():
             rows.append(
                 [
-                    short_name(problem.id),
+                    bare_name(problem.id),
                     f"`{name}`",
                     origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
                     *_cells(name, records),
@@ -112,7 +113,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
             beside = [record for record in records if record.scenario == worst.scenario]
             rows.append(
                 [
-                    short_name(problem.id),
+                    bare_name(problem.id),
                     f"`{name}`",
                     f"`{worst.scenario}`",
                     *_cells(name, beside),

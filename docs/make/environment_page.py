@@ -172,11 +172,6 @@ TABLES = {
 """Of the task, by their names; that of the policies stands beside them."""
 
 
-def environment_tables(problem: Problem) -> dict[str, str]:
-    """Make the tables of an environment, by their names, in Markdown."""
-    return {name: environment_table(problem, name) for name in (*TABLES, "policies")}
-
-
 def environment_table(problem: Problem, name: str) -> str:
     """Make one table of an environment in Markdown.
 

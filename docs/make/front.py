@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 from filtergym.agents.named_policies import pretrained_agents
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.figures.front_figure import Panel, draw_panel, legend_of, name_points
 from filtergym.evaluation.figures.print_layout import figure_with_pairs, in_print
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import points_of_records, times_of_records
 from filtergym.papers.grid import markdown_table
-from records import BenchmarkRecords, short_name
+from records import BenchmarkRecords
 
 BUDGETS = (100, 300, 1000, 5000)
 """Nanoseconds that a measurement may take."""
@@ -24,7 +25,7 @@ def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
             panels.append(
-                Panel(short_name(problem.id), points, known.score_paper, known.score_reference, learned)
+                Panel(bare_name(problem.id), points, known.score_paper, known.score_reference, learned)
             )
     return panels
 
@@ -70,7 +71,7 @@ def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
                 line.append(min(mine, key=lambda r: cast(float, r.value), default=None))
         for kind, title in enumerate(("classical", "learned")):
             cells = [_cell(own, rival) for own, rival in zip(best[kind], best[1 - kind], strict=True)]
-            rows.append([short_name(problem.id) if not kind else "", title, *cells])
+            rows.append([bare_name(problem.id) if not kind else "", title, *cells])
     return "\n".join(markdown_table(["", "", *(f"{budget:,} ns" for budget in BUDGETS)], rows))
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.engine.catalogue import catalogue, nearest
+from filtergym.envs.engine.catalogue import bare_name, catalogue, nearest
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.storage.files import write_text
 from filtergym.evaluation.storage.stored import read_json
@@ -68,18 +68,13 @@ class BenchmarkRecords(NamedTuple):
     records: list[Record]
 
 
-def short_name(id: str) -> str:
-    """Return an environment's id without its namespace and version."""
-    return id.rpartition("/")[2].removesuffix("-v0")
-
-
 def environment_id(name: str) -> str:
     """Return the id of an environment that pages call by its short name.
 
     Raises:
         ValueError: if there is none.
     """
-    known = {short_name(id): id for id in catalogue()}
+    known = {bare_name(id): id for id in catalogue()}
     if name not in known:
         raise nearest("environment", name, known)
     return known[name]
@@ -276,7 +271,7 @@ def read_benchmark(name: str, folder: Path = FOLDER) -> tuple[BenchmarkRecords, 
 
 def recorded_environments(kind: str = BENCHMARK, folder: Path = FOLDER) -> list[str]:
     """Short names of all environments with a record of that kind, in the catalogue's order."""
-    names = map(short_name, catalogue())
+    names = map(bare_name, catalogue())
     return [name for name in names if record_file(f"{kind}/{name}", folder).is_file()]
 
 

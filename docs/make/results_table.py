@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
 from filtergym.papers.grid import markdown_table
-from records import BenchmarkRecords, ResultRecord, short_name
+from records import BenchmarkRecords, ResultRecord
 
 from filtergym.reports.tables.ranking import ranking_sentence
 from filtergym.reports.tables.terminal_tables import (
@@ -154,6 +155,6 @@ def chosen_markdown(
 def _where(records: Sequence[Record]) -> str:
     first = records[0]
     return (
-        f"{short_name(first.environment)}, scenario `{first.scenario}`, {first.episodes} episodes of the "
+        f"{bare_name(first.environment)}, scenario `{first.scenario}`, {first.episodes} episodes of the "
         f"{first.split} split, 95 % bootstrap intervals."
     )

@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, percentile_interval
 from filtergym.papers.grid import markdown_table
 from pictures import draw_profiles
-from records import ResultRecord, short_name
+from records import ResultRecord
 from sentence_numbers import Number
 
 from filtergym.reports.tables.terminal_tables import with_interval
@@ -50,7 +51,7 @@ def recorded_scores(records: Sequence[ResultRecord], algorithms: Sequence[str] =
     found: dict[str, dict[str, list[float]]] = {}
     for record in records:
         data = record.data
-        environment, names = short_name(data["environment"]), {name: own for name, own, *_ in data["runs"]}
+        environment, names = bare_name(data["environment"]), {name: own for name, own, *_ in data["runs"]}
         reference = problem_of(data["environment"]).baselines.score_reference
         [(_, numbers), *_] = data["scenarios"].items()
         for name, statistic, against, metric, _, value, *_ in numbers:

@@ -9,9 +9,9 @@ path is record, row and column of a table of text, see :func:`.records.table_cel
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.running.times import ProcessorTime, time_text
-from records import BENCHMARK, FOLDER, SEEDS, read_record, short_name, table_cell
+from records import BENCHMARK, FOLDER, SEEDS, read_record, table_cell
 
 from filtergym.reports.tables.terminal_tables import with_interval
 
@@ -40,7 +40,7 @@ def record_of(path: str) -> str:
     first, _, rest = path.partition("/")
     if first == SEEDS:
         return f"{SEEDS}/{rest.partition('/')[0]}"
-    return f"{BENCHMARK}/{first}" if first in map(short_name, catalogue()) else first
+    return f"{BENCHMARK}/{first}" if first in map(bare_name, catalogue()) else first
 
 
 def number_text(path: str, interval: bool = True, folder: Path = FOLDER) -> str:

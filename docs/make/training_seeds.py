@@ -17,6 +17,7 @@ import numpy
 import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.problem import Problem, problem_of
+from filtergym.envs.engine.catalogue import bare_name
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import check_sendable
@@ -30,7 +31,7 @@ from filtergym.evaluation.storage.dataset import groups_of, windows_of
 from filtergym.evaluation.storage.store import Store, Work
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
-from records import ResultRecord, round_number, short_name
+from records import ResultRecord, round_number
 from scipy.special import stdtrit
 from sentence_numbers import Number
 
@@ -611,7 +612,7 @@ def seeds_overview(records: Sequence[ResultRecord]) -> str:
         best = min(classical, key=lambda name: classical[name][0])
         own["strongest classical"] = f"`{best}` {_percent(classical[best])}"
         own["reference"] = "; ".join(_percent(v) for name, v in opponents.items() if name not in classical)
-        means[short_name(problem.id)] = own
+        means[bare_name(problem.id)] = own
     algorithms = sorted(
         {name for own in means.values() for name in own} - {"strongest classical", "reference"}
     )

@@ -16,7 +16,8 @@ from ..contract.log_format import TrackLog
 from ..contract.task import Task
 from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, ColumnNames, list_names, numbers, read_table, seconds
 from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
-from .recording import Recording, measure_once, side_by_side
+from .recorded_world import measure_once
+from .recording import Recording, side_by_side
 from .truth_files import match_truth, offset_note, read_truth
 
 if TYPE_CHECKING:

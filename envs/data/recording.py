@@ -1,7 +1,7 @@
 """Recorded measurements in place of a simulated world: what sensors really said, replayed to any policy.
 
 A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, what everyone is told of the
-start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`RecordedWorld` in the
+start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`.RecordedWorld` in the
 place of the task's own: an episode replays one recording, which its first uniform number draws. Banks,
 estimators, backends and evaluations know nothing of it.
 
@@ -14,32 +14,16 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy
 
-from ...compiler.functions import map_arrays
-from ..contract.draws import Draws
-from ..contract.model import Model
-from ..contract.observation import Array
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario, Task, named_arrays
 from ..contract.world import World
-
-
-class Replayed(NamedTuple):
-    """Where an episode is in the tables of a recording."""
-
-    number: Array
-    """Of the recording, ``(N,)``, as a float; likewise all that follows."""
-    count: Array
-    """Measurements so far."""
-    first: Array
-    """Column of the first measurement."""
-    last: Array
-    """Column of the last one."""
+from .recorded_world import RecordedWorld, Tables, measure_once
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,12 +288,12 @@ class Recording:
 
     # --- as a world
 
-    def world(self, task: Task) -> "RecordedWorld":
+    def world(self, task: Task) -> RecordedWorld:
         """Return the world that replays this."""
         return RecordedWorld(task, self)
 
     @functools.cached_property
-    def tables(self) -> "Tables":
+    def tables(self) -> Tables:
         """All episodes one after another, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
@@ -438,172 +422,6 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
     )
 
 
-class Tables(NamedTuple):
-    """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
-
-    measurements: Mapping[str, numpy.ndarray]
-    initial: Mapping[str, numpy.ndarray]
-    truth: numpy.ndarray | None
-    seconds: numpy.ndarray
-    first: numpy.ndarray
-    """Column of the first measurement of each recording, ``(E,)``; likewise of the last."""
-    last: numpy.ndarray
-
-
 def _first(values: numpy.ndarray) -> int:
     """Place of the first row that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
-
-
-def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, Any]:
-    """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
-    episodes side by side.
-
-    Args:
-        task: on NumPy arrays.
-        names: of the arrays of a recording; where one is of a field that only recordings hold, the measurement has
-            these fields, too.
-    """
-    world = task.World(task)
-    draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
-    truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
-    bank = Model(task, task.controls[0]).filter
-    feedback = bank.feedback(bank.start(initial), initial)
-    row = numpy.zeros((world.normals + world.row_uniforms, 8))
-    row[world.normals :] = 0.5
-    measurement = world.advance(truth, row, feedback)[1]
-    whole = world.add_recorded_fields(measurement)
-    further = {name for name, _ in named_arrays(whole)} - {name for name, _ in named_arrays(measurement)}
-    return initial, whole if further & {*names} else measurement, feedback
-
-
-def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; arguments as of :func:`measure_examples`.
-
-    Raises:
-        ValueError: if what is measured depends on what is estimated.
-    """
-    initial, measurement, feedback = measure_examples(task, names)
-    if feedback is not None:
-        raise ValueError(
-            f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
-            "what the sensors said to one estimate is not what they would have said to another, and can be neither "
-            "recorded nor replayed"
-        )
-    return initial, measurement
-
-
-def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
-    """Put other arrays into nested NamedTuples, in the types of their own.
-
-    Args:
-        like: a measurement, or an initial estimate.
-        values: array of a name, as of :func:`~.task.named_arrays`.
-        xp: array namespace.
-    """
-    names = iter([name for name, _ in named_arrays(like)])
-
-    def fill(part: Any) -> Any:
-        array = values(next(names))
-        if part.dtype.kind == "b":
-            return array > 0.5
-        return xp.astype(array, xp.int64) if part.dtype.kind in "iu" else array
-
-    return map_arrays(fill, like)
-
-
-class RecordedWorld(World[Task, Replayed, Any]):
-    """What the sensors said, in place of a task's own world."""
-
-    initial_normals = 1
-    normals = 1
-
-    def __init__(self, task: Task, recording: Recording) -> None:
-        super().__init__(task)
-        self.recording = recording
-        self.simulated = task.World(task)
-        """The task's own world, which knows what an error costs."""
-        plain = type(task)(task.parameters)
-        self._initial, self._measurement = measure_once(plain, recording.measurements)
-        tables = recording.tables
-        # Tables of NumPy are read by compiled code as they are.
-        kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
-        self.tables = Tables(
-            {name: kept(values) for name, values in tables.measurements.items()},
-            {name: kept(values) for name, values in tables.initial.items()},
-            None if tables.truth is None else kept(tables.truth),
-            kept(tables.seconds),
-            kept(tables.first),
-            kept(tables.last),
-        )
-
-    def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
-        """Draw a recording, and tell of its start."""
-        number = draws.integer("recording", (0, len(self.recording.names) - 1))
-        first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
-        initial = self._fill(self._initial, self.tables.initial, number)
-        return Replayed(number, 0.0 * number, first, last), initial
-
-    def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
-        """Go on to the next measurement; at the end the last one is said again."""
-        truth = truth._replace(count=truth.count + 1.0)
-        return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
-
-    def mask_missing(self, measurement: Any) -> Any:
-        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
-        return self.simulated.mask_missing(measurement)
-
-    def component_readings(self, measurement: Any) -> Array | None:
-        """What it says of the components, as in the task's own world."""
-        return self.simulated.component_readings(measurement)
-
-    def component_deviations(self, measurement: Any) -> Array | None:
-        """What is stated of the errors of that, likewise."""
-        return self.simulated.component_deviations(measurement)
-
-    def all_observations(self) -> tuple[Array | None, Array | None]:
-        """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
-        ``(C, measurements)``; None where it is no component.
-        """
-        columns = self.xp.arange(self.tables.seconds.shape[-1])
-        measurement = self._fill(self._measurement, self.tables.measurements, columns)
-        return self.simulated.component_readings(measurement), self.simulated.component_deviations(
-            measurement
-        )
-
-    def _column(self, truth: Replayed) -> Array:
-        """Of the measurement at hand."""
-        xp = self.xp
-        return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
-
-    def _at(self, table: Array, column: Array) -> Array:
-        """Entries of a table, ``(..., N)``."""
-        return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
-
-    def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
-        """A NamedTuple of arrays as one that was measured, from the tables."""
-        return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
-
-    def state(self, truth: Replayed) -> Array:
-        """True values of the task's components, ``(C, N)``.
-
-        Raises:
-            ValueError: if the recording has none.
-        """
-        if self.tables.truth is None:
-            raise ValueError(
-                f"recording {self.recording.name!r} has no truth, so there is no error and no cost"
-            )
-        return self._at(self.tables.truth, self._column(truth))
-
-    def error_cost(self, error: Array) -> Array:
-        """What it costs in the task's own world."""
-        return self.simulated.error_cost(error)
-
-    def records(self, truth: Replayed) -> dict[str, Array]:
-        """Time since the start of the track, s."""
-        return {"seconds": self._at(self.tables.seconds, self._column(truth))}
-
-    def context(self, truth: Replayed) -> dict[str, Array]:
-        """Which recording it is."""
-        return {"recording": truth.number}

@@ -212,6 +212,11 @@ def short_name(id: str) -> str:
     return id.removeprefix("filtergym/").replace("/", "-")
 
 
+def bare_name(id: str) -> str:
+    """Gymnasium id without its namespace and version, as tables and pages call an environment."""
+    return id.rpartition("/")[2].removesuffix("-v0")
+
+
 def parameter_names(cls: "type[Task]") -> list[str]:
     """Names of the keywords that an environment takes besides control, scenario and reward."""
     return [f.name for f in dataclasses.fields(cls.Parameters)]

@@ -241,7 +241,6 @@ class KalmanNetBank(KalmanBank):
         sigma = numpy.sqrt(numpy.diag(usual))
         self.deviations = task.constant(sigma)[:, None]
         self.scales = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
-        self.sensor_scale = task.constant(1.0 / numpy.sqrt(numpy.diag(self.equations.model.R)))[:, None]
 
     @property
     def answers(self) -> Sequence[str]:

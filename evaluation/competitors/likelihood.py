@@ -18,7 +18,8 @@ from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
-from ...envs.data.recording import Recording, fill_arrays, measure_once
+from ...envs.data.recorded_world import fill_arrays, measure_once
+from ...envs.data.recording import Recording
 from ...envs.engine.compiled import AVAILABLE, warn_of
 from .kinds import Likelihood
 

@@ -15,7 +15,7 @@ import numpy
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.parameters import check_integer
-from ...envs.data.recording import measure_examples
+from ...envs.data.recorded_world import measure_examples
 from ...envs.engine.stepper import filter_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS

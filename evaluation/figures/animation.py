@@ -1,6 +1,5 @@
 """Animated pictures of an episode, under whatever estimates, for documentation and to look at a bad one."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,22 +50,19 @@ def episode_frames(
     if kind == "bound":
         raise ValueError(f"{name!r} is a bound: it estimates nothing that could be drawn")
     keywords = {**getattr(competitor, "task_keywords", {}), **keywords}
-    draw = _policy_frames if kind == "policy" else _estimate_frames
-    return draw(task, name, competitor, scenario, seed, every, keywords)
+    if kind == "policy":
+        control = control_of(competitor, kind, None, task, name)
+        world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
+        return _policy_frames(world, name, competitor, seed, every)
+    model, chosen = (
+        make_model(task, task.controls[0], scenario, **keywords),
+        find_scenario(task, scenario, keywords),
+    )
+    return _estimate_frames(model, chosen.name, name, competitor, seed, every)
 
 
-def _policy_frames(
-    task: type[Task],
-    name: str,
-    policy: Any,
-    scenario: Any,
-    seed: int,
-    every: int,
-    keywords: Mapping[str, Any],
-) -> list[Image.Image]:
-    """Draw an episode as the environment does."""
-    control = control_of(policy, "policy", None, task, name)
-    world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
+def _policy_frames(world: TaskEnv, name: str, policy: Any, seed: int, every: int) -> list[Image.Image]:
+    """Draw an episode as the environment does, which is closed after it."""
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
     actor = SteppingPolicy(world.model, make_competitor(policy, world.model))
@@ -84,26 +80,19 @@ def _policy_frames(
 
 
 def _estimate_frames(
-    task: type[Task],
-    name: str,
-    estimator: Any,
-    scenario: Any,
-    seed: int,
-    every: int,
-    keywords: Mapping[str, Any],
+    model: Model, scenario: str, name: str, estimator: Any, seed: int, every: int
 ) -> list[Image.Image]:
     """Draw the estimates of a filter of its own, which is shown no observation and takes no action."""
     # They bring matplotlib.
     from ...envs.drawing.estimate_picture import EstimatePicture
     from ...envs.drawing.rendering import EpisodePicture
 
-    kind, chosen = kind_of(estimator), find_scenario(task, scenario, keywords)
-    model = make_model(task, task.controls[0], scenario, **keywords)
+    kind = kind_of(estimator)
     length = int(model.task.lengths(uniforms_of_seeds([seed], model.task.noise))[0])
     found = run_competitor(model, estimator, kind, [seed], _picture_track)
     track = {key: values[0, :length] for key, values in found.items()}
     drawn = EstimatePicture(model, track)
-    picture = EpisodePicture(model, chosen.name, "rgb_array", 1.0, drawn)
+    picture = EpisodePicture(model, scenario, "rgb_array", 1.0, drawn)
     picture.caption = f"{kind} {name}"
     frames, step = [], every * model.task.decision_interval
     for k in range(length):

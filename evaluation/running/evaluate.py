@@ -3,7 +3,6 @@
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,23 +11,20 @@ import cloudpickle
 import gymnasium
 import numpy
 
-from ...envs.contract.model import Episode, Model
+from ...envs.contract.model import Model
 from ...envs.contract.parameters import check_integer
 from ...envs.contract.task import Scenario, Task
-from ...envs.data.recording import Recording
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
-from ...envs.engine.programs import Report
-from ...envs.engine.reward import charge
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
-from ...filters.gaussian import log_density
 from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
-from ..statistics.cause_split import VARIABLE, cause_coords
 from ..statistics.innovations import with_innovations
-from ..storage.dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
+from ..storage.dataset import FAULTS, group_of_each
+from .kept import DRAWN_PREFIX, Kept, limits
+from .named_axes import recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
@@ -37,11 +33,6 @@ from .times import with_times
 
 if TYPE_CHECKING:
     import xarray
-
-LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
-"""Names of blocks of an observation that show the action before."""
-DRAWN_PREFIX = "drawn_"
-"""Begins the names of what is kept of the first episodes only."""
 
 
 def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
@@ -92,66 +83,6 @@ def check_observation(model: Model, policy: Any, name: str) -> None:
             f"{len(model.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
             "of its run, which does"
         )
-
-
-def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept of every measurement, arrays ``(..., N)``."""
-    error = model.error(episode)
-    return {
-        "error": error,
-        "cost": model.cost(episode),
-        "charge": charge(model, episode),
-        "causes": model.causes(episode),
-        **_normalised_error(model, error, model.covariance(episode)),
-        **model.records(episode),
-    }
-
-
-def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
-    """Normalised squared error of the components whose truth is known, with their marginal covariance.
-
-    Args:
-        model: task with a filter.
-        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known.
-        covariance: reported for it, ``(C, C, N)``.
-
-    Returns:
-        ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
-        known, ``nees_degrees``.
-    """
-    if model.task.has_whole_truth:
-        return {"nees": log_density(error, covariance)[1]}
-    xp = model.task.xp
-    known = error == error  # no number differs from itself
-    # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
-    pairs = known[:, None] & known[None]
-    apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]
-    squared = log_density(xp.where(known, error, 0.0), xp.where(pairs, covariance, apart))[1]
-    degrees = xp.sum(xp.where(known, 1.0, 0.0), axis=0)
-    return {"nees": xp.where(degrees > 0.0, squared, math.nan), "nees_degrees": degrees}
-
-
-@dataclass(frozen=True)
-class Kept:
-    """What is kept of every measurement of a competitor, as a report on a model and its episodes."""
-
-    tracks: bool = False
-    """What a track is drawn from, too."""
-    drawings: bool = False
-    """What a picture of a track shows, too, under names that begin with :data:`DRAWN_PREFIX`."""
-
-    def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
-        """Report it, arrays ``(..., N)``; of the truth nothing where it is not known."""
-        found = _measurement_report(model, episode) if model.task.has_truth else model.records(episode)
-        if self.drawings:
-            shown = model.picture_track(episode)
-            found |= {f"{DRAWN_PREFIX}{name}": values for name, values in shown.items()}
-        return {**found, **model.track(episode)} if self.tracks else found
-
-
-def _limits(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept of a bound."""
-    return model.filter.records(episode.filter, episode.measurement)
 
 
 OPTIONS = (
@@ -316,7 +247,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     kept, drawn = Kept(experiment.tracks), None
-    report: Report = _limits if kind == "bound" else kept
+    report: Report = limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
@@ -415,7 +346,7 @@ class Plan(NamedTuple):
     ) -> "xarray.Dataset":
         """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
         experiment = self.experiment
-        dataset = _dataset(per_policy, self, seeds)
+        dataset = with_named_axes(per_policy, self, seeds)
         if self.flown is not None and self.lengths is not None:
             import xarray
 
@@ -432,7 +363,7 @@ class Plan(NamedTuple):
             )
             if self.scenario.recording is not None:
                 dataset = dataset.assign_coords(
-                    _recording_coords(self.scenario.recording, self.flown, dataset)
+                    recording_coords(self.scenario.recording, self.flown, dataset)
                 )
                 dataset = with_innovations(dataset, next(iter(self.models.values())).task)
         return dataset.assign_attrs(
@@ -442,30 +373,6 @@ class Plan(NamedTuple):
             recorded=int(self.scenario.recording is not None),
             truth=int(next(iter(self.models.values())).task.has_truth),
         )
-
-
-def _recording_coords(
-    recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
-) -> dict[str, Any]:
-    """What the evaluation of a recording says of its log.
-
-    Args:
-        recording: that is replayed.
-        episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
-        dataset: the evaluation.
-
-    Returns:
-        Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
-        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth
-        of some is not known.
-    """
-    length = dataset.sizes["time"]
-    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
-    if recording.log_time is not None:
-        coords["log_time"] = (("episode", "time"), recording.log_time[episodes, :length])
-    if recording.truth is not None and not recording.truth_known.all():
-        coords["truth_known"] = ("component", recording.truth_known.astype(numpy.int32))
-    return coords
 
 
 def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
@@ -569,131 +476,3 @@ def _flights_in_turn(
                 lengths.append(int(length))
         first += share * count
     return found, numpy.array(flown), numpy.array(lengths)
-
-
-def _further_dimensions(key: str, count: int) -> list[str]:
-    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
-    if count < 0:
-        return []
-    key = key.removeprefix(DRAWN_PREFIX)
-    if key == "covariance":
-        return ["component", "other_component"]
-    if key in ("error", "mean_square", "truth", "estimate", "seen"):
-        return ["component"]
-    if key.startswith("measurement_"):
-        return [f"{key}_axis{i}" for i in range(count + 1)]
-    return ["mode" if "mode" in key else key]
-
-
-def action_names(model: Model, count: int) -> tuple[str, ...]:
-    """Names of the components of a box of actions.
-
-    As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
-    for each; else the control, with numbers from 1 on where there are several.
-    """
-    shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
-    for names in (*shown, model.task.modes):
-        # A number alone says less than the hypothesis's name.
-        if len(names) == count and not any(str(name).isdigit() for name in names):
-            return tuple(str(name).replace("-", "_") for name in names)
-    return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
-
-
-def _actions_named(
-    per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
-    controls: Mapping[str, str],
-    models: Mapping[str, Model],
-) -> dict[str, tuple[str, ...]]:
-    """Names of the actions of every policy that has any; of their control too, where they steer by several."""
-    acting = [name for name, series in per_policy.items() if "action" in series]
-    several = len({controls[name] for name in acting}) > 1
-    found = {name: action_names(models[name], per_policy[name]["action"].shape[-1]) for name in acting}
-    if several:
-        return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
-    return found
-
-
-def _actions_aligned(
-    per_policy: Mapping[str, Mapping[str, numpy.ndarray]], actions: Mapping[str, tuple[str, ...]]
-) -> numpy.ndarray:
-    """Actions side by side, ``(policy, episode, time, name)``; NaN where a policy does not steer by that."""
-    every = list(dict.fromkeys(sum(actions.values(), ())))
-    episodes, length = per_policy[next(iter(actions))]["action"].shape[:2]
-    aligned = numpy.full((len(per_policy), episodes, length, len(every)), numpy.nan)
-    for i, (name, series) in enumerate(per_policy.items()):
-        if name in actions:
-            aligned[i][..., [every.index(part) for part in actions[name]]] = series["action"]
-    return aligned
-
-
-def _dataset(
-    per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
-) -> "xarray.Dataset":
-    import xarray
-
-    kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
-    model = next(iter(models.values()))
-    names = list(per_policy)
-    components = [c.name for c in model.task.components]
-    times = numpy.arange(1, model.task.horizon + 1)
-    variables: dict[str, Any] = {}
-    actions = _actions_named(per_policy, controls, models)
-    for key in sorted({key for series in per_policy.values() for key in series}):
-        if key == "action":
-            variables[key] = (
-                ["policy", "episode", "time", "action_name"],
-                _actions_aligned(per_policy, actions),
-            )
-            continue
-        example = next(series[key] for series in per_policy.values() if key in series)
-        stacked = numpy.empty((len(names), *example.shape))
-        for i, name in enumerate(names):
-            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
-        dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
-        dims += _further_dimensions(key, example.ndim - 3)
-        variables[key] = (dims, stacked)
-    dataset = xarray.Dataset(
-        variables,
-        coords={
-            "policy": names,
-            "kind": ("policy", [kinds[n] for n in names]),
-            "control": ("policy", [controls[n] for n in names]),
-            "episode": numpy.arange(len(seeds)),
-            "episode_seed": ("episode", [str(seed) for seed in seeds]),
-            "time": times,
-            "component": components,
-            "unit": ("component", [c.unit for c in model.task.components]),
-            "group": ("component", group_of_each(components, model.task.groups)),
-        },
-        attrs={
-            "environment": model.task.id,
-            "scenario": scenario.name,
-            "keywords": keywords_as_text(plan.experiment.keywords),
-            "split": plan.experiment.split,
-            "seed": whole_number(plan.experiment.seed),
-            "cost": model.task.cost_description,
-        },
-    )
-    if model.task.interval is not None:
-        elapsed = (
-            "time",
-            model.task.interval * times,
-            {"units": "s", "long_name": "since the start of the track"},
-        )
-        dataset = dataset.assign_coords(elapsed=elapsed)
-    windows = {
-        name: (first, min(last, model.task.horizon))
-        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
-        if first <= model.task.horizon
-    }
-    dataset = with_windows(dataset, windows)
-    if "mode_probability" in dataset:
-        dataset = dataset.assign_coords(mode=list(model.task.modes))
-    if VARIABLE in dataset:
-        causes = model.task.causes
-        dataset = dataset.assign_coords(
-            cause_coords([c.name for c in causes], [c.phrase for c in causes], model.task.start_measurements)
-        )
-    if actions:
-        dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
-    return dataset

@@ -9,7 +9,8 @@ from ...envs.contract.filter import Filter, Initial, Input
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task, named_arrays
 from ...envs.data.foreign_files import MOST_NUMBERS
-from ...envs.data.recording import Recording, measure_once
+from ...envs.data.recorded_world import measure_once
+from ...envs.data.recording import Recording
 from ...envs.data.recording_files import differing
 from ...envs.engine.backend import make_model
 from ...envs.engine.episode_noise import uniforms_of_seeds

@@ -15,7 +15,8 @@ from ..statistics.bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
 from ..statistics.statistic import Reduction, Statistic, reduce_run
 from ..storage.store import Store, Work
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
-from .evaluate import DRAWN_PREFIX, Experiment, check_sendable, plan_of, run_piece
+from .evaluate import Experiment, check_sendable, plan_of, run_piece
+from .kept import DRAWN_PREFIX
 from .metrics import Contender, Record, contender_of, record_statistics, records_of
 from .own_metrics import OwnMetrics
 from .parallel import Workers

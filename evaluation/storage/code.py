@@ -33,16 +33,23 @@ def files_digest(folders: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
+def library_versions(libraries: Iterable[str]) -> dict[str, str]:
+    """Return the versions of those that are installed, by name."""
+    versions = {}
+    for library in libraries:
+        try:
+            versions[library] = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
 @functools.cache
 def code_digest() -> str:
     """Return a digest of the package's files and of the versions of Python and of what it computes with.
 
     A process has one: what is edited later it does not run.
     """
-    versions = [python_version()]
-    for library in LIBRARIES:
-        try:
-            versions.append(metadata.version(library))
-        except metadata.PackageNotFoundError:
-            versions.append("")
+    installed = library_versions(LIBRARIES)
+    versions = [python_version(), *(installed.get(library, "") for library in LIBRARIES)]
     return hashlib.sha256(f"{versions} {files_digest(package_folders())}".encode()).hexdigest()

@@ -7,7 +7,8 @@ import typer
 
 from ..agents import training_run
 from ..agents.settings import parse_settings
-from ..agents.training_run import RunOptions, Session
+from ..agents.training_run import RunOptions
+from ..agents.training_session import Session
 from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 from ..agents import training_run
 from ..agents.settings import THROUGH_THE_FILTER
-from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
+from ..agents.training_run import RunOptions, TrainingRun, best_agent
+from ..agents.training_session import Session
 from ..baselines.problem import Problem
 from ..evaluation.running.parallel import Workers
 from ..reports.tables import standing

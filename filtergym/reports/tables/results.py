@@ -6,7 +6,6 @@ The file holds numbers and names: who reads it executes nothing of it, and needs
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from platform import python_version
 from typing import Any, NamedTuple
@@ -14,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
+from ...envs.engine.catalogue import bare_name
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
+from ...evaluation.storage.code import library_versions
 from ...evaluation.storage.files import write_text
 from ...evaluation.storage.stored import read_json, restore
 from ...evaluation.storage.stored_dataset import dataset_as_json, dataset_from_json
@@ -104,18 +105,12 @@ class Result(NamedTuple):
     @property
     def short(self) -> str:
         """Environment without its namespace and version."""
-        return self.environment.rpartition("/")[2].removesuffix("-v0")
+        return bare_name(self.environment)
 
 
 def settings_of(command: str) -> Settings:
     """Return a command with the versions of what runs it."""
-    versions = {"Python": python_version()}
-    for library in LIBRARIES:
-        try:
-            versions[library] = metadata.version(library)
-        except metadata.PackageNotFoundError:
-            continue
-    return Settings(command, versions)
+    return Settings(command, {"Python": python_version(), **library_versions(LIBRARIES)})
 
 
 def select_competitors(

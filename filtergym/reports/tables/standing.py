@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy
 from rich.table import Table
 
-from ...agents import training_run
+from ...agents import validation
 from ...agents.named_policies import find_learned_policy
-from ...agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
+from ...agents.training_run import Passed, TrainingRun
+from ...agents.validation import TrainingEpisodes, validation_backend
 from ...envs.contract.model import Episode, Model
 from ...evaluation.competitors.kinds import RandomPolicy
 from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
@@ -39,7 +40,7 @@ class Standing(NamedTuple):
     role: str
     means: Mapping[str, numpy.ndarray]
     """``cost`` and ``anees`` of every episode, ``(episodes,)``."""
-    beat_paper: training_run.Passed | None = None
+    beat_paper: Passed | None = None
     """When an agent was first better than the paper's algorithm."""
 
 
@@ -54,7 +55,7 @@ class Opponents:
         self.problem = run.problem
         known = self.problem.baselines
         self.paper = known.score_paper
-        self.episodes = TrainingEpisodes(run, training_run.VALIDATION_EPISODES, validation_backend(run))
+        self.episodes = TrainingEpisodes(run, validation.VALIDATION_EPISODES, validation_backend(run))
         self.found: list[Standing] = []
         if self.paper:
             self._fly(self.paper, "paper")

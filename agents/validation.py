@@ -1,0 +1,121 @@
+"""Validation of what is trained, on the validation split, beside the paper's algorithm."""
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy
+
+from ..envs.contract.model import Episode, Model
+from ..envs.engine.backend import make_model
+from ..envs.engine.scenario_choice import find_mixture
+from ..evaluation.competitors.kinds import kind_of
+from ..evaluation.running.rollout import run_competitor
+from ..evaluation.running.seeds import episode_seeds
+from ..evaluation.statistics.bootstrap import Bootstrap
+from .settings import ESTIMATORS
+from .training_run import TrainingRun, ValidationEntry
+
+VALIDATION_EPISODES = 512
+
+
+def _cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+    return {"cost": model.cost(episode)}
+
+
+class TrainingEpisodes:
+    """Episodes of the validation split under what a run trains on; who flies them is scored.
+
+    Of a mixture, every scenario flies all episodes, and what is measured is weighted as they are: the same expectation
+    with less variance than drawing.
+
+    Args:
+        run: gives environment, scenario, and parameters of the task.
+        episodes: number of episodes.
+        backend: what computes the steps.
+    """
+
+    def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
+        self.problem, self.keywords, self.backend = run.problem, run.task_keywords, backend
+        self.weights = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
+        self.seeds = episode_seeds("validation", 0, episodes)
+        self._models: dict[tuple[str | None, str, str], Model] = {}
+
+    def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
+        """Return a model that is made once: compiling it takes time."""
+        key = control, scenario, repr(keywords)
+        if key not in self._models:
+            cls, parameters = self.problem.task, {**keywords, **self.keywords}
+            self._models[key] = make_model(cls, control, scenario, backend=self.backend, **parameters)
+        return self._models[key]
+
+    def means(
+        self,
+        competitor: Any,
+        control: str | None = None,
+        report: Callable[[Model, Episode], dict[str, numpy.ndarray]] = _cost,
+        episodes: int | None = None,
+    ) -> dict[str, numpy.ndarray]:
+        """Return what is reported, as means over every episode, ``(episodes,)``.
+
+        Args:
+            competitor: policy, estimator or reference, or what makes it.
+            control: in which it acts; default: its own.
+            report: as of :func:`.run_competitor`, with one number for every episode.
+            episodes: fly the first of them only.
+        """
+        kind = kind_of(competitor)
+        control = control or getattr(competitor, "control", None)
+        total: dict[str, Any] = {}
+        for scenario, weight in self.weights.items():
+            model = self._model(control, scenario, getattr(competitor, "task_keywords", {}))
+            series = run_competitor(model, competitor, kind, self.seeds[:episodes], report)
+            for name, values in series.items():
+                mean = numpy.ascontiguousarray(values).mean(axis=1)
+                total[name] = total.get(name, 0.0) + weight * mean
+        return total
+
+    def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
+        """Mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
+        return self.means(competitor, control)["cost"]
+
+
+def validation_backend(run: TrainingRun) -> str:
+    """What computes the steps of a run's validations: policies answer in NumPy arrays, not in torch's."""
+    return "auto" if run.backend == "torch" else run.backend
+
+
+class Validation:
+    """Scores an agent, and the paper's algorithm if there is one, on the same episodes of the validation split.
+
+    Args:
+        run: what is trained.
+    """
+
+    def __init__(self, run: TrainingRun) -> None:
+        self.run = run
+        problem = run.problem
+        self.paper = problem.baselines.score_paper
+        self.bootstrap = Bootstrap(VALIDATION_EPISODES)
+        self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
+        # Once: neither the paper's algorithm nor the episodes change in a run.
+        self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
+
+    def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
+        """Mean cost over the episodes and over every resample of them."""
+        return self.bootstrap.means(self.episodes.costs(policy, control))
+
+    def score(self, policy: Any) -> ValidationEntry:
+        """Return an entry of ``TrainingRun.validation``."""
+        acts = self.run.algorithm not in ESTIMATORS
+        # A maker of its own: what is compiled is kept by it, and the network has changed since the last validation.
+        cost = self._costs(copy.copy(policy), self.run.control if acts else None)
+        entry: ValidationEntry = {"steps": self.run.steps_done, "cost": float(cost[0])}
+        if self.paper is None or self.paper_cost is None:
+            return entry
+        return {
+            **entry,
+            "paper": self.paper,
+            "paper_cost": float(self.paper_cost[0]),
+            "relative_cost_difference": list(self.bootstrap.relative_difference(cost, self.paper_cost)),
+        }

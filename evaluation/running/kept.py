@@ -1,0 +1,72 @@
+"""What is kept of every measurement of an episode, and of the first episodes only."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from ...envs.contract.model import Episode, Model
+from ...envs.engine.reward import charge
+from ...filters.gaussian import log_density
+
+DRAWN_PREFIX = "drawn_"
+"""Begins the names of what is kept of the first episodes only."""
+
+
+def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept of every measurement, arrays ``(..., N)``."""
+    error = model.error(episode)
+    return {
+        "error": error,
+        "cost": model.cost(episode),
+        "charge": charge(model, episode),
+        "causes": model.causes(episode),
+        **_normalised_error(model, error, model.covariance(episode)),
+        **model.records(episode),
+    }
+
+
+def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
+    """Normalised squared error of the components whose truth is known, with their marginal covariance.
+
+    Args:
+        model: task with a filter.
+        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known.
+        covariance: reported for it, ``(C, C, N)``.
+
+    Returns:
+        ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
+        known, ``nees_degrees``.
+    """
+    if model.task.has_whole_truth:
+        return {"nees": log_density(error, covariance)[1]}
+    xp = model.task.xp
+    known = error == error  # no number differs from itself
+    # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
+    pairs = known[:, None] & known[None]
+    apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]
+    squared = log_density(xp.where(known, error, 0.0), xp.where(pairs, covariance, apart))[1]
+    degrees = xp.sum(xp.where(known, 1.0, 0.0), axis=0)
+    return {"nees": xp.where(degrees > 0.0, squared, math.nan), "nees_degrees": degrees}
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of every measurement of a competitor, as a report on a model and its episodes."""
+
+    tracks: bool = False
+    """What a track is drawn from, too."""
+    drawings: bool = False
+    """What a picture of a track shows, too, under names that begin with :data:`DRAWN_PREFIX`."""
+
+    def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
+        """Report it, arrays ``(..., N)``; of the truth nothing where it is not known."""
+        found = _measurement_report(model, episode) if model.task.has_truth else model.records(episode)
+        if self.drawings:
+            shown = model.picture_track(episode)
+            found |= {f"{DRAWN_PREFIX}{name}": values for name, values in shown.items()}
+        return {**found, **model.track(episode)} if self.tracks else found
+
+
+def limits(model: Model, episode: Episode) -> dict[str, Any]:
+    """What is kept of a bound."""
+    return model.filter.records(episode.filter, episode.measurement)

@@ -1,0 +1,179 @@
+"""What was kept of episodes as a dataset, whose axes have names and units."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+from ...envs.contract.model import Model
+from ...envs.data.recording import Recording
+from ..statistics.cause_split import VARIABLE, cause_coords
+from ..storage.dataset import group_of_each, keywords_as_text, whole_number, with_windows
+from .kept import DRAWN_PREFIX
+
+if TYPE_CHECKING:
+    import xarray
+
+    from .evaluate import Plan
+
+LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
+"""Names of blocks of an observation that show the action before."""
+
+
+def recording_coords(
+    recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
+) -> dict[str, Any]:
+    """What the evaluation of a recording says of its log.
+
+    Args:
+        recording: that is replayed.
+        episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
+        dataset: the evaluation.
+
+    Returns:
+        Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
+        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth
+        of some is not known.
+    """
+    length = dataset.sizes["time"]
+    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time[episodes, :length])
+    if recording.truth is not None and not recording.truth_known.all():
+        coords["truth_known"] = ("component", recording.truth_known.astype(numpy.int32))
+    return coords
+
+
+def _further_dimensions(key: str, count: int) -> list[str]:
+    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
+    if count < 0:
+        return []
+    key = key.removeprefix(DRAWN_PREFIX)
+    if key == "covariance":
+        return ["component", "other_component"]
+    if key in ("error", "mean_square", "truth", "estimate", "seen"):
+        return ["component"]
+    if key.startswith("measurement_"):
+        return [f"{key}_axis{i}" for i in range(count + 1)]
+    return ["mode" if "mode" in key else key]
+
+
+def action_names(model: Model, count: int) -> tuple[str, ...]:
+    """Names of the components of a box of actions.
+
+    As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
+    for each; else the control, with numbers from 1 on where there are several.
+    """
+    shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
+    for names in (*shown, model.task.modes):
+        # A number alone says less than the hypothesis's name.
+        if len(names) == count and not any(str(name).isdigit() for name in names):
+            return tuple(str(name).replace("-", "_") for name in names)
+    return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
+
+
+def _actions_named(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
+    controls: Mapping[str, str],
+    models: Mapping[str, Model],
+) -> dict[str, tuple[str, ...]]:
+    """Names of the actions of every policy that has any; of their control too, where they steer by several."""
+    acting = [name for name, series in per_policy.items() if "action" in series]
+    several = len({controls[name] for name in acting}) > 1
+    found = {name: action_names(models[name], per_policy[name]["action"].shape[-1]) for name in acting}
+    if several:
+        return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
+    return found
+
+
+def _actions_aligned(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]], actions: Mapping[str, tuple[str, ...]]
+) -> numpy.ndarray:
+    """Actions side by side, ``(policy, episode, time, name)``; NaN where a policy does not steer by that."""
+    every = list(dict.fromkeys(sum(actions.values(), ())))
+    episodes, length = per_policy[next(iter(actions))]["action"].shape[:2]
+    aligned = numpy.full((len(per_policy), episodes, length, len(every)), numpy.nan)
+    for i, (name, series) in enumerate(per_policy.items()):
+        if name in actions:
+            aligned[i][..., [every.index(part) for part in actions[name]]] = series["action"]
+    return aligned
+
+
+def with_named_axes(
+    per_policy: dict[str, dict[str, numpy.ndarray]], plan: "Plan", seeds: Sequence[int]
+) -> "xarray.Dataset":
+    """Return what was kept of competitors as a dataset, and empty it on the way.
+
+    Args:
+        per_policy: of every competitor, what was kept by its name, ``(episodes, time, ...)``.
+        plan: of the evaluation.
+        seeds: of the episodes.
+    """
+    import xarray
+
+    kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
+    model = next(iter(models.values()))
+    names = list(per_policy)
+    components = [c.name for c in model.task.components]
+    times = numpy.arange(1, model.task.horizon + 1)
+    variables: dict[str, Any] = {}
+    actions = _actions_named(per_policy, controls, models)
+    for key in sorted({key for series in per_policy.values() for key in series}):
+        if key == "action":
+            variables[key] = (
+                ["policy", "episode", "time", "action_name"],
+                _actions_aligned(per_policy, actions),
+            )
+            continue
+        example = next(series[key] for series in per_policy.values() if key in series)
+        stacked = numpy.empty((len(names), *example.shape))
+        for i, name in enumerate(names):
+            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
+        dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
+        dims += _further_dimensions(key, example.ndim - 3)
+        variables[key] = (dims, stacked)
+    dataset = xarray.Dataset(
+        variables,
+        coords={
+            "policy": names,
+            "kind": ("policy", [kinds[n] for n in names]),
+            "control": ("policy", [controls[n] for n in names]),
+            "episode": numpy.arange(len(seeds)),
+            "episode_seed": ("episode", [str(seed) for seed in seeds]),
+            "time": times,
+            "component": components,
+            "unit": ("component", [c.unit for c in model.task.components]),
+            "group": ("component", group_of_each(components, model.task.groups)),
+        },
+        attrs={
+            "environment": model.task.id,
+            "scenario": scenario.name,
+            "keywords": keywords_as_text(plan.experiment.keywords),
+            "split": plan.experiment.split,
+            "seed": whole_number(plan.experiment.seed),
+            "cost": model.task.cost_description,
+        },
+    )
+    if model.task.interval is not None:
+        elapsed = (
+            "time",
+            model.task.interval * times,
+            {"units": "s", "long_name": "since the start of the track"},
+        )
+        dataset = dataset.assign_coords(elapsed=elapsed)
+    windows = {
+        name: (first, min(last, model.task.horizon))
+        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
+        if first <= model.task.horizon
+    }
+    dataset = with_windows(dataset, windows)
+    if "mode_probability" in dataset:
+        dataset = dataset.assign_coords(mode=list(model.task.modes))
+    if VARIABLE in dataset:
+        causes = model.task.causes
+        dataset = dataset.assign_coords(
+            cause_coords([c.name for c in causes], [c.phrase for c in causes], model.task.start_measurements)
+        )
+    if actions:
+        dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
+    return dataset
