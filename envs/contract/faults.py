@@ -211,6 +211,37 @@ class Outliers(NamedTuple):
         return xp.where(uniforms[0] < self.probability, self.factor, xp.ones_like(uniforms[0])) * deviation
 
 
+class Glint(Disturbance):
+    """Measurements whose errors are larger than stated, each one on its own, by ``glint_factor`` with
+    ``glint_probability``; nobody says so. Its state is the standard deviation of this measurement's errors over that of
+    usual ones, ``(N,)``; the world's truth counts ``scan``.
+    """
+
+    name = "glint"
+
+    def __init__(self, task: "Task") -> None:
+        super().__init__(task)
+        self.outliers = Outliers(self.parameters.glint_probability, self.parameters.glint_factor)
+        self.row_uniforms = self.outliers.row_uniforms
+
+    @classmethod
+    def is_in(cls, parameters: Any) -> bool:
+        """Whether any measurement may be one."""
+        return bool(parameters.glint_probability > 0.0)
+
+    def begin(self, draws: Draws, normals: Array, truth: Any) -> Array:
+        """Start with a usual one."""
+        return self.xp.ones_like(truth.scan, dtype=self.xp.float64)
+
+    def advance(self, state: Array, interval: Array, numbers: Numbers) -> Array:
+        """Draw whether this is one."""
+        return self.outliers.amplify(self.xp.ones_like(state), numbers.uniforms, self.xp)
+
+    def change_errors(self, state: Array, errors: Array) -> Array:
+        """Enlarge them."""
+        return state * errors
+
+
 class GaussMarkov(NamedTuple):
     """Coloured error of a sensor, ``e_k = psi e_{k-1} + sigma sqrt(1 - psi^2) n`` (first-order Gauss-Markov):
     multipath, the atmosphere, a reference that wanders. It is stationary from the start.

@@ -7,41 +7,10 @@ deviations. Nobody says any of it.
 from typing import Any, NamedTuple
 
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, GaussMarkov, Numbers, Outliers
+from ..contract.faults import Disturbance, GaussMarkov, Glint, Numbers
 from ..contract.observation import Array
-from ..contract.task import Task
 from .clutter import Clutter
 from .parameters import ManeuveringTargetParameters
-
-
-class Glint(Disturbance):
-    """Scans whose errors are larger. Its state is the standard deviation of this scan's errors over that of usual ones,
-    ``(N,)``.
-    """
-
-    name = "glint"
-
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.outliers = Outliers(self.parameters.glint_probability, self.parameters.glint_factor)
-        self.row_uniforms = self.outliers.row_uniforms
-
-    @classmethod
-    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
-        """Whether any scan may be one."""
-        return parameters.glint_probability > 0.0
-
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> Array:
-        """Start with a usual scan."""
-        return self.xp.ones_like(truth.scan)
-
-    def advance(self, state: Array, interval: Array, numbers: Numbers) -> Array:
-        """Draw whether this scan is one."""
-        return self.outliers.amplify(self.xp.ones_like(state), numbers.uniforms, self.xp)
-
-    def change_errors(self, state: Array, errors: Array) -> Array:
-        """Enlarge them."""
-        return state * errors
 
 
 class Colour(NamedTuple):
