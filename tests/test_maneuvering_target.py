@@ -562,8 +562,8 @@ class TestNoTruth:
             place = probe.position
             sigma = np.sqrt(np.stack([variances(x, y) for x, y in place.T], axis=1))
             row = (state.measurement.position - place) / sigma
-            if probe.coloured is not None:  # that part of the error is the same for both
-                row = row - probe.coloured.level
+            if "coloured" in probe.disturbances:  # that part of the error is the same for both
+                row = row - probe.disturbances["coloured"].level
             other = model.measure(other, np.concatenate([row, scan]))
             missed += (state.measurement.available == 0.0).sum()
             assert (abs(other.truth.position - state.truth.position) > 1000.0).any(

@@ -42,6 +42,8 @@ def roll(model, noise, policy=None):
 
 
 def leaves(value):
+    if isinstance(value, dict):
+        value = tuple(value.values())
     if isinstance(value, tuple):
         for item in value:
             yield from leaves(item)
@@ -333,6 +335,8 @@ def test_lanes_do_not_know_their_neighbours(scenario):
     first = numpy.arange(16) < 8
 
     def merged(a, b):
+        if isinstance(a, dict):
+            return {name: merged(x, b[name]) for name, x in a.items()}
         if isinstance(a, tuple):
             return type(a)(*(merged(x, y) for x, y in zip(a, b, strict=True)))
         return numpy.where(first, a, b)

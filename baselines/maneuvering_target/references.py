@@ -45,8 +45,8 @@ class KnownTurn(KalmanModel):
     def start(self, initial: Initial, truth: Truth) -> TurnMemory:
         """Start where everyone starts; a coloured error is stationary from the start."""
         mean, covariance = initial
-        if truth.coloured is not None:
-            none, variance = 0.0 * mean[:2], truth.coloured.deviation**2
+        if "coloured" in truth.disturbances:
+            none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
             mean = self.xp.concat([mean, none])
             covariance = self.block_diagonal(covariance, self.identity * variance)
         return TurnMemory(mean, covariance, truth)
@@ -65,7 +65,7 @@ class KnownTurn(KalmanModel):
         self, measurement: Measurement, truth: Truth, memory: TurnMemory
     ) -> tuple[Array, Array, TurnMemory, Likelihood]:
         """Predict with what is known of the flight since the scan before, and update with the measured position."""
-        xp, world = self.xp, self.task.world
+        xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
         early = None
         if truth.scans is not None and memory.truth.scans is not None:
@@ -81,20 +81,19 @@ class KnownTurn(KalmanModel):
             truth.position, self.task.parameters.range_sigma, world.bearing_sigma
         )
         sigma = xp.sqrt(variance)
-        if truth.clutter is not None:
-            measurement = measurement._replace(**truth.clutter.echo._asdict())
-        if truth.bias is not None:
-            measurement = measurement._replace(position=measurement.position - sigma * truth.bias)
-        if truth.coloured is not None:
-            process = GaussMarkov.sampled(
-                truth.coloured.deviation, truth.coloured.correlation_time, measurement.interval, xp
-            )
+        if "clutter" in disturbances:
+            measurement = measurement._replace(**disturbances["clutter"].echo._asdict())
+        if "bias" in disturbances:
+            measurement = measurement._replace(position=measurement.position - sigma * disturbances["bias"])
+        if "coloured" in disturbances:
+            colour = disturbances["coloured"]
+            process = GaussMarkov.sampled(colour.deviation, colour.correlation_time, measurement.interval, xp)
             F = self.block_diagonal(F, self.identity * process.decay)
             Q = self.block_diagonal(Q, self.identity * process.kick**2)
             offset = xp.concat([offset, 0.0 * sigma])
             H = xp.concat([H + 0.0 * sigma[0], self.identity * sigma], axis=1)
-        if truth.error_factor is not None:
-            variance = truth.error_factor**2 * variance
+        if "glint" in disturbances:
+            variance = disturbances["glint"] ** 2 * variance
         predicted = kalman.predict(memory.mean, memory.covariance, F, Q, offset)
         result = self.update_estimate(predicted, measurement._replace(variance=variance), H)
         mean, covariance = result.mean[:4], result.covariance[:4, :4]
@@ -121,6 +120,7 @@ class KnownInputBound(KalmanModel):
         predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])
         variance = polar.cartesian_variances(truth.position, p.range_sigma, world.bearing_sigma)
         P = bounds.posterior_cramer_rao_bound(predicted, self.H, self.identity * variance)
-        available = measurement.available if truth.clutter is None else truth.clutter.echo.available
+        clutter = truth.disturbances.get("clutter")
+        available = measurement.available if clutter is None else clutter.echo.available
         P = self.xp.where(available > 0.0, P, predicted)
         return self.xp.stack([P[i, i] for i in range(4)]), P

@@ -79,7 +79,7 @@ class _KnownDraw:
 
     def white(self, truth: Truth) -> Array:
         """Covariance of this scan's white errors, ``(2, 2, N)``."""
-        (a, b), factor = self.deviations, truth.error_factor**2
+        (a, b), factor = self.deviations, self.task.world.error_factor(truth) ** 2
         cross = a * b * factor * truth.radar_correlation
         return self.matrix([[a * a * factor, cross], [cross, b * b * factor]])
 

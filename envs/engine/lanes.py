@@ -40,9 +40,13 @@ def mean_of(rewards: Sequence[Array]) -> Array:
 
 
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
-    """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples of arrays."""
+    """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples and dictionaries of
+    arrays.
+    """
     if old is None:
         return None
+    if isinstance(old, dict):
+        return {name: _replace_lanes(part, new[name], lanes) for name, part in old.items()}
     if isinstance(old, tuple):
         parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)

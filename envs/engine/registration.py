@@ -215,7 +215,13 @@ def _check_episodes(model: Model) -> None:
 
 
 def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """Arrays of nested tuples, and whatever stands in their place, with names such as "load of the truth"."""
+    """Arrays of nested tuples and dictionaries, and whatever stands in their place, with names such as "load of the
+    truth".
+    """
+    if isinstance(part, dict):
+        for field, value in part.items():
+            yield from _leaves(f"{field} of the {name}", value)
+        return
     if isinstance(part, tuple):
         for field, value in zip(getattr(part, "_fields", range(len(part))), part, strict=True):
             yield from _leaves(f"{field} of the {name}", value)

@@ -2,6 +2,7 @@
 
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment, bins, context_flag
 from ..contract.observation import Array
+from .disturbances import DISTURBANCES
 
 AFTERMATH = 5.0
 """Scans in which a filter recovers from a manoeuvre."""
@@ -38,4 +39,5 @@ CAUSES = (
     MISSED._replace(phrase="where a scan misses the target"),
     OUTLIER,
     *bins("range", "km", "at ranges", RANGE_EDGES, _range),
+    *(kind.cause for kind in DISTURBANCES if kind.cause is not None),
 )

@@ -10,12 +10,12 @@ the same for all: their own estimate and covariance, carried on at constant velo
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...filters import data_association, polar
 from ..contract.draws import Draws
+from ..contract.faults import Disturbance, Numbers
 from ..contract.observation import Array
-from ..contract.task import Task
 from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 
@@ -60,28 +60,24 @@ class ClutterState(NamedTuple):
     """1 if the plot in the gate is not the target's, ``(N,)``."""
 
 
-class Clutter:
+class Clutter(Disturbance):
     """False plots, uniform in a window about the track.
 
-    Args:
-        task: with density, window and gate.
-
-    Attributes:
-        row_uniforms: uniform numbers that a scan takes: place of each plot, their count, and which is the target's.
+    The uniform numbers of a scan: how many there are, which is the target's, and the place of each.
     """
 
-    parameters: ManeuveringTargetParameters
+    name = "clutter"
+    row_uniforms = 2 * PLOT_SLOTS + 2
 
-    def __init__(self, task: Task) -> None:
-        self.parameters, self.xp = task.parameters, task.xp
-        self.row_uniforms = 2 * PLOT_SLOTS + 2 if self.parameters.cluttered else 0
+    @classmethod
+    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+        """Whether there are any."""
+        return parameters.cluttered
 
-    def begin(self, draws: Draws, position: Array) -> ClutterState | None:
+    def begin(self, draws: Draws, normals: Array, truth: Any) -> ClutterState:
         """Draw the density, which the parameters give per square kilometre."""
-        if not self.parameters.cluttered:
-            return None
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
-        return ClutterState(density, 0.0 * density, Echo(position, 0.0 * density), 0.0 * density)
+        return ClutterState(density, 0.0 * density, Echo(truth.position, 0.0 * density), 0.0 * density)
 
     def count(self, uniform: Array, density: Array) -> Array:
         """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
@@ -96,23 +92,16 @@ class Clutter:
             cumulative = cumulative + term
         return count
 
-    def advance(
-        self, state: ClutterState, track: Track, echo: Echo, interval: Array, uniforms: Array
-    ) -> tuple[ClutterState, Plots, tuple[Array, Array, Array, Array]]:
-        """Put false plots beside that of the target, and associate one with the track.
-
-        Args:
-            state: at the scan before.
-            track: of the filter, after the scan before.
-            echo: plot of the target.
-            interval: s since the scan before, ``(N,)``.
-            uniforms: ``(row_uniforms, N)``.
-
-        Returns:
-            The state, the plots, and of the one that is nearest position, variance, whether there is one, and seconds
-            since there was one before.
-        """
-        xp, p = self.xp, self.parameters
+    def change_measurement(
+        self, state: ClutterState, measurement: Any, numbers: Numbers, feedback: Track
+    ) -> tuple[ClutterState, Any]:
+        """Put false plots beside that of the target, and associate one with the track of the filter."""
+        xp, p, uniforms = self.xp, self.parameters, numbers.uniforms
+        track, interval, echo = (
+            feedback,
+            measurement.interval,
+            Echo(measurement.position, measurement.available),
+        )
         elapsed = state.unseen + interval
         centre, covariance = self.predict(track, interval, elapsed)
         offset = xp.abs(echo.position - centre)
@@ -139,7 +128,13 @@ class Clutter:
         variance = xp.where(found, variance, p.range_sigma**2)
         available = xp.astype(found, total.dtype)
         state = ClutterState(state.density, (1.0 - available) * elapsed, echo, available - own)
-        return state, Plots(positions, variances, there), (position, variance, available, elapsed)
+        return state, measurement._replace(
+            position=position,
+            variance=variance,
+            available=available,
+            elapsed=elapsed,
+            plots=Plots(positions, variances, there),
+        )
 
     def predict(self, track: Track, interval: Array, elapsed: Array) -> tuple[Array, Array]:
         """Position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant velocity, but for an
@@ -152,6 +147,10 @@ class Clutter:
         identity = self.xp.eye(2, dtype=P.dtype, device=P.device)[:, :, None]
         return centre, carried + left * identity
 
-    def context(self, state: ClutterState | None) -> dict[str, Array]:
+    def context(self, state: ClutterState) -> dict[str, Array]:
         """False plots per square kilometre."""
-        return {} if state is None else {"clutter_density": 1e6 * state.density}
+        return {"clutter_density": 1e6 * state.density}
+
+    def records(self, state: ClutterState) -> dict[str, Array]:
+        """Whether the plot that the filter was given is false."""
+        return {"false_association": state.false_association}

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from ..contract.causes import OUTLIER, Cause, Moment, bins
 from ..contract.observation import Array
+from .world import DISTURBANCES
 
 AFTERMATH = 20.0
 """Scans after a change of class: 10 s."""
@@ -49,4 +50,5 @@ def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
         Cause("second emitter", "beside a second emitter", _has_second_emitter),
         OUTLIER,
         *bins("range", "km", "at ranges", RANGE_EDGES, lambda moment: moment.state[0] / 1e3),
+        *(kind.cause for kind in DISTURBANCES if kind.cause is not None),
     )

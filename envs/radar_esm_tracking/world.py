@@ -1,20 +1,23 @@
 """The target of RadarEsmTracking, the radar that measures it and the ESM station that listens to it."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws, category, draw_between
-from ..contract.faults import GaussMarkov, Outliers
+from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint
 from ..contract.observation import Array
 from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
 
 if TYPE_CHECKING:
     from .task import RadarEsmTracking
+
+DISTURBANCES: tuple[type[Disturbance], ...] = (Glint,)
+"""Of the radar, beside its correlated and coloured errors; a further one comes last, so that episodes stay."""
 
 
 class Truth(NamedTuple):
@@ -58,8 +61,8 @@ class Truth(NamedTuple):
     """Of the white errors of range and range rate, ``(N,)``."""
     radar_error: Array
     """Coloured errors of range and range rate now, in the same units, ``(2, N)``."""
-    error_factor: Array
-    """Deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there is glint."""
+    disturbances: dict[str, Any]
+    """State of each by its name, of those that the world has."""
 
 
 class Measurement(NamedTuple):
@@ -99,11 +102,14 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def __init__(self, task: "RadarEsmTracking") -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
-        self.glint = Outliers(p.glint_probability, p.glint_factor)
+        self.disturbances = Disturbances.of(task, DISTURBANCES)
         self.radar_is_coloured = p.radar_coloured[1] > 0.0
         further = 2 if self.radar_is_coloured else 0
-        self.initial_normals, self.normals = 5 + further, 7 + further
-        self.row_uniforms = 4 + self.glint.row_uniforms
+        self.own_initial_normals, self.own_normals = 5 + further, 7 + further
+        """Normal numbers that come before those of the disturbances."""
+        self.initial_normals = self.own_initial_normals + self.disturbances.initial_normals
+        self.normals = self.own_normals + self.disturbances.normals
+        self.row_uniforms = 4 + self.disturbances.row_uniforms
         models, start = task.design_models(p)
         # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
         root = numpy.sqrt if p.process_noise == "acceleration" else numpy.linalg.cholesky
@@ -130,7 +136,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
         """Draw the target and its surroundings, measure it and listen to it once."""
-        xp, p = self.xp, self.parameters
+        xp, p, own = self.xp, self.parameters, self.own_initial_normals
         distance = draws.uniform("initial_range", p.initial_range)
         closing_speed = draws.uniform("closing_speed", p.closing_speed)
         target_class = draws.category("target_class", self.class_thresholds)
@@ -181,10 +187,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             radar_decay=wandering.decay,
             radar_kick=wandering.kick,
             radar_correlation=correlation,
-            radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[-2:],
-            error_factor=1.0 + zero,
+            radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[own - 2 : own],
+            disturbances={},
         )
-        first = self._measure(truth, normals[1:3], normals[3:5], draws.unit("first_intercept", 3))
+        truth = truth._replace(disturbances=self.disturbances.begin(draws, normals[own:], truth))
+        truth, first = self._measure(truth, normals[1:3], normals[3:5], draws.unit("first_intercept", 3))
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
 
@@ -201,8 +208,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Fly one scan under the class at the previous one, let the class change and fall silent, and measure.
 
         A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings, 2 for the radar's coloured
-        errors where there are any; uniform ones for the type, the decision, the source, falling silent, and glint where
-        there is any.
+        errors where there are any; uniform ones for the type, the decision, the source and falling silent. Those of the
+        disturbances follow on both.
         """
         xp, p = self.xp, self.parameters
         scan, uniforms = truth.scan + 1, noise[self.normals :]
@@ -230,17 +237,24 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if self.radar_is_coloured:
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
-        if p.glint_probability:
-            factor = self.glint.amplify(xp.ones_like(truth.error_factor), uniforms[4:], xp)
-            truth = truth._replace(error_factor=factor)
-        return truth, self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
+        numbers = self.disturbances.share(noise[self.own_normals : self.normals], uniforms[4:])
+        interval = p.sampling_interval * xp.ones_like(truth.separation)
+        states = self.disturbances.advance(truth.disturbances, interval, numbers)
+        truth = truth._replace(disturbances=states)
+        truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
+        states, measurement = self.disturbances.change_measurement(
+            truth.disturbances, measurement, numbers, feedback
+        )
+        return truth._replace(disturbances=states), measurement
 
     # --- the sensors
 
     def _looks(self, scan: Array) -> Array:
         return scan % self.parameters.esm_period == 0
 
-    def _measure(self, truth: Truth, errors: Array, bearings: Array, uniforms: Array) -> Measurement:
+    def _measure(
+        self, truth: Truth, errors: Array, bearings: Array, uniforms: Array
+    ) -> tuple[Truth, Measurement]:
         """Measure and listen.
 
         Args:
@@ -253,13 +267,13 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if p.radar_correlation != (0.0, 0.0):
             along = truth.radar_correlation
             errors = xp.stack([errors[0], along * errors[0] + xp.sqrt(1.0 - along * along) * errors[1]])
-        if p.glint_probability:
-            errors = truth.error_factor * errors
+        errors = self.disturbances.change_errors(truth.disturbances, errors)
         if self.radar_is_coloured:
             errors = errors + truth.radar_error
         radar = xp.stack(
             [truth.motion[0] + p.range_sigma * errors[0], truth.motion[1] + p.range_rate_sigma * errors[1]]
         )
+        states, radar = self.disturbances.change_reading(truth.disturbances, radar)
         heard_class, heard_type, heard = truth.target_class, truth.emitter_type, truth.radiating
         esm_bearing = p.esm_bearing_sigma * bearings[1]
         if p.second_emitter_probability[1] > 0.0:
@@ -274,15 +288,20 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         heard = heard & looked
         decision = category(uniforms[1], xp.take(self.decision_thresholds, heard_type, axis=1), xp)
         difference = class_fusion.bearing_difference(p.radar_bearing_sigma * bearings[0], esm_bearing)
-        return Measurement(
+        measurement = Measurement(
             scan=truth.scan,
             radar=radar,
             looked=looked,
             decision=xp.where(heard, decision, self.task.types),
             bearing_difference=xp.where(heard, difference, 0.0),
         )
+        return truth._replace(disturbances=states), measurement
 
     # --- how good an estimate is
+
+    def error_factor(self, truth: Truth) -> Array:
+        """Deviation of this scan's white radar errors over the nominal one, ``(N,)``: not 1 where there is glint."""
+        return truth.disturbances.get("glint", self.xp.ones_like(truth.separation))
 
     def state(self, truth: Truth) -> Array:
         """Range, range rate and acceleration, ``(3, N)``."""
@@ -312,6 +331,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """True class and type, and the time."""
         xp = self.xp
         return {
+            **self.disturbances.records(truth.disturbances),
             "true_class": xp.astype(truth.target_class, xp.float64),
             "true_type": xp.astype(truth.emitter_type, xp.float64),
             "seconds": xp.astype(truth.scan, xp.float64) * self.parameters.sampling_interval,
@@ -340,8 +360,9 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             "radar_decay": truth.radar_decay,
             "radar_correlation": truth.radar_correlation,
             "radar_error": truth.radar_error,
-            "error_factor": truth.error_factor,
+            "error_factor": self.error_factor(truth),
             "radiating": xp.astype(truth.radiating, xp.float64),
+            **self.disturbances.context(truth.disturbances),
         }
 
 

@@ -1,0 +1,87 @@
+"""What may go wrong with the radar of ManeuveringTarget, but for the times of its scans: a class for each.
+
+Errors are along x and y, or, where measurements are polar, of range and azimuth, in units of the white ones' standard
+deviations. Nobody says any of it.
+"""
+
+from typing import Any, NamedTuple
+
+from ..contract.draws import Draws
+from ..contract.faults import Disturbance, GaussMarkov, Glint, Numbers
+from ..contract.observation import Array
+from .clutter import Clutter
+from .parameters import ManeuveringTargetParameters
+
+
+class Colour(NamedTuple):
+    """State of :class:`ColouredErrors`."""
+
+    deviation: Array
+    """``(N,)``."""
+    correlation_time: Array
+    """s, ``(N,)``."""
+    level: Array
+    """In this scan, ``(2, N)``."""
+
+
+class ColouredErrors(Disturbance):
+    """Errors that last from scan to scan, beside the white ones."""
+
+    name = "coloured"
+    initial_normals = 2
+    normals = 2
+
+    @classmethod
+    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+        """Whether there may be any."""
+        return parameters.coloured
+
+    def begin(self, draws: Draws, normals: Array, truth: Any) -> Colour:
+        """Draw how large they are and how long they last; they are stationary from the start."""
+        p = self.parameters
+        deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
+        if p.undisturbed:
+            drawn = draws.drawn.get("undisturbed")
+            calm = draws.event("undisturbed", p.undisturbed) if drawn is None else drawn
+            deviation = self.xp.where(calm, 0.0, deviation)
+        return Colour(deviation, draws.uniform("coloured_time", p.coloured_time), deviation * normals)
+
+    def advance(self, state: Colour, interval: Array, numbers: Numbers) -> Colour:
+        """Let them wander."""
+        process = GaussMarkov.sampled(state.deviation, state.correlation_time, interval, self.xp)
+        return state._replace(level=process.advance(state.level, numbers.normals))
+
+    def change_errors(self, state: Colour, errors: Array) -> Array:
+        """Add them."""
+        return errors + state.level
+
+    def context(self, state: Colour) -> dict[str, Array]:
+        """Their standard deviation."""
+        return {"coloured_sigma": state.deviation}
+
+
+class Bias(Disturbance):
+    """Errors that are the same in all scans of an episode; its state, ``(2, N)``."""
+
+    name = "bias"
+
+    @classmethod
+    def is_in(cls, parameters: ManeuveringTargetParameters) -> bool:
+        """Whether there are any."""
+        return parameters.bias > 0.0
+
+    def begin(self, draws: Draws, normals: Array, truth: Any) -> Array:
+        """Draw them."""
+        return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
+
+    def change_errors(self, state: Array, errors: Array) -> Array:
+        """Add them."""
+        return errors + state
+
+    def context(self, state: Array) -> dict[str, Array]:
+        """All of it."""
+        return {"bias": state}
+
+
+DISTURBANCES: tuple[type[Disturbance], ...] = (Glint, ColouredErrors, Bias, Clutter)
+"""In the order in which they take random numbers and act; a further one comes last, so that episodes stay."""
