@@ -7,15 +7,11 @@ import pickle
 
 import gymnasium
 import numpy as np
+from contract import continued
 
 make_three = functools.partial(gymnasium.make_vec, num_envs=3)
 NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
-
-
-def continued(env, actions):
-    """Everything that some steps return."""
-    return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
 
 
 def test_copies_go_on_as_the_original(env_id, short):
