@@ -1,5 +1,6 @@
 """One pass over an environment, a control and a backend, in which many properties are checked by their names."""
 
+import importlib.util
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,10 @@ import numpy as np
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine.catalogue import task_class
 from models import make_model, random_actions, short_episodes
+
+NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
+BACKENDS = [backend for backend, library in NEEDED.items() if importlib.util.find_spec(library)]
+"""Those that work here."""
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,13 @@
 import concurrent.futures
 import copy
 import functools
-import importlib.util
 import multiprocessing
 import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from contract import Subject, assert_properties, continued
+from contract import BACKENDS, Subject, assert_properties, continued
 from filtergym.envs.data.trajectory import Trajectory
 from filtergym.envs.drawing import rendering
 from filtergym.envs.engine.lanes import ModelStepper
@@ -24,8 +23,6 @@ import filtergym  # noqa: F401  (registers the environments)
 
 ID = "filtergym/ManeuveringTarget-v0"
 make_three = functools.partial(gym.make_vec, num_envs=3)
-NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
-BACKENDS = [backend for backend, library in NEEDED.items() if importlib.util.find_spec(library)]
 
 
 def actions_for(env, count, seed=0):
