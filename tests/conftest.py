@@ -13,13 +13,11 @@ import re
 import resource
 from pathlib import Path
 
-import gymnasium as gym
 import hypothesis
-import numpy as np
 import pytest
 from filtergym.envs.engine import compiled
 from filtergym.envs.engine.catalogue import catalogue
-from models import short_episodes
+from models import random_actions, short_episodes
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
@@ -131,20 +129,10 @@ def short(env_id):
     return short_episodes(env_id)
 
 
-@pytest.fixture
-def random_actions():
-    """Draw actions for a batch, each independent of how many others there are."""
-
-    def draw(space, count, step):
-        return np.stack([_one(space, np.random.default_rng([step, i])) for i in range(count)])
-
-    return draw
-
-
-def _one(space, rng):
-    if isinstance(space, gym.spaces.Discrete):
-        return rng.integers(space.n)
-    return rng.uniform(space.low, space.high).astype(space.dtype)
+@pytest.fixture(name="random_actions")
+def _random_actions():
+    """Draw actions for a batch."""
+    return random_actions
 
 
 @pytest.fixture

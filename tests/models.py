@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import backend
@@ -60,3 +61,14 @@ def watch_hypotheses(model: Model, estimator: Any, field: str, no_action: Any) -
     for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
         pass
     return scans, answers
+
+
+def random_actions(space: gymnasium.Space, count: int, step: int) -> np.ndarray:
+    """Draw actions for a batch, each independent of how many others there are."""
+    return np.stack([_action(space, np.random.default_rng([step, i])) for i in range(count)])
+
+
+def _action(space: Any, rng: np.random.Generator) -> Any:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return rng.integers(space.n)
+    return rng.uniform(space.low, space.high).astype(space.dtype)

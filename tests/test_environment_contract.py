@@ -8,13 +8,13 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract import Subject, assert_properties
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine.catalogue import catalogue, register
-from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.evaluation.running.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
-from models import make_model
+from models import make_model, random_actions, short_episodes
 
 from filtergym import evaluate, make_policy
 
@@ -24,30 +24,42 @@ ALLOWED_WARNINGS = (
 )
 
 
-@pytest.mark.with_controls(("detailed_info",), [(False,), (True,)])
-def test_gymnasium_check(env_id, control, detailed_info, short):
-    env = gym.make(env_id, control=control, detailed_info=detailed_info, disable_env_checker=True, **short)
+def test_every_control(env_id, control):
+    assert_properties(Subject(env_id, control), BY_CONTROL)
+
+
+def test_every_environment(env_id):
+    assert_properties(Subject(env_id), BY_ENVIRONMENT)
+
+
+def test_policies_of_every_environment(env_id):
+    assert_properties(Subject(env_id), OF_POLICIES)
+
+
+# --- of every control
+
+
+def passes_gymnasiums_check(subject):
+    drawn = subject.order == 0 or subject.order % 2 == 1  # a second each
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        # Drawn once for each control, and without an option, as its users call it.
-        check_env(env.unwrapped) if not detailed_info else check_env(env.unwrapped, skip_render_check=True)
-    unexpected = [
-        str(w.message) for w in caught if not any(text in str(w.message) for text in ALLOWED_WARNINGS)
-    ]
-    assert unexpected == []
+        # Where it is drawn without an option, as its users call it.
+        check_env(subject.single().unwrapped, **({} if drawn else {"skip_render_check": True}))
+        check_env(subject.single(detailed_info=True).unwrapped, skip_render_check=True)
+    found = [str(warning.message) for warning in caught]
+    assert [text for text in found if not any(allowed in text for allowed in ALLOWED_WARNINGS)] == []
 
 
-def test_observations_lie_in_their_space(env_id, control, short):
+def shows_what_lies_in_its_space(subject):
     """At the edges of the action space, too, where filters are worst."""
-    env = gym.make_vec(env_id, 16, control=control, **short)
+    env = subject.native(16)
     low, high = env.single_observation_space.low, env.single_observation_space.high
     assert np.isfinite([low, high]).all()
     rng = np.random.default_rng(4)
     observation, _ = env.reset(seed=4)
-    for _ in range(env.last_decision):
+    for actions in subject.actions(env, 16, range(env.unwrapped.last_decision)):
         assert (low <= observation).all()
         assert (observation <= high).all()
-        actions = env.action_space.sample()
         if isinstance(env.single_action_space, gym.spaces.Box):
             edge = np.where(rng.random(actions.shape) < 0.5, env.action_space.low, env.action_space.high)
             actions = edge.astype(actions.dtype)
@@ -65,9 +77,9 @@ def run(env, actions, seed=21):
     return np.stack(shown), np.array(paid), truncated
 
 
-def test_bank_needs_nothing_but_the_measurements(env_id, control, short, random_actions):
+def needs_nothing_but_the_measurements(subject):
     """No truth: fed with what the world said, and with nothing else, the bank shows and estimates the same."""
-    model = make_model(env_id, control, **short)
+    model = subject.model()
     rng, episode = np.random.default_rng(3), None
     noise = model.task.noise
     episode = model.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
@@ -86,9 +98,76 @@ def test_bank_needs_nothing_but_the_measurements(env_id, control, short, random_
         np.testing.assert_array_equal(model.filter.covariance(alone), model.covariance(episode))
 
 
-def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
+def is_made_again_from_text_and_ends_at_its_horizon(subject):
+    env = subject.single(scenario="random")
+    copy = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    actions = [action for (action,) in subject.actions(env, 1, range(5))]
+    found = run(env, actions)
+    for one, other in zip(found, run(copy, actions), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert found[2], "the fifth decision is the last"
+    assert not run(env, actions[:4])[2]
+
+
+def names_all_that_it_shows(subject):
+    env = subject.single()
+    fields = env.unwrapped.observation_fields
+    assert len(fields) == env.observation_space.shape[0]
+    assert len({field.name for field in fields}) == len(fields)
+    assert all(field.name and field.unit and field.description for field in fields)
+
+
+def takes_actions_in_their_own_precision(subject):
+    env = subject.single()
+    if isinstance(env.action_space, gym.spaces.Box):  # 0.1 is another number in float32
+        fine = np.full(env.action_space.shape, 0.3)
+        fine[0] = 0.1
+        exact, rounded = (run(env.unwrapped, [action])[0][1] for action in (fine, fine.astype(np.float32)))
+        assert (exact != rounded).any()
+        np.testing.assert_allclose(exact, rounded, rtol=1e-5, atol=1e-5)
+
+
+def leaves_no_door_for_the_truth(subject):
+    doors = {"self", "initial", "state", "measurement", "action"}  # none of them is for the truth
+    for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
+        function = getattr(type(subject.model().filter), name)
+        assert set(inspect.signature(function).parameters) <= doors, name
+
+
+def relative_reward_is_the_difference_of_costs(subject):
+    paper = subject.model().task.paper_policy
+    ours, relative = (subject.native(3, reward=reward) for reward in ("cost", "relative"))
+    theirs = subject.native(3, reward="cost", control=paper.control)
+    for env in (ours, relative, theirs):
+        env.reset(seed=1)
+    paper_action = np.tile(np.asarray(paper.action), (3, 1))
+    for actions in subject.actions(ours, 3, range(5)):
+        mine, difference, papers = (
+            ours.step(actions)[1],
+            relative.step(actions)[1],
+            theirs.step(paper_action)[1],
+        )
+        np.testing.assert_allclose(difference, mine - papers, rtol=1e-12, atol=1e-12)
+
+
+BY_CONTROL = (
+    passes_gymnasiums_check,
+    shows_what_lies_in_its_space,
+    needs_nothing_but_the_measurements,
+    is_made_again_from_text_and_ends_at_its_horizon,
+    names_all_that_it_shows,
+    takes_actions_in_their_own_precision,
+    leaves_no_door_for_the_truth,
+    relative_reward_is_the_difference_of_costs,
+)
+
+
+# --- of every environment
+
+
+def estimate_made_outside_starts_where_everyone_starts(subject):
     """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
-    model = make_model(env_id, **short).with_filter(lambda other: NoFilter(other.task))
+    model = subject.model().with_filter(lambda other: NoFilter(other.task))
     noise = model.task.noise
     episode = model.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
     mean, covariance = episode.measurement.mean, episode.measurement.covariance
@@ -103,111 +182,83 @@ def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
         assert np.isfinite(model.cost(episode)).all()
 
 
-def test_spec_fields_ends_actions_and_doors(env_id, control, short, random_actions):
-    """One pass over an environment: it is made again from text, ends at its horizon, names what it shows."""
-    env = gym.make(env_id, control=control, scenario="random", **short)
-    copy = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    actions = random_actions(env.action_space, 5, 1)
-    found = run(env, actions)
-    for one, other in zip(found, run(copy, actions), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert found[2], "the fifth decision is the last"
-    assert not run(env, actions[:4])[2]
-
-    fields = env.unwrapped.observation_fields
-    assert len(fields) == env.observation_space.shape[0]
-    assert len({field.name for field in fields}) == len(fields)
-    assert all(field.name and field.unit and field.description for field in fields)
-
-    if isinstance(env.action_space, gym.spaces.Box):  # 0.1 is another number in float32
-        fine = np.full(env.action_space.shape, 0.3)
-        fine[0] = 0.1
-        exact, rounded = (run(env.unwrapped, [action])[0][1] for action in (fine, fine.astype(np.float32)))
-        assert (exact != rounded).any()
-        np.testing.assert_allclose(exact, rounded, rtol=1e-5, atol=1e-5)
-
-    doors = {"self", "initial", "state", "measurement", "action"}  # none of them is for the truth
-    for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
-        function = getattr(type(env.unwrapped.model.filter), name)
-        assert set(inspect.signature(function).parameters) <= doors, name
-
-
-def test_parameters_survive_json(env_id):
+def parameters_survive_json(subject):
     # Lists from a file mean the same as tuples from Python.
-    model = make_model(env_id)
+    model = make_model(subject.id)
     values = {
         name: getattr(model.task.parameters, name) for name in model.task.Parameters.__dataclass_fields__
     }
-    again = make_model(env_id, **json.loads(json.dumps(values)))
+    again = make_model(subject.id, **json.loads(json.dumps(values)))
     assert again.task.parameters == model.task.parameters
 
 
-def test_registration_twice_changes_nothing(env_id):
-    before = gym.spec(env_id)
+def registered_twice_it_stays_as_it_is(subject):
+    before = gym.spec(subject.id)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         register()
-    assert gym.spec(env_id) is before
+    assert gym.spec(subject.id) is before
 
 
-def test_spawned_processes(random_actions):
-    # A process that starts afresh imports the package by the name before the colon.
-    env_id, short = "filtergym/ManeuveringTarget-v0", {"horizon": 5}
-    make = partial(gym.make, f"filtergym:{env_id}", disable_env_checker=True, **short)
-    there = gym.vector.AsyncVectorEnv([make], context="spawn")
-    here = gym.make_vec(env_id, num_envs=1, **short)
-    try:
-        np.testing.assert_array_equal(there.reset(seed=8)[0], here.reset(seed=8)[0])
-        for step in range(3):
-            actions = random_actions(here.single_action_space, 1, step)
-            for one, other in zip(there.step(actions)[:4], here.step(actions)[:4], strict=True):
-                np.testing.assert_array_equal(one, other)
-    finally:
-        there.close()
-
-
-def test_one_scenario_is_for_training(env_id):
-    scenarios = catalogue()[env_id].scenarios
+def one_scenario_is_for_training(subject):
+    scenarios = catalogue()[subject.id].scenarios
     assert scenarios["random"].training
     papers = [scenario for name, scenario in scenarios.items() if name.startswith("paper")]
     assert papers
     assert not any(scenario.training for scenario in papers)
 
 
-def test_relative_reward_of_the_papers_algorithm_is_zero(env_id, short):
-    model = make_model(env_id)
-    env = TaskVectorEnv(env_id, 4, control=model.task.paper_policy.control, reward="relative", **short)
+def relative_reward_of_the_papers_algorithm_is_zero(subject):
+    paper = subject.model().task.paper_policy
+    env = subject.native(4, control=paper.control, reward="relative")
     env.reset(seed=0)
-    action = np.tile(np.asarray(model.task.paper_policy.action), (4, 1))
+    action = np.tile(np.asarray(paper.action), (4, 1))
     if isinstance(env.single_action_space, gym.spaces.Discrete):
         action = action[:, 0].astype(int)
     for _ in range(8):
         np.testing.assert_array_equal(env.step(action)[1], 0.0)
 
 
-def test_relative_reward_is_the_difference_of_costs(env_id, control, short, random_actions):
-    model = make_model(env_id)
-    ours, relative = (
-        TaskVectorEnv(env_id, 3, control=control, reward=r, **short) for r in ("cost", "relative")
-    )
-    paper = TaskVectorEnv(env_id, 3, control=model.task.paper_policy.control, reward="cost", **short)
-    for env in (ours, relative, paper):
-        env.reset(seed=1)
-    paper_action = np.tile(np.asarray(model.task.paper_policy.action), (3, 1))
-    for step in range(5):
-        actions = random_actions(ours.single_action_space, 3, step)
-        mine, difference, papers = (
-            ours.step(actions)[1],
-            relative.step(actions)[1],
-            paper.step(paper_action)[1],
-        )
-        np.testing.assert_allclose(difference, mine - papers, rtol=1e-12, atol=1e-12)
+def evaluation_is_paired_and_repeatable_and_replays_what_gymnasium_shows(subject):
+    """An evaluation's errors are those of the environment under the evaluation's episode seeds."""
+    known, short = baselines_of(subject.id), short_episodes(subject.id)
+    name = known.score_paper
+    alone = evaluate(subject.id, [name], episodes=3, seed=5, **short)
+    both = evaluate(subject.id, [name, "random"], episodes=3, seed=5, **short)
+    np.testing.assert_array_equal(both.error.sel(policy=name), alone.error.sel(policy=name))
+    other = evaluate(subject.id, [name], episodes=3, seed=1, **short)
+    assert (other.error.values != alone.error.values).any(axis=(0, 2, 3)).all()
+    assert not set(other.episode_seed.values) & set(alone.episode_seed.values)
+    env = subject.single(control=known.policies[name].control, detailed_info=True)
+    policy = make_policy(env, name)
+    interval = env.unwrapped.task.decision_interval
+    for episode, seed in enumerate(alone.episode_seed.values):
+        observation, _ = env.reset(seed=int(seed))
+        state = None
+        for decision in range(5):
+            action, state = policy.predict(observation, state, np.array([decision == 0]))
+            observation, _, _, _, info = env.step(action)
+            expected = alone.error.isel(policy=0, episode=episode, time=(decision + 1) * interval - 1)
+            np.testing.assert_array_equal(info["error"], expected.values)
 
 
-def test_papers_policy_equals_the_papers_constant_action(env_id):
+BY_ENVIRONMENT = (
+    estimate_made_outside_starts_where_everyone_starts,
+    parameters_survive_json,
+    registered_twice_it_stays_as_it_is,
+    one_scenario_is_for_training,
+    relative_reward_of_the_papers_algorithm_is_zero,
+    evaluation_is_paired_and_repeatable_and_replays_what_gymnasium_shows,
+)
+
+
+# --- of its policies
+
+
+def papers_policy_equals_the_papers_constant_action(subject):
     """The policy that sees observations, and the same algorithm inside the task."""
-    known = baselines_of(env_id)
-    paper = make_model(env_id).task.paper_policy
+    known = baselines_of(subject.id)
+    paper = make_model(subject.id).task.paper_policy
 
     class Constant:
         control = paper.control
@@ -219,23 +270,23 @@ def test_papers_policy_equals_the_papers_constant_action(env_id):
             action = np.tile(np.asarray(paper.action), (len(observation), 1))
             return (action[:, 0].astype(int) if self.discrete else action), state
 
-    scenario = next(name for name in catalogue()[env_id].scenarios if name.startswith("paper"))
+    scenario = next(name for name in catalogue()[subject.id].scenarios if name.startswith("paper"))
     # Only one paper's experiment is longer.
-    horizon = min(make_model(env_id, scenario=scenario).task.horizon, 600)
+    horizon = min(make_model(subject.id, scenario=scenario).task.horizon, 600)
     makers = {"policy": known.policies[known.score_paper], "inside": Constant}
-    result = evaluate(env_id, makers, scenario, episodes=4, horizon=horizon)
+    result = evaluate(subject.id, makers, scenario, episodes=4, horizon=horizon)
     policy, inside = (result.error.sel(policy=name).values for name in ("policy", "inside"))
     # A bank that mixes amplifies rounding: 1e-6 m and m/s, or a millionth of large errors.
     np.testing.assert_allclose(policy, inside, rtol=1e-6, atol=1e-6)
 
 
-def test_policies_answer_one_and_many(env_id, short):
-    known = baselines_of(env_id)
+def policies_answer_one_and_many(subject):
+    known = baselines_of(subject.id)
     for name, maker in known.policies.items():
-        model = make_model(env_id, getattr(maker, "control", None), **short)
+        model = make_model(subject.id, getattr(maker, "control", None), **short_episodes(subject.id))
         policy = maker(model)
         assert policy.control == model.control
-        env = TaskVectorEnv(env_id, 3, control=model.control, **short)
+        env = subject.native(3, control=model.control)
         observation, _ = env.reset(seed=0)
         state, single_state = None, None
         start = np.ones(3, dtype=bool)
@@ -251,12 +302,12 @@ def test_policies_answer_one_and_many(env_id, short):
             start = np.zeros(3, dtype=bool)
 
 
-def test_policies_forget_at_the_start_of_an_episode(env_id):
-    known = baselines_of(env_id)
+def policies_forget_at_the_start_of_an_episode(subject):
+    known = baselines_of(subject.id)
     for name, maker in known.policies.items():
         if name == "random":
             continue
-        model = make_model(env_id, getattr(maker, "control", None))
+        model = make_model(subject.id, getattr(maker, "control", None))
         policy = maker(model)
         rng = np.random.default_rng(0)
         rows = rng.normal(size=(15, 2, len(model.fields)))
@@ -269,6 +320,29 @@ def test_policies_forget_at_the_start_of_an_episode(env_id):
             action, state = policy.predict(rows[k], state, np.array([k == 10, False]))
             expected, fresh = policy.predict(rows[k], fresh, np.full(2, k == 10))
             np.testing.assert_allclose(action[0], expected[0], rtol=1e-14, err_msg=name)
+
+
+def baselines_are_named_consistently(subject):
+    known = baselines_of(subject.id)
+    assert known.score_paper in known.policies
+    assert {maker.kind for maker in known.estimators.values()} <= {"estimator"}
+    assert known.score_reference in known.references or known.score_reference in known.bounds
+    assert set(known.benchmark) <= set(known.names)
+    assert len(set(known.names)) == len(known.names)
+    for table in (known.references, known.bounds):
+        assert all(maker.knows for maker in table.values())
+    assert {getattr(p, "control", None) for p in known.policies.values()} <= {
+        None,
+        *catalogue()[subject.id].controls,
+    }
+
+
+OF_POLICIES = (
+    papers_policy_equals_the_papers_constant_action,
+    policies_answer_one_and_many,
+    policies_forget_at_the_start_of_an_episode,
+    baselines_are_named_consistently,
+)
 
 
 def test_stable_baselines3_evaluates_a_baseline(env_id, short):
@@ -289,45 +363,17 @@ def test_stable_baselines3_evaluates_a_baseline(env_id, short):
     assert found == pytest.approx([paid], rel=1e-6)  # rewards are float32 there
 
 
-def test_baselines_are_named_consistently(env_id):
-    known = baselines_of(env_id)
-    assert known.score_paper in known.policies
-    assert {maker.kind for maker in known.estimators.values()} <= {"estimator"}
-    assert known.score_reference in known.references or known.score_reference in known.bounds
-    assert set(known.benchmark) <= set(known.names)
-    assert len(set(known.names)) == len(known.names)
-    for table in (known.references, known.bounds):
-        assert all(maker.knows for maker in table.values())
-    assert {getattr(p, "control", None) for p in known.policies.values()} <= {
-        None,
-        *catalogue()[env_id].controls,
-    }
-
-
-def test_evaluation_replays_what_gymnasium_shows(env_id, short):
-    """An evaluation's errors are those of the environment under the evaluation's episode seeds."""
-    known = baselines_of(env_id)
-    maker = known.policies[known.score_paper]
-    result = evaluate(env_id, [known.score_paper], episodes=3, seed=5, **short)
-    env = gym.make(env_id, control=maker.control, detailed_info=True, disable_env_checker=True, **short)
-    policy = make_policy(env, known.score_paper)
-    interval = env.unwrapped.task.decision_interval
-    for episode, seed in enumerate(result.episode_seed.values):
-        observation, _ = env.reset(seed=int(seed))
-        state = None
-        for decision in range(5):
-            action, state = policy.predict(observation, state, np.array([decision == 0]))
-            observation, _, _, _, info = env.step(action)
-            expected = result.error.isel(policy=0, episode=episode, time=(decision + 1) * interval - 1)
-            np.testing.assert_array_equal(info["error"], expected.values)
-
-
-def test_evaluation_is_paired_and_repeatable(env_id, short):
-    known = baselines_of(env_id)
-    names = [known.score_paper, "random"]
-    both = evaluate(env_id, names, episodes=3, seed=0, **short)
-    alone = evaluate(env_id, names[:1], episodes=3, seed=0, **short)
-    np.testing.assert_array_equal(both.error.sel(policy=names[0]), alone.error.sel(policy=names[0]))
-    other = evaluate(env_id, names[:1], episodes=3, seed=1, **short)
-    assert (other.error.values != alone.error.values).any(axis=(0, 2, 3)).all()
-    assert not set(other.episode_seed.values) & set(alone.episode_seed.values)
+def test_spawned_processes():
+    # A process that starts afresh imports the package by the name before the colon.
+    env_id, short = "filtergym/ManeuveringTarget-v0", {"horizon": 5}
+    make = partial(gym.make, f"filtergym:{env_id}", disable_env_checker=True, **short)
+    there = gym.vector.AsyncVectorEnv([make], context="spawn")
+    here = gym.make_vec(env_id, num_envs=1, **short)
+    try:
+        np.testing.assert_array_equal(there.reset(seed=8)[0], here.reset(seed=8)[0])
+        for step in range(3):
+            actions = random_actions(here.single_action_space, 1, step)
+            for one, other in zip(there.step(actions)[:4], here.step(actions)[:4], strict=True):
+                np.testing.assert_array_equal(one, other)
+    finally:
+        there.close()

@@ -179,3 +179,11 @@ def test_merging_keeps_the_other_policies():
     table = json.loads(merge_tables('{"imm": {"values": {}}}', outcome, "a command"))
     assert set(table) == {"imm", "fixed-best"}
     assert math.isfinite(table["fixed-best"]["validation_cost"])
+
+
+def test_tracks_are_kept_of_as_many_episodes_as_are_drawn_in_whatever_pieces(monkeypatch):
+    keywords = {"episodes": 20, "drawn_episodes": 10, "horizon": 4}
+    whole = filtergym.evaluate("filtergym/ManeuveringTarget-v0", ["imm"], **keywords)
+    assert whole.sizes["drawn_episode"] == 10
+    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
+    assert filtergym.evaluate("filtergym/ManeuveringTarget-v0", ["imm"], **keywords).identical(whole)

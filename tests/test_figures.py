@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.evaluation.figures.curve_figures import draw_error_over_time, evaluation_figures
+from filtergym.evaluation.figures.front_figure import Panel, name_points
 from filtergym.evaluation.figures.looks import (
     COLOURS,
     MOST_HIGHLIGHTED,
@@ -19,7 +20,10 @@ from filtergym.evaluation.figures.looks import (
 )
 from filtergym.evaluation.figures.print_layout import WIDTHS, save, sensible_limits
 from filtergym.evaluation.running.curves import curves_of
+from filtergym.evaluation.running.times import Point, ProcessorTime
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from pictures import draw_differences, draw_learning_curves
 
 from filtergym import evaluate, record
@@ -288,3 +292,25 @@ def test_little_to_draw_is_drawn(env, names, length, tmp_path):
         save(figure, tmp_path / f"{name}.png")
         for axis in figure.axes:
             assert np.isfinite([*axis.get_xlim(), *axis.get_ylim()]).all()
+
+
+def test_names_leave_the_line_of_the_papers_cost_free():
+    figure = Figure(figsize=(3.4, 2.4))
+    FigureCanvasAgg(figure)
+    axis = figure.add_subplot(xscale="log", xlim=(10.0, 1e4), ylim=(-10.0, 30.0))
+    costs = {33.0: 2.4, 878.0: 1.8}  # a name beneath either would lie on the line
+    points = [
+        Point(f"of {time:.0f} ns", "estimator", ProcessorTime(time, True), cost)
+        for time, cost in costs.items()
+    ]
+    name_points(figure, {axis: Panel("", points, "", "", ())})
+    assert len(axis.texts) == 2
+    _, zero = axis.transData.transform((10.0, 0.0))
+    for name in axis.texts:
+        box = name.get_window_extent(figure.canvas.get_renderer())
+        assert not box.y0 < zero < box.y1, name
+
+
+def test_consistency_is_labelled_with_plain_numbers(curves):
+    figure = dict(evaluation_figures(curves))["consistency"]
+    assert [axis.yaxis.get_major_formatter()(1.0) for axis in figure.axes] == ["1"] * len(figure.axes)

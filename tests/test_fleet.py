@@ -227,7 +227,7 @@ def test_lanes_of_a_scenario_that_is_left_are_forgotten():
     env = gymnasium.make(ID, **SHORT)
     for k in range(5):
         env.reset(seed=0, options={"parameters": {"range_sigma": 50.0 + k}})
-        assert len(env.unwrapped.fleet._parts) == 1
+        assert len(env.unwrapped.fleet.snapshot()["parts"]) == 1
 
 
 def test_a_mixture_takes_as_many_places_as_it_needs():
@@ -235,7 +235,7 @@ def test_a_mixture_takes_as_many_places_as_it_needs():
     env.reset(seed=0)
     for _ in range(30):
         env.step(np.zeros((100, 1)))
-    assert sum(part.count for part in env.fleet._parts) < 150
+    assert sum(count for _, count, _ in env.fleet.snapshot()["parts"]) < 150
 
 
 def test_details_of_a_mixture_are_those_of_its_scenarios():

@@ -6,6 +6,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract import BACKENDS, Subject, assert_properties
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.task import Task
@@ -18,7 +19,6 @@ from filtergym.evaluation.running.rollout import start_lanes
 from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
-BACKENDS = {"numpy": "numpy", "compiled": "llvmlite"}
 
 
 def naive_identities(generator, episodes):
@@ -113,10 +113,17 @@ def test_identities_of_seeds_are_those_of_environments_that_are_reset():
         identities[0, 0] = 1
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend):
-    pytest.importorskip(BACKENDS[backend])
-    model = make_model(env_id, backend=backend, horizon=40 * make_model(env_id).task.decision_interval)
+def test_lanes_on_every_backend(env_id):
+    for backend in [one for one in BACKENDS if one != "torch"]:
+        assert_properties(Subject(env_id, backend=backend), [restart_at_different_times_as_single_ones])
+    if "compiled" in BACKENDS:
+        beside = (runs_another_beside_for_a_relative_reward, runs_another_beside_for_a_logarithmic_one)
+        assert_properties(Subject(env_id, backend="compiled"), beside)
+
+
+def restart_at_different_times_as_single_ones(subject):
+    interval = make_model(subject.id).task.decision_interval
+    model = make_model(subject.id, backend=subject.backend, horizon=40 * interval)
     count, space = 20, model.action_space
     space.seed(0)
     constant = np.asarray(space.sample())
@@ -152,11 +159,17 @@ def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend
                 np.testing.assert_array_equal(np.asarray(alone.observe())[0], next(step_of)[1][lane])
 
 
-@pytest.mark.parametrize("kind", ["relative", "log-relative"])
-def test_what_runs_beside_equals_lanes_of_its_own(env_id, kind):
+def runs_another_beside_for_a_relative_reward(subject):
+    assert_runs_beside_as_lanes_of_its_own(subject, "relative")
+
+
+def runs_another_beside_for_a_logarithmic_one(subject):
+    assert_runs_beside_as_lanes_of_its_own(subject, "log-relative")
+
+
+def assert_runs_beside_as_lanes_of_its_own(subject, kind):
     """Also where it has no world of its own: after restarts of few lanes, growth, a snapshot and other reports."""
-    pytest.importorskip("llvmlite")
-    model = make_model(env_id, backend="compiled")
+    model = make_model(subject.id, backend=subject.backend)
     beside = reference(kind, model)
     count, report, space = 24, OWN_PAY[kind], model.action_space
     lanes, own, other = (
@@ -192,8 +205,12 @@ def test_what_runs_beside_equals_lanes_of_its_own(env_id, kind):
         np.testing.assert_array_equal(lanes.observe(), own.observe())
 
 
-@pytest.mark.parametrize("again", [copy.deepcopy, lambda noise: pickle.loads(pickle.dumps(noise))])
-def test_copies_go_on_as_the_original(again, either_way):
+def test_copies_go_on_as_the_original(either_way):
+    for again in (copy.deepcopy, lambda noise: pickle.loads(pickle.dumps(noise))):
+        assert_goes_on_as_the_original(again)
+
+
+def assert_goes_on_as_the_original(again):
     noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
     for lane in range(3):
         noise.seed(lane, np.random.default_rng(lane))

@@ -65,6 +65,7 @@ def scores(scenario, episodes, training_episodes, iterations):
     return {r.policy: r.value for r in records if r.metric == "score"}
 
 
+@pytest.mark.claims
 def test_a_schedule_wins_less_than_half_of_what_an_agent_wins():
     pytest.importorskip("torch")
     found = scores("cruise", 300, 32, 20)

@@ -9,8 +9,10 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract import BACKENDS, Subject, assert_properties, continued
 from filtergym.envs.data.trajectory import Trajectory
 from filtergym.envs.drawing import rendering
+from filtergym.envs.engine.lanes import ModelStepper
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
@@ -21,7 +23,6 @@ import filtergym  # noqa: F401  (registers the environments)
 
 ID = "filtergym/ManeuveringTarget-v0"
 make_three = functools.partial(gym.make_vec, num_envs=3)
-NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 
 
 def actions_for(env, count, seed=0):
@@ -29,37 +30,9 @@ def actions_for(env, count, seed=0):
     return [env.action_space.sample() for _ in range(count)]
 
 
-def continued(env, actions):
-    """Everything that some steps return."""
-    return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
-
-
 def assert_all_equal(some, others):
     for one, other in zip(some, others, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-# --- keywords
-
-
-@pytest.mark.parametrize("make", [gym.make, make_three])
-def test_a_client_may_try_whether_a_keyword_is_taken(env_id, make, short):
-    # TorchRL's GymEnv does, and takes the keyword back if this is what Python says.
-    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
-        make(env_id, frameskip=1, **short)
-    with pytest.raises(ValueError, match=r"unexpected keyword argument 'horizons'.*did you mean 'horizon'"):
-        make(env_id, horizons=5)
-
-
-@pytest.mark.parametrize(
-    ("name", "meant"), [("contol", "control"), ("scenari", "scenario"), ("detail_info", "detailed_info")]
-)
-def test_keywords_of_the_environment_itself_are_hinted_at_too(name, meant):
-    with pytest.raises(ValueError, match=f"'{name}'.*did you mean '{meant}'"):
-        gym.make(ID, **{name: "x"})
-
-
-# --- the length of an episode
 
 
 def length(env):
@@ -71,52 +44,154 @@ def length(env):
     return count
 
 
-@pytest.mark.parametrize("make", [gym.make, make_three])
-def test_spec_knows_how_long_an_episode_is(env_id, make, short):
-    env = make(env_id, **short, backend="numpy")
-    assert env.spec.max_episode_steps == length(env) == 5
-    assert make(env_id, **short, backend="numpy", max_episode_steps=3).spec.max_episode_steps == 3
-    assert length(make(env_id, **short, backend="numpy", max_episode_steps=3)) == 3
-    unlimited = make(env_id, **short, backend="numpy", max_episode_steps=-1)
-    assert unlimited.spec.max_episode_steps == length(unlimited) == 5
-    task = env.unwrapped.task
-    default = make(env_id, backend="numpy").spec.max_episode_steps
-    parameters = type(task).Parameters(**task.scenarios[task.default_scenario].parameters)
-    assert default == parameters.horizon // parameters.decision_interval
+# --- one pass over every environment
 
 
-def test_length_of_every_scenario(env_id):
-    task = TaskEnv(env_id, backend="numpy").task
-    for name, scenario in task.scenarios.items():
+def test_every_environment(env_id):
+    assert_properties(Subject(env_id, backend="numpy"), PROPERTIES)
+    assert_properties(Subject(env_id), [draws_without_a_trace_and_copies_alike])
+
+
+def test_float32_on_every_backend(env_id):
+    for backend in BACKENDS:
+        assert_properties(Subject(env_id, backend=backend), [rounds_float64_to_float32])
+
+
+def refuses_keywords_as_a_client_expects_who_tries_them(subject):
+    # TorchRL's GymEnv does, and takes the keyword back if this is what Python says.
+    for make in (gym.make, make_three):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+            make(subject.id, frameskip=1)
+        with pytest.raises(
+            ValueError, match=r"unexpected keyword argument 'horizons'.*did you mean 'horizon'"
+        ):
+            make(subject.id, horizons=5)
+
+
+def says_in_its_spec_how_long_an_episode_is(subject):
+    for make in (subject.single, functools.partial(subject.native, 3)):
+        env, limited, unlimited = (make(**k) for k in ({}, *({"max_episode_steps": n} for n in (3, -1))))
+        assert env.spec.max_episode_steps == length(env) == 5
+        assert limited.spec.max_episode_steps == length(limited) == 3
+        assert unlimited.spec.max_episode_steps == length(unlimited) == 5
+        spec = EnvSpec.from_json(env.spec.to_json())
+        # A vector's spec holds the number of environments.
+        again = gym.make(spec) if make == subject.single else gym.make_vec(spec)
+        assert again.spec.max_episode_steps == length(again) == 5
+
+
+def says_how_long_each_scenario_is(subject):
+    task = subject.single().unwrapped.task
+    for name, scenario in {None: task.scenarios[task.default_scenario], **task.scenarios}.items():
         parameters = task.Parameters(**scenario.parameters)
         expected = parameters.horizon // parameters.decision_interval
-        assert gym.make(env_id, scenario=name, backend="numpy").spec.max_episode_steps == expected
+        for make in (gym.make, make_three):
+            env = make(subject.id, scenario=name, backend="numpy")
+            assert env.spec.max_episode_steps == expected, name
 
 
-def test_only_who_asks_is_limited(env_id, short):
+def limits_only_whom_asks(subject):
     def limited(env):
         return isinstance(env, TimeLimit) or (isinstance(env, gym.Wrapper) and limited(env.env))
 
-    assert not limited(gym.make(env_id, **short, backend="numpy"))
-    assert limited(gym.make(env_id, **short, backend="numpy", max_episode_steps=3))
+    assert not limited(subject.single())
+    assert limited(subject.single(max_episode_steps=3))
 
 
-@pytest.mark.parametrize("make", [gym.make, make_three])
-def test_what_a_spec_makes_is_as_long(env_id, make, short):
-    again = EnvSpec.from_json(make(env_id, **short, backend="numpy").spec.to_json())
-    # A vector's spec holds the number of environments.
-    env = gym.make(again) if make is gym.make else gym.make_vec(again)
-    assert env.spec.max_episode_steps == length(env) == 5
-
-
-def test_time_aware_observation(env_id, short):
-    env = TimeAwareObservation(gym.make(env_id, **short, backend="numpy"), normalize_time=True)
+def is_aware_of_time(subject):
+    env = TimeAwareObservation(subject.single(), normalize_time=True)
     shown, _ = env.reset(seed=0)
     times, finished = [shown[-1]], False
     while not finished:
         shown, _, _, finished, _ = env.step(env.action_space.sample())
         times.append(shown[-1])
     np.testing.assert_allclose(times, np.arange(6) / 5, rtol=1e-6)
+
+
+def rounds_float64_to_float32(subject):
+    fine, rounded = (
+        subject.native(3, dtype=dtype, autoreset_mode="SameStep") for dtype in ("float64", "float32")
+    )
+    assert rounded.single_observation_space.dtype == rounded.observation_space.dtype == np.float32
+    assert fine.single_observation_space.dtype == np.float64
+    pairs = [(fine.reset(seed=0)[0], rounded.reset(seed=0)[0])]
+    for action in actions_for(fine, 7):
+        one, other = fine.step(action), rounded.step(action)
+        pairs += zip(one[:2], other[:2], strict=True)
+        if one[3].any():
+            final = [info["final_obs"] for info in (one[4], other[4])]
+            pairs.append(tuple(np.stack([np.asarray(row) for row in rows]) for rows in final))
+    assert len(pairs) == 1 + 2 * 7 + 1
+    for exact, coarse in pairs:
+        assert np.asarray(coarse).dtype == np.float32
+        np.testing.assert_array_equal(np.asarray(exact).astype(np.float32), np.asarray(coarse))
+
+
+def rounds_a_single_environment_as_a_vector(subject):
+    env, vector = subject.single(dtype="float32"), subject.native(1, dtype="float32")
+    shown = env.reset(seed=2)[0]
+    assert env.observation_space.dtype == shown.dtype == np.float32
+    np.testing.assert_array_equal(shown, vector.reset(seed=2)[0][0])
+    for action in actions_for(env, 5):
+        shown, paid, *_ = env.step(action)
+        many, all_paid, *_ = vector.step(np.asarray(action)[None])
+        assert env.observation_space.contains(shown)
+        np.testing.assert_array_equal(shown, many[0])
+        assert type(paid) is float
+        assert paid == all_paid[0]
+
+
+def draws_without_a_trace_and_copies_alike(subject):
+    """Whoever draws, closes or copies a picture changes no episode, and a copy draws what the original does."""
+    plain, env = subject.single(), subject.single(render_mode="rgb_array")
+    np.testing.assert_array_equal(plain.reset(seed=3)[0], env.reset(seed=3)[0])
+    actions = actions_for(env, 5)
+    assert_all_equal(continued(plain, actions[:2]), continued(env, actions[:2]))
+    env.render()
+    other = pickle.loads(pickle.dumps(env))
+    expected = continued(plain, actions[2:])
+    assert_all_equal(expected, continued(env, actions[2:]))
+    assert_all_equal(expected, continued(other, actions[2:]))
+    drawn = other.render()
+    assert (drawn.shape, drawn.dtype) == ((608, 960, 3), np.uint8)
+    np.testing.assert_array_equal(env.render(), drawn)
+
+
+PROPERTIES = (
+    refuses_keywords_as_a_client_expects_who_tries_them,
+    says_in_its_spec_how_long_an_episode_is,
+    says_how_long_each_scenario_is,
+    limits_only_whom_asks,
+    is_aware_of_time,
+    rounds_a_single_environment_as_a_vector,
+)
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process that starts afresh."""
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        yield pool
+
+
+def test_episodes_go_on_in_another_process(env_id, short, elsewhere):
+    for make in (gym.make, make_three):
+        env = make(env_id, **short)
+        env.reset(seed=3)
+        actions = actions_for(env, 5)
+        continued(env, actions[:2])
+        there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
+        assert_all_equal(continued(env, actions[2:]), there)
+
+
+# --- keywords
+
+
+def test_keywords_of_the_environment_itself_are_hinted_at_too():
+    for name, meant in (("contol", "control"), ("scenari", "scenario"), ("detail_info", "detailed_info")):
+        with pytest.raises(ValueError, match=f"'{name}'.*did you mean '{meant}'"):
+            gym.make(ID, **{name: "x"})
 
 
 # --- specs as text
@@ -194,21 +269,17 @@ MAKING_VECTORS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
-@pytest.mark.parametrize("case", MAKING)
-def test_wrong_arguments_of_both_faces(face, case):
-    keywords, message = MAKING[case]
+def assert_refused(face, keywords, message):
     with pytest.raises((ValueError, TypeError), match=message) as caught:
         face(**{"task": ID, **keywords})
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("case", MAKING_VECTORS)
-def test_wrong_arguments_of_vectors(case):
-    keywords, message = MAKING_VECTORS[case]
-    with pytest.raises((ValueError, TypeError), match=message) as caught:
-        TaskVectorEnv(**{"task": ID, **keywords})
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
+def test_wrong_arguments(face):
+    cases = MAKING if face is TaskEnv else MAKING | MAKING_VECTORS
+    for keywords, message in cases.values():
+        assert_refused(face, keywords, message)
 
 
 RESETS = {
@@ -240,15 +311,12 @@ def assert_refused_without_a_trace(env, untouched, keywords, message):
     np.testing.assert_array_equal(env.reset()[0], untouched.reset()[0])
 
 
-@pytest.mark.parametrize("case", RESETS)
-def test_wrong_arguments_of_every_reset(case):
-    assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), *RESETS[case])
-    assert_refused_without_a_trace(TaskVectorEnv(ID, 2), TaskVectorEnv(ID, 2), *RESETS[case])
-
-
-@pytest.mark.parametrize("case", RESETS_OF_VECTORS)
-def test_wrong_arguments_of_a_vectors_reset(case):
-    assert_refused_without_a_trace(TaskVectorEnv(ID, 2), TaskVectorEnv(ID, 2), *RESETS_OF_VECTORS[case])
+@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
+def test_wrong_arguments_of_a_reset(face):
+    many = {} if face is TaskEnv else {"num_envs": 2}
+    env, untouched = (face(ID, **many) for _ in range(2))
+    for keywords, message in (RESETS if face is TaskEnv else RESETS | RESETS_OF_VECTORS).values():
+        assert_refused_without_a_trace(env, untouched, keywords, message)
 
 
 def test_options_of_a_single_environment():
@@ -265,41 +333,7 @@ def test_seeds_may_be_numpys():
         np.testing.assert_array_equal(vector.reset(seed=seed)[0][0], expected)
 
 
-# --- float32
-
-
-@pytest.mark.parametrize("backend", NEEDED)
-def test_float32_is_float64_rounded(env_id, short, backend):
-    pytest.importorskip(NEEDED[backend])
-    keywords = {"num_envs": 3, "backend": backend, "autoreset_mode": "SameStep", **short}
-    fine, rounded = (gym.make_vec(env_id, dtype=dtype, **keywords) for dtype in ("float64", "float32"))
-    assert rounded.single_observation_space.dtype == rounded.observation_space.dtype == np.float32
-    assert fine.single_observation_space.dtype == np.float64
-    pairs = [(fine.reset(seed=0)[0], rounded.reset(seed=0)[0])]
-    for action in actions_for(fine, 7):
-        one, other = fine.step(action), rounded.step(action)
-        pairs += zip(one[:2], other[:2], strict=True)
-        if one[3].any():
-            final = [info["final_obs"] for info in (one[4], other[4])]
-            pairs.append(tuple(np.stack([np.asarray(row) for row in rows]) for rows in final))
-    assert len(pairs) == 1 + 2 * 7 + 1
-    for exact, coarse in pairs:
-        assert np.asarray(coarse).dtype == np.float32
-        np.testing.assert_array_equal(np.asarray(exact).astype(np.float32), np.asarray(coarse))
-
-
-def test_float32_of_a_single_environment(env_id, short):
-    env, vector = gym.make(env_id, dtype="float32", **short), gym.make_vec(env_id, dtype="float32", **short)
-    shown = env.reset(seed=2)[0]
-    assert env.observation_space.dtype == shown.dtype == np.float32
-    np.testing.assert_array_equal(shown, vector.reset(seed=2)[0][0])
-    for action in actions_for(env, 5):
-        shown, paid, *_ = env.step(action)
-        many, all_paid, *_ = vector.step(np.asarray(action)[None])
-        assert env.observation_space.contains(shown)
-        np.testing.assert_array_equal(shown, many[0])
-        assert type(paid) is float
-        assert paid == all_paid[0]
+# --- gradients
 
 
 def test_gradients_flow_through_float32():
@@ -350,26 +384,25 @@ def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
     vector.close()
 
 
-def test_drawing_leaves_the_episodes_of_every_environment_alone(env_id, short, monkeypatch):
-    backend = "torch" if env_id == ID else "compiled"
-    pytest.importorskip(NEEDED[backend])
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+def test_drawing_a_vector_leaves_its_episodes_alone(backend, monkeypatch):
     monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
-    plain, drawn = (
-        gym.make_vec(env_id, num_envs=2, backend=backend, render_mode=mode, **short)
-        for mode in (None, "rgb_array")
-    )
+    subject = Subject(ID, backend=backend)
+    plain, drawn = (subject.native(2, render_mode=mode) for mode in (None, "rgb_array"))
     np.testing.assert_array_equal(plain.reset(seed=0)[0], drawn.reset(seed=0)[0])
     actions = actions_for(plain, 7)
     assert_all_equal(continued(plain, actions), continued(drawn, actions))
     assert [(frame.shape, frame.dtype) for frame in drawn.render()] == [((608, 960, 3), np.uint8)] * 2
 
 
-def test_the_fast_loop_stays_closed_without_a_render_mode():
+def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_mode(monkeypatch):
     pytest.importorskip("llvmlite")
+    called = []
+    monkeypatch.setattr(ModelStepper, "step", lambda *_: called.append("step"))
     env = TaskVectorEnv(ID, 2, backend="compiled")
     env.reset(seed=0)
     env.step(env.action_space.sample())
-    assert env.fleet.only._moving, "episodes move in the memory of compiled code"
+    assert called == []
     assert env.pictures is None
 
 
@@ -406,30 +439,21 @@ def test_video_of_a_vector(tmp_path):
 WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
-def assert_drawn_alike(env, copied):
+def test_copies_of_vectors_are_drawn_alike(monkeypatch):
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
+    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
     env.reset(seed=3)
     actions = actions_for(env, 5)
     continued(env, actions[:2])
     env.render()
-    other = copied(env)
+    other = pickle.loads(pickle.dumps(env))
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
     drawn = other.render()
     np.testing.assert_array_equal(env.render(), drawn)
     # What was closed is drawn anew.
     env.close()
-    again = copied(env)
-    np.testing.assert_array_equal(again.unwrapped.render(), drawn)
-    return again
-
-
-def test_copies_are_drawn_alike(env_id, short):
-    assert_drawn_alike(gym.make(env_id, render_mode="rgb_array", **short), WAYS["pickle"])
-
-
-def test_copies_of_vectors_are_drawn_alike(monkeypatch):
-    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
-    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
-    again = assert_drawn_alike(env, WAYS["pickle"])
+    again = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(again.render(), drawn)
     # Closed and drawn again, it can be copied as before.
     again.close()
     again.render()
@@ -445,24 +469,6 @@ def test_copies_of_what_is_wrapped(way):
     other = WAYS[way](env)
     assert other.spec == env.spec
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-
-
-@pytest.fixture(scope="module")
-def elsewhere():
-    """A process that starts afresh."""
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-        yield pool
-
-
-@pytest.mark.parametrize("make", [gym.make, make_three])
-def test_episodes_go_on_in_another_process(env_id, short, make, elsewhere):
-    env = make(env_id, **short)
-    env.reset(seed=3)
-    actions = actions_for(env, 5)
-    continued(env, actions[:2])
-    there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
-    assert_all_equal(continued(env, actions[2:]), there)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import math
 import numpy
 import pytest
 from filtergym.envs.contract.model import Model
+from filtergym.envs.radar_esm_tracking.picture import RadarEsmTrackingPicture
 from filtergym.envs.radar_esm_tracking.task import TASK
 from filtergym.filters import class_fusion, imm
 
@@ -485,3 +486,17 @@ def test_silent_targets_radiate_in_bursts():
 def test_bad_parameters_are_refused_with_the_reason(keywords, reason):
     with pytest.raises(ValueError, match=reason):
         TASK.Parameters(**keywords)
+
+
+def test_accelerations_of_a_picture_reach_two_deviations_of_the_class_that_is_flown():
+    model = make()
+    uniforms, normals, _ = draw(model, 8, 0)
+    episode = model.begin(uniforms, normals)
+    picture = RadarEsmTrackingPicture(model)
+    for target_class, sigma in enumerate(model.task.parameters.acceleration_sigma):
+        truth = episode.truth._replace(
+            target_class=numpy.full(8, target_class), change_scan=numpy.full(8, model.task.horizon + 1)
+        )
+        picture.begin(episode._replace(truth=truth))
+        assert picture.height == max(15.0, 2.0 * sigma)
+        assert picture.change is None

@@ -202,7 +202,7 @@ def test_stays_near_the_enumeration_where_it_merges(model):
     filter = SemiMarkov(model.task, **prior(begin=0.05, hazards=(0.0, 0.3, 0.4)))
     initial, measurements, answers = answers_of(model, filter, 6)
     distances, differences = [], []
-    for b in range(LANES):
+    for b in range(0, LANES, 3):  # seconds each
         for (x, P, total), (mean, _, log_likelihood) in zip(
             enumerated(filter, initial, measurements, b), answers, strict=True
         ):

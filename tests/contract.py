@@ -1,0 +1,86 @@
+"""One pass over an environment, a control and a backend, in which many properties are checked by their names."""
+
+import importlib.util
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from filtergym.envs.contract.model import Model
+from filtergym.envs.engine.catalogue import task_class
+from models import make_model, random_actions, short_episodes
+
+NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
+BACKENDS = [backend for backend, library in NEEDED.items() if importlib.util.find_spec(library)]
+"""Those that work here."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a pass goes over; its episodes are five decisions long."""
+
+    id: str
+    control: str | None = None
+    backend: str = "auto"
+
+    def __str__(self) -> str:
+        return f"{self.id}, control {self.control or 'default'}, backend {self.backend}"
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """What an environment of it is made with."""
+        return {"control": self.control, "backend": self.backend, **short_episodes(self.id)}
+
+    @property
+    def order(self) -> int:
+        """Place of the control among those of the environment; zero of the default."""
+        return 0 if self.control is None else list(task_class(self.id).controls).index(self.control)
+
+    def single(self, **keywords: Any) -> gym.Env:
+        """Make one environment."""
+        return gym.make(self.id, disable_env_checker=True, **self.keywords | keywords)
+
+    def native(self, count: int, **keywords: Any) -> gym.vector.VectorEnv:
+        """Make many of them side by side."""
+        return gym.make_vec(self.id, num_envs=count, **self.keywords | keywords)
+
+    def synchronous(self, count: int, mode: Any = gym.vector.AutoresetMode.NEXT_STEP, **keywords: Any) -> Any:
+        """Make Gymnasium's own vector of single environments."""
+        makers = [lambda: self.single(**keywords)] * count
+        return gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
+
+    def model(self, **keywords: Any) -> Model:
+        """Make its model."""
+        return make_model(self.id, self.control, **short_episodes(self.id) | keywords)
+
+    def actions(self, env: Any, count: int, steps: Iterable[int]) -> list[Any]:
+        """Random actions for a batch, of each step."""
+        space = getattr(env, "single_action_space", env.action_space)
+        return [random_actions(space, count, step) for step in steps]
+
+
+def continued(env: Any, actions: Iterable[Any]) -> list[np.ndarray]:
+    """Everything that some steps return."""
+    return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
+
+
+Property = Callable[[Subject], None]
+"""Function that raises where its subject has not what the function's name says."""
+
+
+def assert_properties(subject: Subject, properties: Iterable[Property]) -> None:
+    """Check all properties, and tell of each that does not hold which one it is and of what.
+
+    Raises:
+        ExceptionGroup: if there are some.
+    """
+    failures = []
+    for has in properties:
+        try:
+            has(subject)
+        except Exception as error:
+            error.add_note(f"property {has.__name__!r} of {subject}")
+            failures.append(error)
+    if failures:
+        raise ExceptionGroup(f"{len(failures)} properties of {subject}", failures)
