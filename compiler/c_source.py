@@ -1,6 +1,7 @@
 """A program as text of C99, of one lane in double or float; the same statements are the body of a kernel of CUDA.
 
-Every step is one statement; numbers that cross from one static function to the next lie in a scratch array ``w``.
+Every step is one statement, or, in a loop, every array operation (:mod:`.rolling`); numbers that cross from one static
+function or loop to the next lie in a scratch array ``w``.
 Comparisons with what is no number, and what ``maximum``, ``minimum``, ``sign``, ``remainder`` and ``take`` make of it,
 are those of the code of :mod:`.emission`; of the two zeros a ``maximum`` may return either.
 
@@ -9,20 +10,24 @@ No name and no sentence gets into the text but through :func:`identifier` and :f
 
 import math
 import re
+import struct
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
 from .interpretation import first_steps
 from .parts import FREE, Statement, cut_parts, scratch_slots
 from .program import Program
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Rolled, roll, steady
 
 PART = 200
 """Statements of a function."""
+SHORTER = 1.5
+"""Straight statements that are as long, compiled, as a statement in a loop with its tables."""
 WIDTH = 100
 """Characters of a line of a comment."""
 _INFIX = {
@@ -245,34 +250,182 @@ class _Text:
     def expression(self, index: int) -> str:
         """Return what computes a step."""
         operation, arguments, _ = self.program.steps[index]
-        if operation == "take":
-            start, length, place = arguments
-            return f"{self.tables[start]}[place_of({self.value(place)}, {length})]"
-        values = [self.value(argument) for argument in arguments]
-        if operation in _INFIX:
-            return f"{values[0]} {_INFIX[operation]} {values[1]}"
-        if operation == "logical_not":
-            return f"!{values[0]}"
-        if operation == "negative":
-            return f"-{values[0]}"
-        if operation == "where":
-            return f"{values[0]} ? {values[1]} : {values[2]}"
-        if operation == "number":
-            return f"{values[0]} ? {self.literal(1.0)} : {self.literal(0.0)}"
-        if operation in ("maximum", "minimum"):
-            return self._extreme(arguments, ">" if operation == "maximum" else "<")
-        name = {"absolute": "fabs", "sign": "sign_of", "remainder": "remainder_of"}.get(operation, operation)
-        suffix = "" if name.endswith("_of") else self.scalar.suffix
-        return f"{name}{suffix}({', '.join(values)})"
+        parts = self.program.steps[index].parts
+        known = [self.program.steps[part].operation == "constant" for part in parts]
+        table = (self.tables[arguments[0]], arguments[1]) if operation == "take" else None
+        return _expression(operation, [self.value(part) for part in parts], known, self.scalar, table)
 
-    def _extreme(self, arguments: tuple[int, ...], sign: str) -> str:
-        """The larger or smaller of two; what is no number stays that."""
-        known = [self.program.steps[argument].operation == "constant" for argument in arguments]
-        first, second = arguments if known[0] or not known[1] else arguments[::-1]
-        one, other = self.value(first), self.value(second)
-        # A constant is a number: see Graph.
-        unordered = "" if any(known) else f" || {one} != {one}"
-        return f"{one} {sign} {other}{unordered} ? {one} : {other}"
+
+def _expression(
+    operation: str,
+    values: Sequence[str],
+    known: Sequence[bool],
+    scalar: Scalar,
+    table: tuple[str, int] | None = None,
+) -> str:
+    """Return what computes an operation.
+
+    Args:
+        operation: of a step.
+        values: its arguments.
+        known: which of them are constants.
+        scalar: kind of numbers.
+        table: of ``take``, its name and its length.
+    """
+    if table is not None:
+        return f"{table[0]}[place_of({values[0]}, {table[1]})]"
+    if operation == "copy":
+        return values[0]
+    if operation in _INFIX:
+        return f"{values[0]} {_INFIX[operation]} {values[1]}"
+    if operation == "logical_not":
+        return f"!{values[0]}"
+    if operation == "negative":
+        return f"-{values[0]}"
+    if operation == "where":
+        return f"{values[0]} ? {values[1]} : {values[2]}"
+    if operation == "number":
+        return f"{values[0]} ? {literal(1.0, scalar)} : {literal(0.0, scalar)}"
+    if operation in ("maximum", "minimum"):
+        return _extreme(values, known, ">" if operation == "maximum" else "<")
+    name = {"absolute": "fabs", "sign": "sign_of", "remainder": "remainder_of"}.get(operation, operation)
+    suffix = "" if name.endswith("_of") else scalar.suffix
+    return f"{name}{suffix}({', '.join(values)})"
+
+
+def _extreme(values: Sequence[str], known: Sequence[bool], sign: str) -> str:
+    """The larger or smaller of two; what is no number stays that."""
+    one, other = values if known[0] or not known[1] else values[::-1]
+    # A constant is a number: see Graph.
+    unordered = "" if any(known) else f" || {one} != {one}"
+    return f"{one} {sign} {other}{unordered} ? {one} : {other}"
+
+
+class Rows(NamedTuple):
+    """Where the rows of an argument lie, for loops over them."""
+
+    array: str
+    """Expression of a pointer to numbers."""
+    places: Mapping[int, int] | Sequence[int]
+    """Place of every row behind it."""
+
+
+class Arrays(NamedTuple):
+    """Where the rows of all arguments lie."""
+
+    read: Mapping[int, Rows]
+    written: Mapping[int, Rows]
+
+
+class _Loops:
+    """Loops of a program as text.
+
+    Args:
+        program: that was rolled up.
+        name: that tables begin with.
+        read: expression of a row of an argument.
+        write: where a row of an argument goes.
+        arrays: where these rows lie.
+        scalar: kind of numbers.
+        tables: by where ``take`` finds them.
+        qualifier: of tables.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        name: str,
+        read: Callable[[int, int], str],
+        write: Callable[[int, int], str],
+        arrays: Arrays,
+        scalar: Scalar,
+        tables: Mapping[int, str],
+        qualifier: str,
+    ) -> None:
+        self.program, self.name, self.read, self.write, self.arrays = program, name, read, write, arrays
+        self.scalar, self.tables, self.qualifier = scalar, tables, qualifier
+        self.defined: list[str] = []
+        self._found: dict[tuple[Any, ...], str] = {}
+
+    def loop(self, loop: Loop) -> list[str]:
+        """Return the lines of a loop."""
+        lines = []
+        for number, operation, operands, logical, table, kept in loop.body:
+            values = [self._value(operand) for operand in operands]
+            known = [operand.array == CONSTANTS for operand in operands]
+            taken = (self.tables[table[0]], table[1]) if operation == "take" else None
+            text = _expression(operation, values, known, self.scalar, taken)
+            if operation == "copy":
+                own = self._number(text, logical)
+            else:
+                kind = "int" if logical else self.scalar.name
+                lines.append(f"const {kind} v{number} = {text};")
+                own = self._number(f"v{number}", logical)
+            for to in kept:
+                place = self._place(to, self.write, self.arrays.written)
+                if place:
+                    lines.append(f"{place} = {own};")
+        if loop.count == 1:
+            return lines
+        return [f"for (int k = 0; k < {loop.count}; ++k) {{", *(f"    {line}" for line in lines), "}"]
+
+    def _number(self, value: str, logical: bool) -> str:
+        one, zero = literal(1.0, self.scalar), literal(0.0, self.scalar)
+        return f"{value} ? {one} : {zero}" if logical else value
+
+    def _value(self, operand: Operand) -> str:
+        if operand.array == TURN:
+            return f"v{operand.places[0]}"
+        if operand.array == CONSTANTS:
+            numbers = tuple(float(self.program.constants[place]) for place in operand.places)
+            if len({struct.pack("d", number) for number in numbers}) == 1:
+                text = literal(numbers[0], self.scalar)
+                return str(int(numbers[0] != 0.0)) if operand.logical else text
+            text = f"{self._table(numbers)}[k]"
+        else:
+            text = self._place(operand, self.read, self.arrays.read)
+        return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
+
+    def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
+        """Expression of a member of an array, in a turn of the loop."""
+        array, places = operand.array, operand.places
+        if array != SCRATCH:
+            if len(set(places)) == 1:
+                return single(array, places[0])
+            pointer, of_row = rows[array]
+            places = tuple(of_row[place] for place in places)
+        else:
+            pointer = "w"
+        return f"{pointer}[{self._index(places)}]"
+
+    def _index(self, places: tuple[int, ...]) -> str:
+        step, first = steady(places), places[0]
+        if step is None:
+            first = min(places)
+            moved = f"{self._table(tuple(place - first for place in places))}[k]"
+        elif step == 0:
+            return str(first)
+        elif step < 0:
+            return f"{first} - k" if step == -1 else f"{first} - {-step} * k"
+        else:
+            moved = "k" if step == 1 else f"{step} * k"
+        return f"{first} + {moved}" if first else moved
+
+    def _table(self, values: tuple[Any, ...]) -> str:
+        """Name of a constant array: of numbers, or of distances."""
+        key = (type(values[0]), *(struct.pack("d", value) for value in values))
+        if key not in self._found:
+            name = self._found[key] = (
+                f"{self.name}_{'values' if key[0] is float else 'at'}_{len(self._found)}"
+            )
+            if key[0] is float:
+                text = array_text(name, numpy.array(values), self.scalar, f"{self.qualifier}const")
+            else:
+                kind = "char" if max(values) < 256 else "short" if max(values) < 65536 else "int"
+                inside = textwrap.fill(", ".join(map(str, values)), WIDTH)
+                text = f"{self.qualifier}const unsigned {kind} {name}[{len(values)}] = {{\n{inside}\n}};\n"
+            self.defined.append(text)
+        return self._found[key]
 
 
 def write_program(
@@ -285,8 +438,9 @@ def write_program(
     qualifier: str = "static ",
     between: Sequence[str] = (),
     results: int = 0,
+    arrays: Arrays | None = None,
 ) -> Source:
-    """Write a program as statements.
+    """Write a program as statements, in loops where that is shorter.
 
     A result is written as soon as it is computed: what is written must not be what is read.
 
@@ -300,24 +454,33 @@ def write_program(
         qualifier: of static functions.
         between: statements that stand where the first results are known, before any other input is read.
         results: how many these are.
+        arrays: where the rows of all arguments lie, for loops; default: no loops.
     """
     if any(step.operation == "product" for step in program.steps):
         raise ValueError("a product that is a loop has no form in C: trace it with Graph(loops=False)")
     starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
-    text = _Text(program, read, scalar, tables)
-    pause = first_steps(program, results) if between else 0
-    parts, before = cut_parts(program, PART, pause)
     count_operations = sum(step.operation not in FREE for step in program.steps)
-    together = count_operations <= PART
-    slots = {} if together else scratch_slots(program, parts)
-    everything: set[Statement] = set(range(len(program.steps)))
-    blocks = [_statements(text, part, everything if together else set(part), write, slots) for part in parts]
     defined = [
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
     ]
-    count = max(slots.values(), default=-1) + 1
+    rolled = None if arrays is None else _shorter(program, results if between else 0, count_operations)
+    if arrays is not None and rolled is not None:
+        loops = _Loops(program, name, read, write, arrays, scalar, tables, qualifier)
+        blocks, before = _packed([loops.loop(loop) for loop in rolled.loops], rolled.before)
+        defined += loops.defined
+        count, together = rolled.scratch, len(blocks) == 1
+    else:
+        together = count_operations <= PART
+        text = _Text(program, read, scalar, tables)
+        parts, before = cut_parts(program, PART, first_steps(program, results) if between else 0)
+        slots = {} if together else scratch_slots(program, parts)
+        everything: set[Statement] = set(range(len(program.steps)))
+        blocks = [
+            _statements(text, part, everything if together else set(part), write, slots) for part in parts
+        ]
+        count = max(slots.values(), default=-1) + 1
     lines = blocks
     if not together:
         listed = [*parameters, Parameter(f"{scalar.name} *", "w")]
@@ -326,7 +489,7 @@ def write_program(
         lines = [[f"{name}_part_{i}({names});"] for i in range(len(blocks))]
     body = [line for block in lines[:before] for line in block]
     body += [*between, *(line for block in lines[before:] for line in block)]
-    if not together:
+    if count or not together:
         body.insert(0, f"{scalar.name} w[{max(count, 1)}];")
     constants = [
         float(program.constants[step.arguments[0]])
@@ -335,6 +498,25 @@ def write_program(
     ]
     replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
     return Source("\n".join(defined), body, count_operations, count, replaced)
+
+
+def _shorter(program: Program, results: int, operations: int) -> Rolled | None:
+    """A program as loops, where they are less text than a straight line of so many operations."""
+    rolled = roll(program, results)
+    statements = sum(len(loop.body) for loop in rolled.loops)
+    return rolled if SHORTER * statements < operations + len(program.results) else None
+
+
+def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
+    """Blocks put together as long as a function is not too long, and how many of them are before a pause."""
+    packed: list[list[str]] = []
+    before = 0
+    for i, block in enumerate(blocks):
+        if not packed or i == pause or len(packed[-1]) + len(block) > PART:
+            packed.append([])
+        packed[-1] += block
+        before = len(packed) if i < pause else before
+    return packed or [[]], before
 
 
 def _statements(

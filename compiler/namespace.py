@@ -192,7 +192,9 @@ def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None
 
 
 def _elementwise(name: str, arrays: Sequence[Traced], dtype: Any) -> Traced:
-    node = _OPEN.get().node
+    graph = _OPEN.get()
+    graph.begin_group()
+    node = graph.node
     spread = (
         numpy.broadcast_arrays(*(array.nodes for array in arrays)) if len(arrays) > 1 else [arrays[0].nodes]
     )
@@ -409,31 +411,46 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
     rows: Any
     if isinstance(x, numpy.ndarray) and x.dtype == float:
         rows = numpy.moveaxis(x, axis, -1)
+        graph.begin_group()
         taken = [[graph.take(row, place) for place in places] for row in rows.reshape(-1, rows.shape[-1])]
     else:
         x = asarray(x)
         rows = numpy.moveaxis(x.nodes, axis, -1)
-        choices = rows.reshape(-1, rows.shape[-1]).tolist()
-        taken = [[_choose(graph, row, place) for place in places] for row in choices]
+        taken = _choose(graph, rows.reshape(-1, rows.shape[-1]), places, x.dtype)
     shaped = numpy.array(taken, dtype=numpy.int64).reshape(*rows.shape[:-1], *indices.shape)
     for i in range(indices.ndim):
         shaped = numpy.moveaxis(shaped, rows.ndim - 1 + i, axis % x.ndim + i)
     return Traced(shaped, x.dtype)
 
 
-def _choose(graph: Graph, row: list[int], index: int) -> int:
-    values, known = [graph.values[node] for node in row], graph.values[index]
-    if known is not None:
-        return row[int(known)]
-    if None not in values and not builtins.any(graph.logical[node] for node in row):
-        return graph.take(numpy.array(values, dtype=float), index)
-    # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
-    from_end = graph.node("add", index, graph.constant(len(row)))
-    index = graph.node("where", graph.node("less", index, graph.constant(0.0)), from_end, index)
-    chosen = row[0]
-    for place, node in enumerate(row[1:], 1):
-        here = graph.node("greater_equal", index, graph.constant(place))
-        chosen = graph.node("where", here, node, chosen)
+def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) -> numpy.ndarray:
+    """Entries of each row ``(R, choices)`` at some places, ``(R, places)``."""
+    chosen = numpy.empty((len(rows), len(places)), dtype=numpy.int64)
+    open_rows, open_places = [], []
+    graph.begin_group()
+    for r, row in enumerate(rows.tolist()):
+        values = [graph.values[node] for node in row]
+        table = None
+        if None not in values and not builtins.any(graph.logical[node] for node in row):
+            table = numpy.array(values, dtype=float)
+        for p, index in enumerate(places):
+            known = graph.values[index]
+            if known is not None:
+                chosen[r, p] = row[int(known)]
+            elif table is not None:
+                chosen[r, p] = graph.take(table, index)
+            else:
+                open_rows.append(r)
+                open_places.append(p)
+    if open_rows:
+        choices = Traced(rows[open_rows].T, dtype)
+        index = Traced(numpy.array(places)[open_places], float64)
+        # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
+        index = where(less(index, 0.0), add(index, float(rows.shape[-1])), index)
+        found = choices[0]
+        for place, choice in enumerate(list(choices)[1:], 1):
+            found = where(greater_equal(index, float(place)), choice, found)
+        chosen[open_rows, open_places] = found.nodes
     return chosen
 
 

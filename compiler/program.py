@@ -95,6 +95,7 @@ class Graph:
         operations: name of every expression.
         arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
         values: value of a constant, None of what varies.
+        groups: number of the array operation that made an expression: those of one do not depend on one another.
         tables: what ``take`` and ``product`` read, ``(length,)`` each.
         loops: whether products with large matrices of constants may be kept whole, for code that has loops.
     """
@@ -105,6 +106,8 @@ class Graph:
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
         self.logical: list[bool] = []
+        self.groups: list[int] = []
+        self.group = 0
         self.tables: list[numpy.ndarray] = []
         self._found: dict[Any, int] = {}
 
@@ -116,7 +119,12 @@ class Graph:
             self.arguments.append(arguments)
             self.values.append(value)
             self.logical.append(logical)
+            self.groups.append(self.group)
         return found
+
+    def begin_group(self) -> None:
+        """Say that what is made from now on is another array operation."""
+        self.group += 1
 
     def input(self, argument: int, row: int) -> int:
         """Number in a row of an argument."""
@@ -188,10 +196,10 @@ class Graph:
         simpler = self._simpler(name, arguments, values)
         if simpler is not None:
             return simpler
-        if name in COMMUTATIVE and arguments[1] < arguments[0]:
-            arguments = (arguments[1], arguments[0])
+        # Found in either order, and kept in the order of the array operation, whose members are alike then.
+        key = (name, *(sorted(arguments) if name in COMMUTATIVE else arguments))
         logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
-        return self._intern((name, *arguments), name, arguments, None, logical)
+        return self._intern(key, name, arguments, None, logical)
 
     def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
         """The same with less work, for finite numbers."""
@@ -298,6 +306,8 @@ class Program(NamedTuple):
     """``(n,)``: scalars, then the tables one after the other."""
     results: list[Result]
     """``node`` is a step's place."""
+    origins: Sequence[tuple[int, int]] = ()
+    """For each step the number of the array operation that made it, and one that grows from member to member."""
 
 
 @without_collection()
@@ -331,4 +341,5 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     constants = numpy.concatenate(
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
-    return Program(steps, constants, [Result(r.argument, r.row, place[r.node]) for r in wanted])
+    results = [Result(r.argument, r.row, place[r.node]) for r in wanted]
+    return Program(steps, constants, results, [(graph.groups[node], node) for node in order])

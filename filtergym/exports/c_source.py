@@ -18,7 +18,9 @@ from ..baselines.fitted_filters import LogSetup
 from ..compiler.c_source import (
     DOUBLE,
     FLOAT,
+    Arrays,
     Parameter,
+    Rows,
     Scalar,
     comment,
     function_text,
@@ -36,7 +38,10 @@ from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
+    ESTIMATE,
+    INITIAL,
     LIKELIHOODS,
+    MEASUREMENT,
     SHOWN,
     STATE,
     TracedFilter,
@@ -99,6 +104,11 @@ class Writer:
             for part in parts
         ]
 
+    def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
+        """Numbers of a struct one after the other: it has no members of another kind."""
+        pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
+        return Rows(pointer, self.structs[part].numbers)
+
     def _start(self) -> tuple[str, Any]:
         to, given = self.structs["state"].places, self.structs["initial"].places
         parameters = self._parameters("state", "initial")
@@ -109,6 +119,7 @@ class Writer:
             lambda _, row: f"initial->{given[row]}",
             lambda _, row: f"state->{to[row]}",
             self.scalar,
+            arrays=Arrays({INITIAL: self._rows("initial")}, {STATE: self._rows("state", qualifier="")}),
         )
         body = list(source.body)
         if self.memory:
@@ -141,6 +152,12 @@ class Writer:
                 return f"shown[{row}]"
             return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
 
+        read_rows = {STATE: self._rows("state"), MEASUREMENT: self._rows("measurement")}
+        written = {STATE: self._rows("state", "next", ""), ESTIMATE: self._rows("estimate", qualifier="")}
+        if traced.network is not None:
+            read_rows[ANSWER] = Rows("answer", range(count_answers(traced.network)))
+            written[SHOWN] = Rows("shown", range(traced.shown))
+        arrays = Arrays(read_rows, written)
         source = write_program(
             traced.update,
             f"{own}_update",
@@ -150,6 +167,7 @@ class Writer:
             self.scalar,
             between=between,
             results=traced.shown,
+            arrays=arrays,
         )
         body = list(source.body)
         if self.has_state:

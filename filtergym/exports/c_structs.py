@@ -20,6 +20,12 @@ class Structure(NamedTuple):
     columns: dict[int, str]
     """Row of the argument to a name in a table."""
 
+    @property
+    def numbers(self) -> dict[int, int]:
+        """Row of the argument to its place among the numbers of the struct, which has no others before them."""
+        rows = [row for _, _, _, own in self.arrays for row in own]
+        return {row: place for place, row in enumerate(rows)}
+
 
 def structure(name: str, members: Sequence[Member]) -> Structure:
     """Give numbers their places in a struct: an array of which every entry is there stays one, of others the entries

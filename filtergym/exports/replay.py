@@ -208,8 +208,9 @@ class _CompiledUpdate:
         code, shown = traced.update, traced.shown
         self._whole, self._before = _Code(code, E), None
         if shown:  # what a network is shown is computed before it is asked, and once more with its answer
-            steps = code.steps[: first_steps(code, shown)]
-            self._before = _Code(Program(steps, code.constants, code.results[:shown]), E)
+            first = first_steps(code, shown)
+            steps, origins = code.steps[:first], code.origins[:first]
+            self._before = _Code(Program(steps, code.constants, code.results[:shown], origins), E)
 
     def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
         if network is not None and self._before is not None:

@@ -1,0 +1,357 @@
+"""A straight line rolled up: what one array operation has made is one statement again, in a loop over its members.
+
+A trace leaves scalars behind, each with the number of the array operation that made it (:attr:`.Program.origins`).
+Members of one operation do not depend on one another: they become a :class:`Statement` of so many members. Statements
+of equal count stand in one loop, where a member may take what the same turn has computed; all else crosses loops
+through a scratch array. What is computed, of what, and in which order its operands stand is as in the straight line, so
+that every bit is.
+"""
+
+import heapq
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from .interpretation import first_steps
+from .parts import FREE
+from .program import Program, without_collection
+
+LEAST = 3
+"""Members of a statement: fewer are statements of their own."""
+MOST = 100
+"""Statements of a loop."""
+SCRATCH, CONSTANTS, TURN = -1, -2, -3
+"""In place of an argument: the scratch array, the constants, and what a statement of the same loop has computed in the
+same turn."""
+
+
+class Operand(NamedTuple):
+    """Where the members of a statement find a number, or leave one."""
+
+    array: int
+    """An argument, or one of ``SCRATCH``, ``CONSTANTS``, ``TURN``."""
+    places: tuple[int, ...]
+    """For every member: a row of the argument, a place in the scratch array, or in the constants; of ``TURN`` the
+    number of the statement alone."""
+    logical: bool = False
+    """Whether it is a truth value: in the arrays one and zero."""
+
+
+class Statement(NamedTuple):
+    """One operation for so many members."""
+
+    number: int
+    operation: str
+    """As of a step, or ``copy``."""
+    operands: tuple[Operand, ...]
+    logical: bool
+    table: tuple[int, int]
+    """Of ``take``: where its table begins in the constants, and its length."""
+    kept: tuple[Operand, ...]
+    """Where its members go beside the turn itself."""
+
+
+class Loop(NamedTuple):
+    """Statements that are computed together, turn by turn."""
+
+    count: int
+    body: list[Statement]
+
+
+class Rolled(NamedTuple):
+    """A program as loops."""
+
+    loops: list[Loop]
+    before: int
+    """Loops that stand before the pause."""
+    scratch: int
+    """Numbers in the scratch array."""
+
+
+class _Draft:
+    """A statement whose places are not known yet: members and operands are steps."""
+
+    def __init__(
+        self,
+        operation: str,
+        members: Sequence[int],
+        columns: Sequence[Sequence[int]],
+        late: bool,
+        logical: bool,
+    ) -> None:
+        self.operation, self.members, self.columns = operation, members, columns
+        self.late, self.logical = late, logical
+        self.count = len(columns[0])
+        self.table = (0, 0)
+        self.group = 0
+        self.loop = -1
+        self.results: list[Operand] = []
+
+
+class _Roller:
+    """What :func:`roll` is made with."""
+
+    def __init__(self, program: Program, results: int) -> None:
+        self.program, self.steps = program, program.steps
+        self.pause = first_steps(program, results)
+        self.drafts: list[_Draft] = []
+        self.where: dict[int, tuple[int, int]] = {}
+        for members in self._alike():
+            self._compute(members)
+        early = program.results[:results]
+        for late, some in ((False, early), (True, program.results[results:])):
+            rows: dict[int, dict[int, int]] = {}
+            for result in some:
+                rows.setdefault(result.argument, {})[result.row] = result.node
+            for argument, nodes in rows.items():
+                self._write(argument, nodes, late)
+        self._copy_what_is_mixed()
+
+    def _add(self, draft: _Draft) -> None:
+        for k, step in enumerate(draft.members):
+            self.where[step] = len(self.drafts), k
+        self.drafts.append(draft)
+
+    # --- what becomes a statement
+
+    def _alike(self) -> Iterator[list[int]]:
+        """Steps of one array operation with one form, in the order of that operation."""
+        steps, origins = self.steps, self.program.origins
+        levels = [0] * len(steps)
+        found: dict[tuple[object, ...], list[int]] = {}
+        for index, step in enumerate(steps):
+            if step.operation in FREE:
+                continue
+            group = origins[index][0]
+            # What one operation makes in several steps.
+            levels[index] = max((levels[x] + 1 for x in step.parts if origins[x][0] == group), default=0)
+            extremes = step.operation in ("maximum", "minimum")
+            known = tuple(extremes and steps[x].operation == "constant" for x in step.parts)
+            truths = tuple(steps[x].logical for x in step.parts)
+            table = step.arguments[:2] if step.operation == "take" else ()
+            key = (
+                index >= self.pause,
+                group,
+                levels[index],
+                step.operation,
+                step.logical,
+                known,
+                truths,
+                table,
+            )
+            found.setdefault(key, []).append(index)
+        for key in sorted(found, key=lambda key: key[:3]):
+            members = sorted(found[key], key=lambda index: origins[index][1])
+            if len(members) < LEAST:
+                yield from ([index] for index in members)
+            else:
+                yield members
+
+    def _compute(self, members: list[int]) -> None:
+        first = self.steps[members[0]]
+        columns = list(zip(*(self.steps[index].parts for index in members), strict=True))
+        draft = _Draft(first.operation, members, columns, members[0] >= self.pause, first.logical)
+        if first.operation == "take":
+            draft.table = first.arguments[0], first.arguments[1]
+        draft.group = self.program.origins[members[0]][0]
+        self._add(draft)
+
+    def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
+        """Statements that write results: those of a whole statement with it, the others together."""
+        by_draft: dict[int, list[tuple[int, int]]] = {}
+        rest = []
+        for row, step in sorted(nodes.items()):
+            if step in self.where:
+                draft, k = self.where[step]
+                by_draft.setdefault(draft, []).append((k, row))
+            else:
+                rest.append(row)
+        for number, pairs in by_draft.items():
+            if [k for k, _ in sorted(pairs)] == list(range(self.drafts[number].count)):
+                self._copy_out(argument, [row for _, row in sorted(pairs)], nodes, late)
+            else:
+                rest += [row for _, row in pairs]
+        rest.sort()
+        for rows in [rest] if len(rest) >= LEAST else [[row] for row in rest]:
+            self._copy_out(argument, rows, nodes, late)
+
+    def _copy_out(self, argument: int, rows: list[int], nodes: dict[int, int], late: bool) -> None:
+        column = [nodes[row] for row in rows]
+        draft = _Draft("copy", (), [column], late, all(self.steps[x].logical for x in column))
+        draft.results.append(Operand(argument, tuple(rows), draft.logical))
+        self._add(draft)
+
+    def _source(self, column: Sequence[int]) -> int | None:
+        """Argument or constants that a whole operand is read from; None: the scratch array."""
+        kinds = {self.steps[x].operation for x in column}
+        if kinds == {"constant"}:
+            return CONSTANTS
+        arguments = {self.steps[x].arguments[0] for x in column}
+        return arguments.pop() if kinds == {"input"} and len(arguments) == 1 else None
+
+    def _copy_what_is_mixed(self) -> None:
+        """Inputs and constants that stand beside other values in an operand are copied to the scratch array, once."""
+        for late in (False, True):
+            sources: dict[int, set[int]] = {}
+            for draft in self.drafts:
+                for column in draft.columns:
+                    if draft.late == late and self._source(column) is None:
+                        for x in column:
+                            if x not in self.where:
+                                source = self._source([x])
+                                assert source is not None
+                                sources.setdefault(source, set()).add(x)
+            for _, inputs in sorted(sources.items()):
+                members = sorted(inputs, key=lambda x: (self.steps[x].arguments, x))
+                draft = _Draft("copy", members, [members], late, False)
+                draft.group = -1 - len(self.drafts)
+                self._add(draft)
+
+    # --- in which order
+
+    def _needs(self, draft: _Draft) -> dict[int, bool]:
+        """Statements that one takes members of, and whether the same turn of a loop will do."""
+        needs: dict[int, bool] = {}
+        for column in draft.columns:
+            if self._source(column) is None:
+                turn = self._same_turn(column)
+                for number in {self.where[x][0] for x in column}:
+                    needs[number] = needs.get(number, True) and number == turn
+        return needs
+
+    def _same_turn(self, column: Sequence[int]) -> int | None:
+        """Statement whose members these are, one by one."""
+        number = self.where[column[0]][0]
+        return number if list(column) == list(self.drafts[number].members) else None
+
+    def schedule(self) -> list[list[int]]:
+        """Put every statement into a loop with others of its count, as early as what it takes allows."""
+        drafts = self.drafts
+        waits = [0] * len(drafts)
+        users: list[list[tuple[int, bool]]] = [[] for _ in drafts]
+        for number, draft in enumerate(drafts):
+            for other, turn in self._needs(draft).items():
+                waits[number] += 1
+                users[other].append((number, turn))
+        loops: list[list[int]] = []
+        ready: dict[tuple[bool, int], list[int]] = {}
+
+        def release(number: int) -> None:
+            waits[number] -= 1
+            if waits[number] <= 0:
+                draft = drafts[number]
+                heapq.heappush(ready.setdefault((draft.late, draft.count), []), number)
+
+        for number in [number for number, count in enumerate(waits) if count == 0]:
+            release(number)
+        while any(ready.values()):
+            late = min(key[0] for key, waiting in ready.items() if waiting)
+            _, kind = min((waiting[0], key) for key, waiting in ready.items() if waiting and key[0] == late)
+            body: list[int] = []
+            after: list[int] = []
+            while ready[kind] and len(body) < MOST:
+                number = heapq.heappop(ready[kind])
+                drafts[number].loop = len(loops)
+                body.append(number)
+                for user, turn in users[number]:
+                    if turn:
+                        release(user)
+                    else:
+                        after.append(user)
+            for user in after:
+                release(user)
+            loops.append(body)
+        return loops
+
+    # --- where
+
+    def finish(self) -> Rolled:
+        """Loops with the places of all that crosses them."""
+        loops = self.schedule()
+        drafts = self.drafts
+        turns: dict[tuple[int, int], int] = {}
+        last: dict[int, int] = {}
+        kept: set[int] = set()
+        for number, draft in enumerate(drafts):
+            for i, column in enumerate(draft.columns):
+                if self._source(column) is not None:
+                    continue
+                turn = self._same_turn(column)
+                if turn is not None and drafts[turn].loop == draft.loop:
+                    turns[number, i] = turn
+                    continue
+                for other in {self.where[x][0] for x in column}:
+                    kept.add(other)
+                    group = drafts[other].group
+                    last[group] = max(last.get(group, 0), draft.loop)
+        at, scratch = self._slots(kept, last)
+
+        def operand(number: int, i: int, column: Sequence[int]) -> Operand:
+            logical = (
+                drafts[number].logical
+                if drafts[number].operation == "copy"
+                else self.steps[column[0]].logical
+            )
+            if (number, i) in turns:
+                return Operand(TURN, (turns[number, i],), logical)
+            source = self._source(column)
+            if source is None:
+                places = [self.where[x] for x in column]
+                return Operand(SCRATCH, tuple(at[other] + k for other, k in places), logical)
+            place = 0 if source == CONSTANTS else 1
+            return Operand(source, tuple(self.steps[x].arguments[place] for x in column), logical)
+
+        def statement(number: int) -> Statement:
+            draft = drafts[number]
+            own = tuple(operand(number, i, column) for i, column in enumerate(draft.columns))
+            to = list(draft.results)
+            if number in kept:
+                to.append(Operand(SCRATCH, tuple(range(at[number], at[number] + draft.count)), draft.logical))
+            return Statement(number, draft.operation, own, draft.logical, draft.table, tuple(to))
+
+        made = [Loop(drafts[body[0]].count, [statement(number) for number in body]) for body in loops]
+        before = sum(not drafts[body[0]].late for body in loops)
+        return Rolled(made, before, scratch)
+
+    def _slots(self, kept: Iterable[int], last: dict[int, int]) -> tuple[dict[int, int], int]:
+        """Place in the scratch array of the first member of every statement that is kept, and its length; what one
+        array operation made lies together as long as any of it is needed.
+        """
+        inside: dict[int, int] = {}
+        sizes: dict[int, int] = {}
+        first: dict[int, int] = {}
+        for number in sorted(kept):
+            draft = self.drafts[number]
+            inside[number] = sizes.get(draft.group, 0)
+            sizes[draft.group] = inside[number] + draft.count
+            first[draft.group] = min(first.get(draft.group, draft.loop), draft.loop)
+        busy: list[tuple[int, int, int]] = []
+        base: dict[int, int] = {}
+        for group in sorted(sizes, key=lambda group: (first[group], group)):
+            busy = sorted(entry for entry in busy if entry[2] >= first[group])
+            place = 0
+            for start, end, _ in busy:
+                if start - place >= sizes[group]:
+                    break
+                place = max(place, end)
+            base[group] = place
+            busy.append((place, place + sizes[group], last[group]))
+        top = max((base[group] + sizes[group] for group in sizes), default=0)
+        return {number: base[self.drafts[number].group] + k for number, k in inside.items()}, top
+
+
+@without_collection()
+def roll(program: Program, results: int = 0) -> Rolled:
+    """Roll a program up.
+
+    Args:
+        program: with origins, and without products that are loops.
+        results: first results that are written before any other input than theirs is read.
+    """
+    return _Roller(program, results).finish()
+
+
+def steady(places: Sequence[int]) -> int | None:
+    """Distance from each place to the next, where it is always the same."""
+    step = places[1] - places[0] if len(places) > 1 else 0
+    return step if all(b - a == step for a, b in pairwise(places)) else None
