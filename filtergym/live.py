@@ -1,6 +1,7 @@
 """Run what competes in a loop of one's own."""
 
 import dataclasses
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ def online(
     tracks: int = 1,
     regular: bool = False,
     second_sensor: bool = False,
+    lag: int | timedelta = 0,
     backend: str = "auto",
     trust: bool = False,
     **keywords: Any,
@@ -43,6 +45,9 @@ def online(
         regular: every measurement comes, one sampling interval after the one before; some filters are then simpler.
         second_sensor: a measurement holds what only recordings do, such as odometry; what ``advise`` has fitted to one
             takes it anyway.
+        lag: how late a measurement may come: after how many that are newer, or a :class:`datetime.timedelta` after the
+            newest. These are kept, each with the state of the filter before it: in ManeuveringTarget from 5 kB each
+            (``imm``) to 43 kB (``semi-markov-vague``), for each eight tracks begun. Default: times must increase.
         backend: what computes, "auto", "compiled" or "numpy".
         trust: load a model's zip, which can execute code.
         **keywords: parameters of the task.
@@ -72,11 +77,11 @@ def online(
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
     range = training_range(problem.task, maker)
     if range is None:
-        return OnlineFilter(model, maker, kind, name, tracks)
+        return OnlineFilter(model, maker, kind, name, tracks, lag=lag)
     if kind == "estimator":
         estimator = maker(model.task)
         watch = WatchedPolicy(estimator.network, range)
         estimator.filter.decider.ask = watch.act
-        return OnlineFilter(model, estimator, kind, name, tracks, watch)
+        return OnlineFilter(model, estimator, kind, name, tracks, watch, lag)
     watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), range)
-    return OnlineFilter(model, watch, kind, name, tracks, watch)
+    return OnlineFilter(model, watch, kind, name, tracks, watch, lag)

@@ -2,6 +2,7 @@
 
 import pickle
 import runpy
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -338,6 +339,170 @@ def test_what_an_environment_needs_is_said():
     assert np.isfinite(held.mean).all()
     with pytest.raises(ValueError, match="needs command at every measurement"):
         uav.update(reading=np.zeros(sensors), control=0.0)
+
+
+# --- late measurements
+
+
+def plots(count, seed=0):
+    """Times and values of plots of a target that drives past, some of them missed."""
+    rng = np.random.default_rng(seed)
+    time = 4.0 * np.arange(1, count + 1) + rng.uniform(-1.0, 1.0, count)
+    x, y = 1e4 - 200.0 * time + rng.normal(0, 100, count), 2e4 + 50.0 * time + rng.normal(0, 100, count)
+    return [
+        (t, {} if k % 7 == 5 else {"x": a, "y": b})
+        for k, (t, a, b) in enumerate(zip(time, x, y, strict=True))
+    ]
+
+
+def out_of_order(rows, lag, seed=0):
+    """The same rows, each after at most ``lag`` of those that are newer."""
+    delayed = np.arange(len(rows)) + np.random.default_rng(seed).uniform(0.0, lag, len(rows))
+    return [rows[i] for i in np.argsort(delayed, kind="stable")]
+
+
+@pytest.mark.parametrize("name", ["imm", "semi-markov-vague", "bptt", "kalman-net", Last])
+@pytest.mark.parametrize("lag", [4, timedelta(seconds=24.0)])
+def test_late_measurements_are_taken_in_as_if_they_had_come_in_time(name, lag):
+    """The filter is saved between two measurements and goes on elsewhere; its buffer goes along."""
+    rows = plots(30)
+    late = out_of_order(rows, 4)
+    assert [t for t, _ in late] != sorted(t for t, _ in late)
+    ordered = filtergym.online(RADAR, name, sampling_interval=4.0)
+    ordered.start(STATE, COVARIANCE)
+    for time, values in rows:
+        expected = ordered.update(time, **values)
+    filter, other = (filtergym.online(RADAR, name, sampling_interval=4.0, lag=lag) for _ in range(2))
+    filter.start(STATE, COVARIANCE)
+    newest = 0.0
+    for k, (time, values) in enumerate(late):
+        newest = max(newest, time)
+        assert filter.update(time, **values).time == newest
+        if k == 12:
+            saved, filter = pickle.loads(pickle.dumps(filter.save())), other
+            filter.restore(saved)
+    found = filter.update(newest + 4.0)
+    expected = ordered.update(newest + 4.0)
+    np.testing.assert_array_equal(found.mean, expected.mean)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    assert filter.too_late == 0
+
+
+@pytest.mark.parametrize(("lag", "kept"), [(3, 3), (timedelta(seconds=9.0), 3)])
+def test_what_is_older_than_the_buffer_is_counted_and_refused(lag, kept):
+    filter = filtergym.online(RADAR, "imm", sampling_interval=4.0, lag=lag)
+    filter.start(STATE, COVARIANCE)
+    sizes = []
+    for k in range(1, 30):
+        filter.update(4.0 * k, x=1e4 - 800.0 * k, y=2e4)
+        sizes.append(len(pickle.dumps(filter.save())))
+    assert len(filter.save().history.taken) == kept
+    assert max(sizes[kept:]) - min(sizes[kept:]) < 200
+    before = filter.predict().mean
+    for count in (1, 2):
+        with pytest.raises(
+            ValueError, match=rf"of 50.0 s comes too late: .* until 104.0 s is settled; {count} were"
+        ):
+            filter.update(50.0, x=0.0, y=0.0)
+        assert filter.too_late == filter.save().too_late == count
+    np.testing.assert_array_equal(filter.predict().mean, before)
+    with pytest.raises(ValueError, match="time must increase"):
+        filter.predict(110.0)
+    filter.start(STATE, COVARIANCE)
+    assert filter.too_late == 0
+    with pytest.raises(ValueError, match=r"until 0.0 s is settled"):
+        filter.update(0.0, x=0.0, y=0.0)
+
+
+def test_a_late_measurement_that_cannot_be_leaves_the_filter_as_it_was():
+    filter = filtergym.online(RADAR, "kalman-imm-turn", sampling_interval=4.0, lag=5)
+    filter.start(STATE, COVARIANCE)
+    for k in range(1, 5):
+        filter.update(4.0 * k, x=1e4 - 800.0 * k, y=2e4)
+    saved, before = filter.save(), filter.predict().mean
+    for values, sentence in (
+        ({"x": "east", "y": 0.0}, "x must be numbers"),
+        ({"z": 1.0}, "unknown value 'z'"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            filter.update(9.0, **values)
+    with pytest.raises(ValueError, match="apart"):
+        filter.update(12.0 - 1e-9, x=0.0, y=0.0)
+    np.testing.assert_array_equal(filter.predict().mean, before)
+    assert len(filter.save().history.taken) == len(saved.history.taken) == 4
+    filter.update(10.0, x=8e3, y=2e4)
+    assert not np.array_equal(filter.predict(20.0).mean, before)
+    filter.restore(saved)
+    np.testing.assert_array_equal(filter.predict().mean, before)
+
+
+def test_what_comes_late_for_a_time_supplies_what_was_missing_then():
+    ordered, filter = (
+        filtergym.online(LOOSE, "plain-reduced"),
+        filtergym.online(LOOSE, "plain-reduced", lag=5),
+    )
+    for each in (ordered, filter):
+        each.start([0.0], [[0.0]])
+    fixes = [None, 0.25, None, 0.45]
+    for k, fix in enumerate(fixes, 1):
+        expected = ordered.update(0.1 * k, ins=0.1 * k, fix=fix)
+        filter.update(0.1 * k, ins=0.1 * k)
+    filter.update(0.1 * 4, fix=0.45)
+    found = filter.update(0.1 * 2, fix=0.25)
+    np.testing.assert_array_equal(found.mean, expected.mean)
+    with pytest.raises(ValueError, match="time must increase"):
+        filter.update(0.1 * 2, fix=0.3)  # it has another fix of that time
+
+
+def test_fixes_of_one_time_are_fused_also_when_they_come_late():
+    ordered, filter = (
+        filtergym.online(RADAR, "kalman-imm-turn", sampling_interval=4.0, lag=n) for n in (0, 5)
+    )
+    rows = [(4.0, 9.2e3), (8.0, 8.3e3), (8.0, 8.5e3), (12.0, 7.6e3)]
+    last = []
+    for each, order in ((ordered, rows), (filter, [rows[i] for i in (0, 1, 3, 2)])):
+        each.start(STATE, COVARIANCE)
+        last.append([each.update(time, x=x, y=2e4) for time, x in order][-1])
+    np.testing.assert_array_equal(last[0].mean, last[1].mean)
+
+
+def test_late_measurements_of_several_tracks():
+    filter = filtergym.online(RADAR, "imm", tracks=2, sampling_interval=4.0, lag=5)
+    filter.start(np.array([STATE, STATE]).T, np.stack([COVARIANCE, COVARIANCE], axis=2))
+    for time in (4.0, 8.0, 16.0):
+        filter.update(time, x=[1e4, 1e4], y=[2e4, 2e4])
+    with pytest.raises(ValueError, match=r"late for all of them alike, got \[12.0, 20.0\]"):
+        filter.update([12.0, 20.0], x=[1e4, 1e4], y=[2e4, 2e4])
+    filter.update([12.0, 12.5], x=[1e4, 1e4], y=[2e4, 2e4])
+    filter.start(
+        np.array([STATE, STATE]).T, np.stack([COVARIANCE, COVARIANCE], axis=2), time=16.0, tracks=[1]
+    )
+    with pytest.raises(ValueError, match="too late"):
+        filter.update(13.0, x=[1e4, 1e4], y=[2e4, 2e4])
+
+
+@pytest.mark.parametrize("lag", [-1, 2.5, True, "2 s", timedelta(seconds=-1.0)])
+def test_a_lag_is_a_number_of_measurements_or_a_time(lag):
+    with pytest.raises(ValueError, match="lag must"):
+        filtergym.online(RADAR, "imm", lag=lag)
+
+
+@pytest.mark.parametrize("name", ["imm", "adaptive", "bptt"])
+def test_fixes_too_near_in_time_are_no_speed(name):
+    """Noise in a fix makes at most ten times the speed that it makes after a sampling interval."""
+    filter = filtergym.online(RADAR, name, sampling_interval=4.0)
+    filter.start(STATE, COVARIANCE)
+    before = filter.update(4.0, x=9.2e3, y=2.02e4)
+    for later in (1e-6, 0.1, 0.399):
+        with pytest.raises(ValueError, match=r"at least 0.4 s apart, got .* gains of .* are made for 4 s"):
+            filter.update(4.0 + later, x=9.2e3, y=2.02e4)
+
+    def moved(interval):
+        noise = np.array([150.0, -150.0])
+        x, y = before.mean[:2] + interval * before.mean[2:] + noise
+        return np.hypot(*(filter.predict(4.0 + interval, x=x, y=y).mean - before.mean)[2:])
+
+    assert moved(0.4) < 10.5 * moved(4.0)
 
 
 # --- careless callers

@@ -475,6 +475,47 @@ def test_a_timed_model_takes_measurements_of_any_time(make, policy):
         filter.update(60.0 + 1e-7, values=[1.0])
 
 
+@pytest.mark.parametrize("policy", ["kalman", "extended", "unscented"])
+def test_a_timed_model_takes_late_measurements_where_they_belong(make, policy):
+    """Against the naive filter that has all of them in order, the last digits of a matrix inverse aside."""
+    f, F_of = MOVES["nonlinear"]
+    id = make(f=f, Q=noise_of, covariance=0.1 * np.eye(2), sampling_interval=0.1).id
+    rng = np.random.default_rng(2)
+    times, z = np.cumsum(rng.uniform(0.02, 0.2, 40)), rng.normal(0.0, 1.0, 40)
+    filter, ordered = filtergym.online(id, policy, lag=6), filtergym.online(id, policy)
+    for each in (filter, ordered):
+        each.start(mean=[0, 1], covariance=0.1 * np.eye(2))
+    for k in np.argsort(np.arange(40) + rng.uniform(0.0, 6.0, 40)):
+        filter.update(times[k], values=[z[k]])
+    for time, value in zip(times, z, strict=True):
+        expected = ordered.update(time, values=[value])
+    found = filter.update(times[-1] + 1.0)
+    expected = ordered.update(times[-1] + 1.0)
+    np.testing.assert_array_equal(found.mean, expected.mean)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    if policy != "unscented":
+        steps = [*zip(np.diff([0.0, *times]), z, strict=True), (1.0, np.nan)]
+        mean, P = naive_timed(f, F_of, np.array([0.0, 1.0]), 0.1 * np.eye(2), steps)
+        np.testing.assert_allclose(found.mean, mean, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance, P, rtol=1e-9)
+
+
+def test_a_model_of_a_fixed_interval_is_supplied_late_with_what_was_missing(make):
+    id = make(h=np.eye(2), R=np.eye(2)).id
+    filter, ordered = filtergym.online(id, "kalman", lag=3), filtergym.online(id, "kalman")
+    rows = [[1.0, 1.1], [2.2, 0.9], [2.9, 1.0]]
+    for each in (filter, ordered):
+        each.start(mean=[0, 1], covariance=np.eye(2))
+    for row in rows:
+        expected = ordered.update(values=row)
+        filter.update(values=[row[0], np.nan])
+    for time in (3.0, 1.0, 2.0):
+        found = filter.update(time, values=[np.nan, rows[int(time) - 1][1]])
+    np.testing.assert_array_equal(found.mean, expected.mean)
+    with pytest.raises(ValueError, match="moves by 1 s from one measurement to the next"):
+        filter.update(1.5, values=[1.0, 1.0])
+
+
 def test_a_timed_model_that_moves_in_no_time_takes_one_measurement_at_a_time(make):
     filter = filtergym.online(make(f=lambda x, dt: [x[0] + dt * x[1] + 1.0, x[1]], Q=noise_of).id, "kalman")
     filter.start(mean=[0, 1], covariance=np.eye(2))

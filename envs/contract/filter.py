@@ -52,6 +52,8 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     """Whether ``start`` and ``update`` run as Python code, whatever computes the rest: they cannot be traced."""
     adapts_covariance: ClassVar[bool] = False
     """Whether the covariance that is reported grows with the innovations."""
+    least_interval: ClassVar[float] = 0.0
+    """Share of the sampling interval from which on its gains are good for the time between two measurements."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task

@@ -42,6 +42,10 @@ LARGEST_SHARE = 1e8
 """Of what an acceleration leaves over the covariance that the gains give."""
 
 
+LEAST_INTERVAL = 0.1
+"""Of the sampling interval: beta over the time is what turns position noise into speed, ten times too large here."""
+
+
 class AlphaBeta(NamedTuple):
     """One alpha-beta filter with the covariance that belongs to the gains it used."""
 
@@ -175,6 +179,7 @@ class GainBank(RadarBank):
     """Control ``gain``: one filter, whose position gain the action sets."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    least_interval = LEAST_INTERVAL
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -342,6 +347,8 @@ class GainBank(RadarBank):
 
 class FilterBank(RadarBank):
     """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
+
+    least_interval = LEAST_INTERVAL
 
     def __init__(self, task: "ManeuveringTarget", control: str) -> None:
         super().__init__(task, control)

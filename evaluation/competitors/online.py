@@ -6,8 +6,9 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 import copy
 import importlib.metadata
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, NamedTuple, Protocol
 
 import numpy
@@ -85,6 +86,27 @@ class Estimate:
         return ", ".join(f"{name} {mean:.6g} ± {sigma:.2g} {unit}" for name, mean, sigma, unit in each)
 
 
+class Taken(NamedTuple):
+    """A measurement that was taken in."""
+
+    time: numpy.ndarray
+    """s, ``(N,)``."""
+    values: Mapping[str, Any]
+    """What the sensors said."""
+    before: "OnlineState"
+    """Without a history."""
+
+
+@dataclass(frozen=True)
+class History:
+    """The last measurements in the order of their times. Nothing in it ever changes, so that copies share it."""
+
+    taken: tuple[Taken, ...] = ()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "History":
+        return self
+
+
 class OnlineState(NamedTuple):
     """All that a running filter remembers; it can be pickled.
 
@@ -111,6 +133,10 @@ class OnlineState(NamedTuple):
     """Memory of the watch."""
     owner: tuple[str, ...] = ()
     """Of which filter it is; no other goes on from it."""
+    history: History = History()
+    """Of a filter that takes late measurements, what these may have to be followed by again."""
+    too_late: int = 0
+    """Measurements so far that were older than the history."""
 
 
 class OnlineFilter:
@@ -123,6 +149,8 @@ class OnlineFilter:
         name: of it, in errors.
         tracks: how many are followed side by side.
         watch: looks at what a network inside is shown; None where there is none.
+        lag: how many measurements, or how much time, a measurement may come late; see :meth:`update`. For each of those
+            kept, the filter's state is, and what the policy or estimator remembers.
 
     Raises:
         ValueError: for what cannot run ahead of the truth or of later measurements.
@@ -136,13 +164,14 @@ class OnlineFilter:
         name: str,
         tracks: int = 1,
         watch: Watch | None = None,
+        lag: int | timedelta = 0,
     ) -> None:
         if kind not in ("policy", "estimator"):
             raise ValueError(
                 f"{name!r} is of kind {kind} and cannot run online: choose a policy or an estimator"
             )
         tracks = check_integer("tracks", tracks, 1)
-        self.name, self.tracks, self.watch = name, tracks, watch
+        self.name, self.tracks, self.watch, self._lag = name, tracks, watch, _check_lag(lag)
         self.task = model.task
         initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
         if self.task.recording.second_sensor:
@@ -191,7 +220,8 @@ class OnlineFilter:
             mean: initial estimate, ``(C,)``, or of several tracks ``(C, N)``.
             covariance: of its error, ``(C, C)`` or ``(C, C, N)``.
             time: s, a number or ``(N,)``.
-            tracks: numbers of those that start anew while the others go on; default: all.
+            tracks: numbers of those that start anew while the others go on; default: all. What came before them cannot
+                come late any more, of any track.
             **values: what else the environment is given at the start, see ``input.start_values``.
 
         Raises:
@@ -230,43 +260,104 @@ class OnlineFilter:
     def update(self, time: Any = None, **values: Any) -> Estimate:
         """Take a measurement in; one of the same time as the last is fused with it, where the sensors allow it.
 
+        With a ``lag``, a measurement may be older than the last: it is taken in where it belongs, and those after it
+        are taken in again. At the time of another it supplies what that one lacks, or else is fused with it.
+
         Args:
             time: s, a number or ``(N,)``; default: one sampling interval after the last.
             **values: what the sensors say, by the names of ``input.values``; what did not come is None, NaN or left
                 out. Numbers, or arrays of one track; for several tracks with N last.
 
         Returns:
-            The estimate at that time.
+            The estimate at that time; of a late measurement at the time of the last one.
 
         Raises:
-            ValueError: for what is missing, unknown or of another shape, or a time that does not increase.
+            ValueError: for what is missing, unknown or of another shape, or a time that does not increase, or comes
+                later than ``lag`` allows; the filter is then as it was, but for :attr:`too_late`.
         """
+        at = self._time_of(time)
+        self.input.check_names(values, self.input.values)
+        if self._lag and (at <= self._running().input["time"]).any():
+            return self._take_late(at, values)
+        return self._take(at, values)
+
+    @property
+    def too_late(self) -> int:
+        """Measurements since the start that were refused because ``lag`` does not reach back to them."""
+        return self._running().too_late
+
+    def _take(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
+        """Take in a measurement that is not older than the last."""
         before = self._running()
         last = before.input["time"]
-        at = last + self._default_interval() if time is None else self._times(time)
         together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
         if not ((at > last).all() or together):
             raise ValueError(
-                f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(time)}"
+                f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(_plain(at))}"
             )
-        self.input.check_names(values, self.input.values)
-        if together:
-            return self._fuse(at, values)
-        self._check_interval(at - last, time)
-        for scan in self._missed_scans(last, at):
-            self._step(scan, {})
-        return self._step(at, values)
-
-    def _fuse(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
-        """Take in one more measurement of the same time."""
-        saved = self.save()
-        found = self._step(at, values)
-        if not (numpy.isfinite(found.mean).all() and numpy.isfinite(found.covariance).all()):
-            self.restore(saved)
-            raise ValueError(
-                f"{self.name!r} cannot take two measurements of one time, {_plain(at)} s: give the second a later one"
-            )
+        if not together:
+            self._check_interval(at - last, at)
+        scans = [] if together else self._missed_scans(last, at)
+        kept = self._snapshot() if self._lag or together or scans else None
+        try:
+            for scan in scans:
+                self._step(scan, {})
+            found = self._step(at, values)
+            if together and not (numpy.isfinite(found.mean).all() and numpy.isfinite(found.covariance).all()):
+                raise ValueError(
+                    f"{self.name!r} cannot take two measurements of one time, {_plain(at)} s: give the second a later "
+                    "one"
+                )
+        except BaseException:
+            if kept is not None:
+                self._resume(kept)
+            raise
+        if self._lag and kept is not None:
+            self._remember(Taken(at, copy.deepcopy(values), kept._replace(history=History())))
         return found
+
+    def _take_late(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
+        """Take a measurement in where it belongs, and again what came after it."""
+        state = self._running()
+        taken = state.history.taken
+        oldest = taken[0].before.input["time"] if taken else state.input["time"]
+        if not (at > oldest).all():
+            self._state = state._replace(too_late=state.too_late + 1)
+            raise ValueError(
+                f"the measurement of {_plain(at)} s comes too late: what came until {_plain(oldest)} s is settled; "
+                f"{state.too_late + 1:,} were refused so far, and a longer lag takes more"
+            )
+        place = sum(bool((one.time <= at).all()) for one in taken)
+        before, after = taken[:place], taken[place:]
+        if not all((one.time > at).all() for one in after):
+            raise ValueError(
+                f"a measurement of several tracks is late for all of them alike, got {reprlib.repr(at.tolist())}"
+            )
+        again = [(at, values), *((one.time, one.values) for one in after)]
+        if before and (before[-1].time == at).all():
+            both = _supply(before[-1].values, values)
+            if both is not None:
+                again[0] = at, both
+                before, after = before[:-1], (before[-1], *after)
+        kept = self._snapshot()
+        try:
+            if after:
+                self._resume(after[0].before._replace(history=History(before), too_late=state.too_late))
+            return [self._take(time, said) for time, said in again][-1]
+        except BaseException:
+            self._resume(kept)
+            raise
+
+    def _remember(self, one: Taken) -> None:
+        """Keep a measurement, and let go those to which ``lag`` does not reach back any more."""
+        state = self._running()
+        taken = (*state.history.taken, one)
+        if isinstance(self._lag, timedelta):
+            first = one.time - self._lag.total_seconds()
+            taken = tuple(old for old in taken if (old.time >= first).any())
+        else:
+            taken = taken[-self._lag :]
+        self._state = state._replace(history=History(taken))
 
     def _missed_scans(self, last: numpy.ndarray, at: numpy.ndarray) -> list[numpy.ndarray]:
         """Times of the scans between that missed the target, as a log that is read has them; none where the filter was
@@ -283,7 +374,7 @@ class OnlineFilter:
             )
         return [last + (at - last) * number / scans for number in range(1, scans)]
 
-    def _step(self, at: numpy.ndarray, values: dict[str, Any]) -> Estimate:
+    def _step(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
         """Advance to a time and take in what came."""
         before = self._running()
         measurement, memory = self.input.measure(before.input, at, values)
@@ -307,14 +398,19 @@ class OnlineFilter:
         Raises:
             ValueError: as of :meth:`update`.
         """
-        saved = self.save()
+        at = self._time_of(time)
+        self.input.check_names(values, self.input.values)
+        kept = self._snapshot()
         try:
-            return self.update(time, **values)
+            return self._take(at, values)
         finally:
-            self.restore(saved)
+            self._resume(kept)
 
     def save(self) -> OnlineState:
         """Return all that it remembers, to go on from it later, also in another process."""
+        return self._snapshot()._replace(owner=self._owner)
+
+    def _snapshot(self) -> OnlineState:
         state = self._running()
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(
@@ -322,7 +418,6 @@ class OnlineFilter:
                 filter=self._stepper.state,
                 python=None if own is None else (own.memory, own.step),
                 watch=None if self.watch is None else self.watch.memory,
-                owner=self._owner,
             )
         )
 
@@ -338,6 +433,10 @@ class OnlineFilter:
             raise ValueError(
                 f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
             )
+        self._resume(state if self._lag else state._replace(history=History()))
+
+    def _resume(self, state: OnlineState) -> None:
+        """Go on from a snapshot, which stays as it is."""
         state = copy.deepcopy(state)
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step = state.python
@@ -421,15 +520,23 @@ class OnlineFilter:
             raise ValueError(f"{self.task.id} has no sampling interval: give update the time")
         return float(interval)
 
-    def _check_interval(self, interval: numpy.ndarray, time: Any) -> None:
-        """Raise ValueError for times that are closer than any sensor is read: motion within them is rounding."""
-        least = (
-            LEAST_INTERVAL * self._default_interval() if time is not None and self._has_interval() else 0.0
-        )
+    def _time_of(self, time: Any) -> numpy.ndarray:
+        """Return the time of a measurement, ``(N,)``, s."""
+        return self._running().input["time"] + self._default_interval() if time is None else self._times(time)
+
+    def _check_interval(self, interval: numpy.ndarray, at: numpy.ndarray) -> None:
+        """Raise ValueError for times that are closer than any sensor is read, where motion is rounding, or than the
+        gains of the filter allow.
+        """
+        if not self._has_interval():
+            return
+        usual, share = self._default_interval(), self.model.filter.least_interval
+        least = max(LEAST_INTERVAL, share) * usual
         if (interval < least).any():
+            why = f": the gains of {self.name!r} are made for {usual:g} s and make speeds of noise below"
             raise ValueError(
-                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {reprlib.repr(time)} after "
-                f"{_plain(self._running().input['time'])} s"
+                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {reprlib.repr(_plain(at))} s "
+                f"after {_plain(self._running().input['time'])} s{why if share > LEAST_INTERVAL else ''}"
             )
 
     def _check_covariance(self, initial: Any) -> None:
@@ -482,6 +589,7 @@ class OnlineFilter:
             filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
             input=select_nested(chosen, begun.input, old.input),
             fresh=chosen | old.fresh,
+            history=History(),
         )
 
 
@@ -504,3 +612,37 @@ def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
 def _plain(values: numpy.ndarray) -> Any:
     """A number where all are the same."""
     return float(values[0]) if (values == values[0]).all() else values
+
+
+def _check_lag(lag: Any) -> int | timedelta:
+    """Return how late a measurement may come, or raise ValueError for what is neither a number nor a time."""
+    if not isinstance(lag, timedelta):
+        return check_integer("lag", lag, 0)
+    if lag < timedelta(0):
+        raise ValueError(f"lag must not be negative, got {lag}")
+    return lag
+
+
+def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Measurement that has what another lacks, both of one time; None where it lacks nothing, or they differ."""
+    both, new = dict(given), False
+    for name, value in late.items():
+        first, second = _numbers(given.get(name)), _numbers(value)
+        there, also = numpy.isfinite(first), numpy.isfinite(second)
+        if not there.any():
+            both[name] = value
+            new |= bool(also.any())
+        elif also.any():
+            if first.shape != second.shape or (first != second)[there & also].any():
+                return None
+            both[name] = numpy.where(there, first, second)
+            new |= bool((also & ~there).any())
+    return both if new else None
+
+
+def _numbers(value: Any) -> numpy.ndarray:
+    """What a sensor said, as numbers; NaN where it is none, which whoever takes it in says."""
+    try:
+        return numpy.asarray(numpy.nan if value is None else value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return numpy.array(numpy.nan)
