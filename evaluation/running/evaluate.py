@@ -17,6 +17,7 @@ from ...envs.contract.task import Scenario, Task
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
+from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
 from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
