@@ -64,12 +64,12 @@ class Disturbance(ABC):
         """
         return None
 
-    def advance(self, state: Any, interval: Array, numbers: Numbers) -> Any:
+    def advance(self, state: Any, interval: Array | float, numbers: Numbers) -> Any:
         """State at a measurement, from that at the one before.
 
         Args:
             state: of :meth:`begin`, or the one before.
-            interval: s since the measurement before, ``(N,)``.
+            interval: s since the measurement before, ``(N,)``, or one number where all are the same.
             numbers: that it takes.
         """
         return state
@@ -146,7 +146,7 @@ class Disturbances:
         return shares
 
     def advance(
-        self, states: Mapping[str, Any], interval: Array, numbers: Mapping[str, Numbers]
+        self, states: Mapping[str, Any], interval: Array | float, numbers: Mapping[str, Numbers]
     ) -> dict[str, Any]:
         """States at a measurement."""
         return {
@@ -233,7 +233,7 @@ class Glint(Disturbance):
         """Start with a usual one."""
         return self.xp.ones_like(truth.scan, dtype=self.xp.float64)
 
-    def advance(self, state: Array, interval: Array, numbers: Numbers) -> Array:
+    def advance(self, state: Array, interval: Array | float, numbers: Numbers) -> Array:
         """Draw whether this is one."""
         return self.outliers.amplify(self.xp.ones_like(state), numbers.uniforms, self.xp)
 

@@ -238,8 +238,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
         numbers = self.disturbances.share(noise[self.own_normals : self.normals], uniforms[4:])
-        interval = p.sampling_interval * xp.ones_like(truth.separation)
-        states = self.disturbances.advance(truth.disturbances, interval, numbers)
+        states = self.disturbances.advance(truth.disturbances, p.sampling_interval, numbers)
         truth = truth._replace(disturbances=states)
         truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
         states, measurement = self.disturbances.change_measurement(
