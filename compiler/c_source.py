@@ -365,9 +365,9 @@ class _Loops:
                 place = self._place(to, self.write, self.arrays.written)
                 if place:
                     lines.append(f"{place} = {own};")
-        if loop.count == 1:
+        if loop.turns == 1:
             return lines
-        return [f"for (int k = 0; k < {loop.count}; ++k) {{", *(f"    {line}" for line in lines), "}"]
+        return [f"for (int k = 0; k < {loop.turns}; ++k) {{", *(f"    {line}" for line in lines), "}"]
 
     def _number(self, value: str, logical: bool) -> str:
         one, zero = literal(1.0, self.scalar), literal(0.0, self.scalar)

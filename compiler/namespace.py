@@ -409,6 +409,7 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
         raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
     graph, places = _OPEN.get(), indices.nodes.ravel().tolist()
     rows: Any
+    taken: Any
     if isinstance(x, numpy.ndarray) and x.dtype == float:
         rows = numpy.moveaxis(x, axis, -1)
         graph.begin_group()
@@ -444,12 +445,12 @@ def _choose(graph: Graph, rows: numpy.ndarray, places: list[int], dtype: Any) ->
                 open_places.append(p)
     if open_rows:
         choices = Traced(rows[open_rows].T, dtype)
-        index = Traced(numpy.array(places)[open_places], float64)
+        asked = Traced(numpy.array(places)[open_places], float64)
         # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
-        index = where(less(index, 0.0), add(index, float(rows.shape[-1])), index)
+        asked = where(less(asked, 0.0), add(asked, float(rows.shape[-1])), asked)
         found = choices[0]
         for place, choice in enumerate(list(choices)[1:], 1):
-            found = where(greater_equal(index, float(place)), choice, found)
+            found = where(greater_equal(asked, float(place)), choice, found)
         chosen[open_rows, open_places] = found.nodes
     return chosen
 

@@ -10,7 +10,7 @@ that every bit is.
 import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .interpretation import first_steps
 from .parts import FREE
@@ -54,7 +54,7 @@ class Statement(NamedTuple):
 class Loop(NamedTuple):
     """Statements that are computed together, turn by turn."""
 
-    count: int
+    turns: int
     body: list[Statement]
 
 
@@ -118,7 +118,7 @@ class _Roller:
         """Steps of one array operation with one form, in the order of that operation."""
         steps, origins = self.steps, self.program.origins
         levels = [0] * len(steps)
-        found: dict[tuple[object, ...], list[int]] = {}
+        found: dict[Any, list[int]] = {}
         for index, step in enumerate(steps):
             if step.operation in FREE:
                 continue

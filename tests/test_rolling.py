@@ -50,7 +50,7 @@ def run_loops(code, read, shown=0, between=None):
         for number, loop in enumerate(rolled.loops):
             if number == rolled.before and between is not None:
                 between([written[result[:2]] for result in code.results[:shown]])
-            for k in range(loop.count):
+            for k in range(loop.turns):
                 turn = {}
                 for statement in loop.body:
                     values = [find(operand, k, turn) for operand in statement.operands]

@@ -303,7 +303,10 @@ class Writer:
     def source(self) -> str:
         """Text of the source."""
         parts = [
-            comment("See the header. Temporaries are numbered in the order in which they are computed."),
+            comment(
+                "See the header. A loop goes over the members of array operations, k is the member; where they lie is "
+                "said by tables, whose names end in at and a number. The array w holds what one loop leaves to another."
+            ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),
         ]
