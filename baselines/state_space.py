@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.filter import Initial
+from ..envs.contract.filter import Initial, Likelihood
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
-from ..evaluation.competitors.kinds import ConstantPolicy, Likelihood, Policy, RandomPolicy
+from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
 from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum

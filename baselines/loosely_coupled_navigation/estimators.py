@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters.ordered_sums import ordered_sum
 from ..measurement_noise import MeasurementNoise
 from .augmented import AugmentedFilter, AugmentedMemory

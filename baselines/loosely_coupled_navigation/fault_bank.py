@@ -5,11 +5,10 @@ The filters stand in ``envs/loosely_coupled_navigation/fault_bank.py``, because 
 
 import math
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.fault_bank import FaultFilter, Memory
 from ...envs.loosely_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 
 
 class FaultBank(FaultFilter):

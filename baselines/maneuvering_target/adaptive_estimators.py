@@ -5,11 +5,10 @@ A scan that missed the target says nothing of any noise: what is estimated holds
 
 from typing import NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import kalman, noise_adaptation, predicted_covariance
 from .estimators import KalmanModel
 

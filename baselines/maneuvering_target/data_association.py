@@ -5,11 +5,11 @@ Equations: ``filters/data_association.py``. Without clutter each is the estimato
 
 import math
 
+from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement, Plots
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import data_association, kalman
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses

@@ -7,12 +7,11 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import coordinated_turn, imm, kalman, unscented
 from ...filters.ordered_sums import weighted_sum
 

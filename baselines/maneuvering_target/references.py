@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 from ...envs.contract.faults import GaussMarkov
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import bounds, kalman, polar
 from ...filters.small_matrices import apply
 from .estimators import KalmanModel

@@ -3,11 +3,10 @@
 The filter stands in ``envs/maneuvering_target/semi_markov.py``, because an action may steer it, too.
 """
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.semi_markov import SemiMarkovFilter, SemiMarkovTrack
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from .estimators import KalmanModel
 
 

@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import class_fusion, contaminated_normal, imm, kalman, packed_covariance
 from ...filters import emitter_association as emitters
 from ...filters.ordered_sums import ordered_sum

@@ -3,12 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 
 
 class HuberBank(HypothesisBank):

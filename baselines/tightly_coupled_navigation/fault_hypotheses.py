@@ -3,11 +3,10 @@
 The filters stand in ``envs/tightly_coupled_navigation/fault_hypotheses.py``, because an action may steer them, too.
 """
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter, Hypotheses
 from ...envs.tightly_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 
 
 class FaultHypotheses(FaultFilter):

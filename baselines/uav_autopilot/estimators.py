@@ -8,11 +8,10 @@ and a noisier sensor asks for another change of the filter than stronger gusts d
 import math
 from typing import Any, ClassVar, NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
 from ...filters.ordered_sums import ordered_sum, weighted_sum

@@ -3,11 +3,10 @@
 The filters stand in ``envs/uav_autopilot/level_bank.py``, because an action may steer them, too.
 """
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.level_bank import LevelFilter
 from ...envs.uav_autopilot.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters.noise_levels import Hypotheses
 from .estimators import likelihood_of
 
