@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.filter import Initial, Likelihood
+from ..envs.contract.filter import Filter, Initial, Input, Likelihood, Track
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
@@ -74,7 +74,7 @@ def _numbers(measurement: Measurement, xp: Any) -> Array:
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
-class Extended:
+class Extended(Filter[StateSpace, Measurement, Track]):
     """The Kalman filter as written, extended where the model is not linear, as an estimator.
 
     Args:
@@ -83,24 +83,23 @@ class Extended:
         measurement_noise: factor on R.
     """
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        self.xp, self.equations = task.xp, task.believed[0]
+        super().__init__(task)
+        self.equations = task.believed[0]
         self.Q = process_noise * self.equations.Q[:, :, None]
         self.R = measurement_noise * self.equations.R[:, :, None]
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
-        return Initial(initial.mean, initial.covariance)
+        return Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
-        mean, carried = self.equations.carry(*memory)
-        result = _update(self.equations, mean, carried + self.Q, self.R, measurement, self.xp)
-        after = Initial(result.mean, result.covariance)
-        return *after, after, _likelihood(result, measurement.available, self.xp)
+        mean, carried = self.equations.carry(state.mean, state.covariance)
+        result = _update(self.equations, mean, carried + self.Q, self.R, given.measurement, self.xp)
+        return Track(
+            result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
+        )
 
 
 def _update(
@@ -114,38 +113,39 @@ def _update(
 class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`."""
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts, nowhere certain."""
-        return Initial(initial.mean, initial.covariance + UNCERTAIN * self.Q)
+        return super().start(initial._replace(covariance=initial.covariance + UNCERTAIN * self.Q))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Predict and update by sigma points."""
-        mean, spread = unscented.transform(memory.mean, memory.covariance, self.equations.move)
-        z, h = _numbers(measurement, self.xp), self.equations.measure
-        result = unscented_update(mean, spread + self.Q, z, h, self.R, measurement.available)
-        after = Initial(result.mean, result.covariance)
-        return *after, after, _likelihood(result, measurement.available, self.xp)
+        available = given.measurement.available
+        mean, spread = unscented.transform(state.mean, state.covariance, self.equations.move)
+        z, h = _numbers(given.measurement, self.xp), self.equations.measure
+        result = unscented_update(mean, spread + self.Q, z, h, self.R, available)
+        return Track(result.mean, result.covariance, _likelihood(result, available, self.xp))
 
 
-class InteractingKalman:
+class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        self.xp, self.bank = task.xp, HypothesisBank(task, "evidence", process_noise, measurement_noise)
+        super().__init__(task)
+        self.bank = HypothesisBank(task, "evidence", process_noise, measurement_noise)
 
-    def start(self, initial: Initial, N: int) -> Mixture:
+    def start(self, initial: Initial) -> Mixture:
         """Start where everyone starts."""
         return self.bank.start(initial)
 
-    def update(self, measurement: Measurement, memory: Mixture) -> tuple[Array, Array, Mixture, Array]:
+    def update(self, state: Mixture, given: Input) -> Mixture:
         """Predict and update, without evidence."""
-        given = measurement._replace(values=_numbers(measurement, self.xp))
-        predicted = self.bank.predict(memory, given)
-        after = self.bank.act(predicted, given, 0.0 * predicted.action)
-        return after.mean, after.covariance, after, self.bank.records(after, given)["log_likelihood"]
+        measurement = given.measurement._replace(values=_numbers(given.measurement, self.xp))
+        predicted = self.bank.predict(state, measurement)
+        return self.bank.act(predicted, measurement, 0.0 * predicted.action)
+
+    def records(self, state: Mixture, measurement: Measurement) -> dict[str, Array]:
+        """How likely the measurement was."""
+        return {"log_likelihood": self.bank.records(state, measurement)["log_likelihood"]}
 
 
 class KnownModel:
