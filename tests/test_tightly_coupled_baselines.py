@@ -85,7 +85,7 @@ def test_bound_is_the_dense_recursion():
             return super().update(measurement, truth, memory)
 
     run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
-    bounds = [episode.filter.mean_square for episode, _ in run]
+    bounds = [episode.filter.own.mean for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
     assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
     p, S = model.task.parameters, model.task.satellites
