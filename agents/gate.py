@@ -22,13 +22,14 @@ import numpy
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem, problem_of
 from ..envs.contract.failures import explain_errors
+from ..envs.contract.filter import Filter, Input, Likelihood
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
+from ..evaluation.competitors.filters import Adapter, as_filter
 from ..evaluation.competitors.kinds import (
     ConstantPolicy,
     Kind,
-    Likelihood,
     Policy,
     RandomPolicy,
     check_competitor,
@@ -287,13 +288,15 @@ class ListeningPolicy(Policy):
         return action, ListeningMemory(memory, trust, trusted)
 
 
-class GatedMemory(NamedTuple):
-    """What a gated estimator remembers."""
+class GatedState(NamedTuple):
+    """State of a gated filter."""
 
     agent: Any
-    """State of the agent's filter."""
+    """Of the agent's filter."""
     fallback: Any
-    """Memory of the other."""
+    """Of the other."""
+    trusted: Array
+    """Whether the agent's filter answers, booleans ``(N,)``."""
     odds: Array
     """Log-odds of the fallback to the agent's filter by how well they have predicted the measurements, ``(N,)``."""
     squares: Array
@@ -302,8 +305,8 @@ class GatedMemory(NamedTuple):
     """Likewise of their degrees of freedom."""
 
 
-class GatedEstimator:
-    """An agent's filter and a fallback side by side, see :class:`~..evaluation.competitors.Estimator`.
+class GatedEstimator(Filter[Any, Any, GatedState]):
+    """An agent's filter and a fallback side by side.
 
     Beside its alarms the agent has to stand the comparison: it is not trusted while the fallback has predicted the
     measurements better. The log-likelihood ratios of the two are summed within :data:`MOST_ODDS`, so that old ones are
@@ -317,34 +320,41 @@ class GatedEstimator:
 
     Args:
         agent: a filter whose policy is a :class:`ListeningPolicy`.
-        fallback: an estimator.
+        fallback: a filter.
     """
 
-    kind: ClassVar[Kind] = "estimator"
-
-    def __init__(self, agent: LearnedEstimator, fallback: Any) -> None:
-        self.agent, self.fallback, self.xp = agent, fallback, agent.filter.xp
-        self.network, self.filter = agent.network, agent.filter
-        self.adapts_covariance = isinstance(fallback, LearnedEstimator) and fallback.filter.adapts_covariance
+    def __init__(self, agent: LearnedEstimator, fallback: Filter) -> None:
+        super().__init__(agent.task)
+        self.agent, self.fallback = agent, fallback
+        self.network, self.decider = agent.network, agent.decider
         policy: Any = agent.network
-        self.traceable = says_traceable(policy.policy) and getattr(fallback, "traceable", False)
+        self.in_python = fallback.in_python or not says_traceable(policy.policy)
 
-    def start(self, initial: Any, N: int) -> GatedMemory:
+    def start(self, initial: Any) -> GatedState:
         """Start both where everyone starts."""
         none = 0.0 * initial.mean[0]
         expected = none + NIS_MEMORY
-        return GatedMemory(
-            self.agent.start(initial, N), self.fallback.start(initial, N), none, expected, expected
+        states = self.agent.start(initial), self.fallback.start(initial)
+        return GatedState(*states, none > 0.0, none, expected, expected)
+
+    def predict(self, state: GatedState, measurement: Any) -> GatedState:
+        """Let both predict."""
+        return state._replace(
+            agent=self.agent.predict(state.agent, measurement),
+            fallback=self.fallback.predict(state.fallback, measurement),
         )
 
-    def update(self, measurement: Any, memory: GatedMemory) -> tuple[Array, Array, GatedMemory]:
-        """Let both take the measurement in, and answer with the estimate of the one that is trusted."""
-        xp = self.xp
-        mean, covariance, agent, own = self.agent.update(measurement, memory.agent)
-        other_mean, other_covariance, fallback, *told = self.fallback.update(measurement, memory.fallback)
-        other = Likelihood.of(*told) if told else Likelihood(None)
+    def update(self, state: GatedState, given: Input) -> GatedState:
+        """Let both take the measurement in, and decide who is trusted."""
+        xp, measurement = self.xp, given.measurement
+        agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)
+        mean, other_mean = self.agent.mean(agent), self.fallback.mean(fallback)
+        own = Likelihood.told(self.agent.records(agent, measurement))
+        other = Likelihood.told(self.fallback.records(fallback, measurement))
+        if isinstance(self.fallback, Adapter) and not self.fallback.tells:
+            other = Likelihood(None)
         # A track that is lost altogether, so that its estimate is no number, is no answer either.
-        odds, sound = memory.odds, xp.all(xp.isfinite(mean), axis=0)
+        odds, sound = state.odds, xp.all(xp.isfinite(mean), axis=0)
         if other.log_likelihood is not None:
             silent = xp.isnan(other.log_likelihood) & xp.all(xp.isfinite(other_mean), axis=0)
             if own.log_likelihood is None:
@@ -354,20 +364,28 @@ class GatedEstimator:
                 ratio = other.log_likelihood - own.log_likelihood
                 odds = xp.clip(odds + xp.where(xp.isfinite(ratio), ratio, 0.0), -MOST_ODDS, MOST_ODDS)
                 odds = xp.where(silent & xp.isfinite(own.log_likelihood), MOST_ODDS, odds)
-        squares, degrees = self._sum_squares(memory, other)
-        other_covariance = self._variance_factor(squares, degrees) * other_covariance
+        squares, degrees = self._sum_squares(state, other)
         trusted = (agent.policy.memory.trusted[0] > 0.5) & (odds <= 0.0) & sound
-        return (
-            xp.where(trusted, mean, other_mean),
-            xp.where(trusted, covariance, other_covariance),
-            GatedMemory(agent, fallback, odds, squares, degrees),
-        )
+        return GatedState(agent, fallback, trusted, odds, squares, degrees)
 
-    def _sum_squares(self, memory: GatedMemory, told: Likelihood) -> tuple[Array, Array]:
+    def mean(self, state: GatedState) -> Array:
+        """That of the filter that is trusted."""
+        return self.xp.where(state.trusted, self.agent.mean(state.agent), self.fallback.mean(state.fallback))
+
+    def covariance(self, state: GatedState) -> Array:
+        """Likewise."""
+        other = self._variance_factor(state.squares, state.degrees) * self.fallback.covariance(state.fallback)
+        return self.xp.where(state.trusted, self.agent.covariance(state.agent), other)
+
+    def records(self, state: GatedState, measurement: Any) -> dict[str, Array]:
+        """Nothing: the one that answers changes."""
+        return {}
+
+    def _sum_squares(self, memory: GatedState, told: Likelihood) -> tuple[Array, Array]:
         """Sums of the fallback's normalised innovations squared, and of their degrees; what is not told, or not
         received, leaves them as they are.
         """
-        if self.adapts_covariance or told.nis is None or told.nis_degrees is None:
+        if self.fallback.adapts_covariance or told.nis is None or told.nis_degrees is None:
             return memory.squares, memory.degrees
         xp, keep = self.xp, 1.0 - 1.0 / NIS_MEMORY
         there = xp.isfinite(told.nis) & (told.nis_degrees > 0.0)
@@ -473,10 +491,10 @@ class GatedMaker:
         agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
         return GatedEstimator(agent, self._make_fallback(task))
 
-    def _make_fallback(self, task: Task) -> Any:
+    def _make_fallback(self, task: Task) -> Filter:
         if kind_of(self._fallback) == "estimator":
             with explain_errors(f"fallback {self.fallback!r} cannot be made"):
-                return make_competitor(self._fallback, task)
+                return as_filter(task, make_competitor(self._fallback, task))
         control = control_of(self._fallback, "policy", None, self.problem.task, self.fallback)
         model = Model(task, control)
         policy = make_competitor(self._fallback, model.on_numpy())

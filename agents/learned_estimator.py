@@ -12,14 +12,13 @@ import numpy
 from ..compiler.functions import map_arrays
 from ..envs.contract.filter import Input
 from ..envs.contract.model import Model
-from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
-from ..evaluation.competitors.kinds import Kind, Likelihood, Policy
-from ..evaluation.competitors.steered_filter import Steered, steer
+from ..evaluation.competitors.kinds import Kind, Policy
+from ..evaluation.competitors.steered_filter import Steered, SteeredFilter, decider_of
 
 
-class LearnedEstimator:
-    """A bank with the policy that closes it, see :class:`~..evaluation.competitors.Estimator`.
+class LearnedEstimator(SteeredFilter):
+    """A bank with the policy that closes it, given zero where nothing was received, as banks are.
 
     Args:
         model: with the bank.
@@ -27,26 +26,17 @@ class LearnedEstimator:
         interval: measurements for which an action holds.
     """
 
-    kind: ClassVar[Kind] = "estimator"
-    traceable: ClassVar[bool] = True
-
     def __init__(self, model: Model, network: Policy, interval: int = 1) -> None:
+        super().__init__(model, decider_of(model, network, interval))
         self.network = network
-        self.filter = steer(model, network, interval)
 
-    def start(self, initial: Any, N: int) -> Steered:
-        """Start the filter where everyone starts."""
-        return self.filter.start(initial)
+    def predict(self, state: Steered, measurement: Any) -> Steered:
+        """Predict in the bank."""
+        return super().predict(state, fill_missing(measurement))
 
-    def update(self, measurement: Any, memory: Steered) -> tuple[Array, Array, Steered, Likelihood]:
-        """Predict, show the network what comes of it, and update as it answers; what the bank does not tell of the
-        likelihood is None.
-        """
-        measurement = fill_missing(measurement)
-        state = self.filter.update(self.filter.predict(memory, measurement), Input(measurement))
-        records = self.filter.records(state, measurement)
-        likelihood = Likelihood(*(records.get(name) for name in Likelihood._fields))
-        return self.filter.mean(state), self.filter.covariance(state), state, likelihood
+    def update(self, state: Steered, given: Input) -> Steered:
+        """Show the network what has come, and update as it answers."""
+        return super().update(state, Input(fill_missing(given.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:

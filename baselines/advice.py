@@ -376,14 +376,15 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit
     estimator = tunable.apply(found.values)[1](task)
     # The scale of the noise is outside, the choice between two updates within.
     scaled = estimator if isinstance(estimator, ScaledNoise) else ScaledNoise(estimator, lambda m, _: m, 1.0)
-    memory = scaled.start(fill_arrays(template, initial.__getitem__, numpy), len(recording.names))
+    robust: Any = scaled.own
+    state = scaled.start(fill_arrays(template, initial.__getitem__, numpy))
     for k in range(recording.seconds.shape[1]):
         row = {name: numpy.moveaxis(values[:, k], 0, -1) for name, values in recording.measurements.items()}
         measurement = task.world.mask_missing(fill_arrays(like, row.__getitem__, numpy))
         with numpy.errstate(all="ignore"):
             taken = scaled.scaled(measurement, scaled.factor)
-            usual, wide, is_outlier[:, k], _ = scaled.own.compare(taken, memory)
-        memory = select_nested(is_outlier[:, k], wide[2], usual[2])
+            usual, wide, is_outlier[:, k], _ = robust.compare(taken, state.own)
+        state = state._replace(own=select_nested(is_outlier[:, k], wide[0], usual[0]))
     return is_outlier & (numpy.arange(is_outlier.shape[1]) < recording.rows[:, None])
 
 

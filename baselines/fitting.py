@@ -17,7 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..evaluation.competitors.kinds import Likelihood
+from ..envs.contract.filter import Filter, Input, Likelihood
+from ..envs.contract.observation import Array
+from ..envs.contract.task import Task
+from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.likelihood import WindowLikelihood
 from ..filters.array_namespace import select_nested
 from .table import Tunable
@@ -80,28 +83,42 @@ class Fit(NamedTuple):
     """Parameters that ended at a limit of the search."""
 
 
-class ScaledNoise:
-    """An estimator that takes stated deviations of measurements for larger or smaller by a factor.
+class ScaledNoise(Filter[Task, Any, Any]):
+    """A filter that takes stated deviations of measurements for larger or smaller by a factor; its state is that one's.
 
     Args:
-        own: the estimator.
+        own: the filter.
         scaled: multiplies the deviations stated in a measurement by a factor.
         factor: a number, or ``(N,)``.
     """
 
-    kind = "estimator"
+    def __init__(self, own: Filter, scaled: Callable[[Any, Any], Any], factor: Any) -> None:
+        super().__init__(own.task)
+        self.own, self.scaled, self.factor, self.in_python = own, scaled, factor, own.in_python
 
-    def __init__(self, own: Any, scaled: Callable[[Any, Any], Any], factor: Any) -> None:
-        self.own, self.scaled, self.factor = own, scaled, factor
-        self.traceable = getattr(own, "traceable", False)
-
-    def start(self, initial: Any, N: int) -> Any:
+    def start(self, initial: Any) -> Any:
         """Start where everyone starts, as much less sure of it: a track starts from measurements."""
-        return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2), N)
+        return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2))
 
-    def update(self, measurement: Any, memory: Any) -> Any:
+    def predict(self, state: Any, measurement: Any) -> Any:
+        """Predict to the measurement as it is taken."""
+        return self.own.predict(state, self.scaled(measurement, self.factor))
+
+    def update(self, state: Any, given: Input) -> Any:
         """Update with the measurement as it is taken."""
-        return self.own.update(self.scaled(measurement, self.factor), memory)
+        return self.own.update(state, Input(self.scaled(given.measurement, self.factor)))
+
+    def mean(self, state: Any) -> Array:
+        """That of the filter."""
+        return self.own.mean(state)
+
+    def covariance(self, state: Any) -> Array:
+        """That of the filter."""
+        return self.own.covariance(state)
+
+    def records(self, state: Any, measurement: Any) -> dict[str, Array]:
+        """Those of the filter."""
+        return self.own.records(state, self.scaled(measurement, self.factor))
 
 
 def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
@@ -117,53 +134,70 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
         own = {name: value for name, value in values.items() if name != NOISE_SCALE}
         keywords, make = tunable.apply(own)
         factor = 10.0 ** values[NOISE_SCALE]
-        return keywords, lambda task: ScaledNoise(make(task), scaled, factor)
+        return keywords, lambda task: ScaledNoise(as_filter(task, make(task)), scaled, factor)
 
     limits = {**tunable.limits, NOISE_SCALE: (low, high)}
     start_values = {**tunable.start, NOISE_SCALE: start}
     return dataclasses.replace(tunable, limits=limits, start=start_values, apply=apply)
 
 
-class RobustEstimator:
-    """An estimator that takes every measurement either as stated or as an outlier, whichever is likelier.
+class RobustState(NamedTuple):
+    """State of a filter that knows of outliers."""
+
+    own: Any
+    """Of the filter."""
+    likelihood: Likelihood
+    """Of the mixture."""
+
+
+class RobustEstimator(Filter[Task, Any, RobustState]):
+    """A filter that takes every measurement either as stated or as an outlier, whichever is likelier.
 
     Args:
-        own: the estimator.
+        own: the filter, which tells the log-likelihood.
         scaled: multiplies the deviations stated in a measurement by a factor.
         share: of outliers, a number, or ``(N,)``.
-        xp: array namespace.
     """
 
-    kind = "estimator"
+    def __init__(self, own: Filter, scaled: Callable[[Any, Any], Any], share: Any) -> None:
+        super().__init__(own.task)
+        self.own, self.scaled, self.share, self.in_python = own, scaled, share, own.in_python
 
-    def __init__(self, own: Any, scaled: Callable[[Any, Any], Any], share: Any, xp: Any) -> None:
-        self.own, self.scaled, self.share, self.xp = own, scaled, share, xp
-        self.traceable = getattr(own, "traceable", False)
+    def start(self, initial: Any) -> RobustState:
+        """Start as the filter does."""
+        return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def start(self, initial: Any, N: int) -> Any:
-        """Start as the estimator does."""
-        return self.own.start(initial, N)
-
-    def update(self, measurement: Any, memory: Any) -> Any:
+    def update(self, state: RobustState, given: Input) -> RobustState:
         """Update as stated and with wide deviations, and keep the likelier result; say the mixture's likelihood."""
-        usual, wide, is_outlier, log_likelihood = self.compare(measurement, memory)
-        mean, covariance, after = (
-            select_nested(is_outlier, other, one) for one, other in zip(usual[:3], wide[:3], strict=True)
-        )
-        nis = self.xp.where(is_outlier, wide[3].nis, usual[3].nis)
-        return mean, covariance, after, Likelihood(log_likelihood, nis, usual[3].nis_degrees)
+        (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
+        nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
+        likelihood = Likelihood(log_likelihood, nis, own.nis_degrees).fill_unknown(log_likelihood)
+        return RobustState(select_nested(is_outlier, wide, usual), likelihood)
 
-    def compare(self, measurement: Any, memory: Any) -> tuple[Any, Any, Any, Any]:
-        """Return both updates, whether the second is likelier, and the log-likelihood of the mixture, ``(N,)``."""
+    def compare(self, measurement: Any, state: Any) -> tuple[Any, Any, Any, Any]:
+        """Return both updates, state and likelihood, whether the second is likelier, and the log-likelihood of the
+        mixture, ``(N,)``.
+        """
         xp = self.xp
-        usual = self.own.update(measurement, memory)
-        wide = self.own.update(self.scaled(measurement, WIDE), memory)
-        one = usual[3].log_likelihood + xp.log(1.0 - self.share)
-        other = wide[3].log_likelihood + xp.log(self.share)
+        usual, wide = (self._step(state, z) for z in (measurement, self.scaled(measurement, WIDE)))
+        one = usual[1].log_likelihood + xp.log(1.0 - self.share)
+        other = wide[1].log_likelihood + xp.log(self.share)
         # Of a measurement that was not received both are NaN: the first update is kept.
         is_outlier = other > one
         top = xp.where(is_outlier, other, one)
         return usual, wide, is_outlier, top + xp.log(xp.exp(one - top) + xp.exp(other - top))
+
+    def _step(self, state: Any, measurement: Any) -> tuple[Any, Likelihood]:
+        after = self.own.step(state, Input(measurement))
+        return after, Likelihood.told(self.own.records(after, measurement))
+
+    def mean(self, state: RobustState) -> Array:
+        """That of the filter."""
+        return self.own.mean(state.own)
+
+    def covariance(self, state: RobustState) -> Array:
+        """That of the filter."""
+        return self.own.covariance(state.own)
 
 
 def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunable:
@@ -176,7 +210,7 @@ def with_outliers(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tunabl
         own = {name: value for name, value in values.items() if name != OUTLIER_SHARE}
         keywords, make = tunable.apply(own)
         share = 10.0 ** values[OUTLIER_SHARE]
-        return keywords, lambda task: RobustEstimator(make(task), scaled, share, task.xp)
+        return keywords, lambda task: RobustEstimator(as_filter(task, make(task)), scaled, share)
 
     limits = {**tunable.limits, OUTLIER_SHARE: (low, high)}
     return dataclasses.replace(

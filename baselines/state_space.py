@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.filter import Initial
+from ..envs.contract.filter import Filter, Initial, Input, Likelihood, Track
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
-from ..evaluation.competitors.kinds import ConstantPolicy, Likelihood, Policy, RandomPolicy
+from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
 from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
@@ -74,7 +74,7 @@ def _numbers(measurement: Measurement, xp: Any) -> Array:
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
-class Extended:
+class Extended(Filter[StateSpace, Measurement, Track]):
     """The Kalman filter as written, extended where the model is not linear, as an estimator.
 
     Args:
@@ -83,25 +83,25 @@ class Extended:
         measurement_noise: factor on R.
     """
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        self.xp, self.equations = task.xp, task.believed[0]
+        super().__init__(task)
+        self.equations = task.believed[0]
         self.factor = process_noise
         self.R = measurement_noise * self.equations.R[:, :, None]
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
-        return Initial(initial.mean, initial.covariance)
+        return Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
-        mean, carried = self.equations.carry(*memory, measurement.interval)
-        Q = self.factor * self.equations.process_noise(measurement.interval)
-        result = _update(self.equations, mean, carried + Q, self.R, measurement, self.xp)
-        after = Initial(result.mean, result.covariance)
-        return *after, after, _likelihood(result, measurement.available, self.xp)
+        interval = given.measurement.interval
+        mean, carried = self.equations.carry(state.mean, state.covariance, interval)
+        Q = self.factor * self.equations.process_noise(interval)
+        result = _update(self.equations, mean, carried + Q, self.R, given.measurement, self.xp)
+        return Track(
+            result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
+        )
 
 
 def _update(
@@ -120,42 +120,43 @@ class Unscented(Extended):
         usual = self.equations.model.process_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts, nowhere certain."""
-        return Initial(initial.mean, initial.covariance + self.uncertain)
+        return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Predict and update by sigma points."""
+        measurement = given.measurement
         interval = measurement.interval
         mean, spread = unscented.transform(
-            memory.mean, memory.covariance, lambda x: self.equations.move(x, interval)
+            state.mean, state.covariance, lambda x: self.equations.move(x, interval)
         )
         Q = self.factor * self.equations.process_noise(interval)
         z, h = _numbers(measurement, self.xp), self.equations.measure
         result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available)
-        after = Initial(result.mean, result.covariance)
-        return *after, after, _likelihood(result, measurement.available, self.xp)
+        return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 
-class InteractingKalman:
+class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        self.xp, self.bank = task.xp, HypothesisBank(task, "evidence", process_noise, measurement_noise)
+        super().__init__(task)
+        self.bank = HypothesisBank(task, "evidence", process_noise, measurement_noise)
 
-    def start(self, initial: Initial, N: int) -> Mixture:
+    def start(self, initial: Initial) -> Mixture:
         """Start where everyone starts."""
         return self.bank.start(initial)
 
-    def update(self, measurement: Measurement, memory: Mixture) -> tuple[Array, Array, Mixture, Array]:
+    def update(self, state: Mixture, given: Input) -> Mixture:
         """Predict and update, without evidence."""
-        given = measurement._replace(values=_numbers(measurement, self.xp))
-        predicted = self.bank.predict(memory, given)
-        after = self.bank.act(predicted, given, 0.0 * predicted.action)
-        return after.mean, after.covariance, after, self.bank.records(after, given)["log_likelihood"]
+        measurement = given.measurement._replace(values=_numbers(given.measurement, self.xp))
+        predicted = self.bank.predict(state, measurement)
+        return self.bank.act(predicted, measurement, 0.0 * predicted.action)
+
+    def records(self, state: Mixture, measurement: Measurement) -> dict[str, Array]:
+        """How likely the measurement was."""
+        return {"log_likelihood": self.bank.records(state, measurement)["log_likelihood"]}
 
 
 class KnownModel:

@@ -37,15 +37,15 @@ class Kept(ExactBayes):
         self.initial: Any = None
         self.steps: list[Any] = []
 
-    def start(self, initial: Any, N: int) -> Any:
+    def start(self, initial: Any) -> Any:
         """Start it."""
         self.initial = initial
-        return super().start(initial, N)
+        return super().start(initial)
 
-    def update(self, measurement: Any, memory: Any) -> Any:
+    def update(self, state: Any, given: Any) -> Any:
         """Ask it."""
-        found = super().update(measurement, memory)
-        self.steps.append((measurement, found[0], found[1]))
+        found = super().update(state, given)
+        self.steps.append((given.measurement, found.mean, found.covariance))
         return found
 
 

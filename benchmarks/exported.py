@@ -29,6 +29,7 @@ from filtergym.compiler.native import native
 from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.competitors.filters import as_filter
 from filtergym.evaluation.competitors.kinds import kind_of, make_competitor
 from filtergym.evaluation.competitors.steered_filter import steer
 from filtergym.evaluation.running.evaluate import control_of
@@ -160,13 +161,12 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
     start_lanes(plain, seeds, lambda episode: started.append(one_lane(episode.measurement)))
     measurement = one_lane(next(rollout(plain, maker, seeds, kind=kind, name=name))[0].measurement)
     if kind == "estimator":
-        own = make_competitor(maker, plain.task)
-        memory = own.start(started[0], 1)
-        received = plain.task.world.mask_missing(measurement)
-        return least_time(lambda: own.update(received, memory), 3)
-    steered = steer(plain, make_competitor(maker, plain))
-    state = steered.start(started[0])
-    return least_time(lambda: steered.update(steered.predict(state, measurement), Input(measurement)), 3)
+        filter = as_filter(plain.task, make_competitor(maker, plain.task))
+        measurement = plain.task.world.mask_missing(measurement)
+    else:
+        filter = steer(plain, make_competitor(maker, plain))
+    state = filter.start(started[0])
+    return least_time(lambda: filter.step(state, Input(measurement)), 3)
 
 
 def least_time(call: Any, count: int) -> float:

@@ -19,11 +19,11 @@ import math
 from typing import Any
 
 import numpy
-from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.schedules import Steps, within
 from filtergym.envs.engine.backend import make_model
+from filtergym.envs.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.envs.loosely_coupled_navigation.world import Truth
 from filtergym.evaluation.running.rollout import rollout

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -134,11 +135,12 @@ class Watched:
     def start(self, initial: Any, N: int) -> Any:
         """Start it."""
         self.initial = initial
-        return self.estimator.start(initial, N)
+        return self.estimator.start(initial)
 
     def update(self, measurement: Any, memory: Any) -> Any:
         """Ask it."""
-        mean, covariance, memory, _ = self.estimator.update(measurement, memory)
+        memory = self.estimator.step(memory, Input(measurement))
+        mean, covariance = self.estimator.mean(memory), self.estimator.covariance(memory)
         self.measurements.append(measurement)
         self.answers.append((mean, covariance))
         return mean, covariance, memory

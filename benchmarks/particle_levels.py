@@ -20,12 +20,11 @@ import math
 from typing import Any
 
 import numpy
-from filtergym.baselines.uav_autopilot.level_bank import LevelBank
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.schedules import Steps
 from filtergym.envs.engine.backend import make_model
-from filtergym.envs.uav_autopilot.level_bank import VAGUE
+from filtergym.envs.uav_autopilot.level_bank import VAGUE, LevelBank
 from filtergym.envs.uav_autopilot.task import TASK
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds

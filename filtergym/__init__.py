@@ -41,12 +41,13 @@ from .envs.engine.catalogue import register  # noqa: E402  (its import may be fo
 
 if TYPE_CHECKING:
     from .baselines.table import Baselines
+    from .envs.contract.filter import Likelihood
     from .envs.contract.task import Task
     from .envs.data.flights import Flights, read_flights
     from .envs.data.recording import Recording
     from .envs.data.trajectory import Trajectory
     from .envs.engine.scenario_choice import read_recording
-    from .evaluation.competitors.kinds import FunctionPolicy, Likelihood
+    from .evaluation.competitors.kinds import FunctionPolicy
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
     from .own_models import state_space
@@ -70,11 +71,12 @@ __all__ = [
     "tidy_records",
 ]
 MODULES = {
+    "envs.contract.filter": ("Likelihood",),
     "envs.data.flights": ("Flights", "read_flights"),
     "envs.data.recording": ("Recording",),
     "envs.engine.scenario_choice": ("read_recording",),
     "envs.data.trajectory": ("Trajectory",),
-    "evaluation.competitors.kinds": ("FunctionPolicy", "Likelihood"),
+    "evaluation.competitors.kinds": ("FunctionPolicy",),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),
     "own_models": ("state_space",),

@@ -81,7 +81,7 @@ def online(
     if kind == "estimator":
         estimator = maker(model.task)
         watch = WatchedPolicy(estimator.network, range)
-        estimator.filter.decider.ask = watch.act
+        estimator.decider.ask = watch.act
         return OnlineFilter(model, estimator, kind, name, tracks, watch, lag)
     watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), range)
     return OnlineFilter(model, watch, kind, name, tracks, watch, lag)

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from filtergym.envs.contract.filter import Filter, Input, Likelihood
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import backend
 from filtergym.envs.engine.catalogue import task_class
@@ -25,6 +26,25 @@ def short_episodes(id: str) -> dict[str, Any]:
     return {"horizon": DECISIONS * interval, "decision_interval": interval}
 
 
+class Asked:
+    """A filter as a user's estimator, to look at what it is given and answers; further arguments make the filter."""
+
+    make: Any = None
+    """Class of the filter, of subclasses."""
+
+    def __init__(self, made: Any, *arguments: Any, **keywords: Any) -> None:
+        self.filter: Filter = made if isinstance(made, Filter) else self.make(made, *arguments, **keywords)
+        self.traceable = not self.filter.in_python
+
+    def start(self, initial: Any, N: int) -> Any:
+        return self.filter.start(initial)
+
+    def update(self, measurement: Any, memory: Any) -> tuple[Any, ...]:
+        own, state = self.filter, self.filter.step(memory, Input(measurement))
+        told = Likelihood.told(own.records(state, measurement))
+        return own.mean(state), own.covariance(state), state, told
+
+
 LANES = 8
 """Of a bank of hypotheses that is watched."""
 
@@ -41,6 +61,7 @@ def watch_hypotheses(model: Model, estimator: Any, field: str, no_action: Any) -
         for every measurement the bank's state as predicted with the measurement, and the estimator's answers.
     """
     bank, scans, answers = model.filter, [], []
+    estimator = Asked(estimator) if isinstance(estimator, Filter) else estimator
 
     class Watched:
         kind = "estimator"

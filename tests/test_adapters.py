@@ -58,17 +58,13 @@ def compare(one, other, growth=1.0, **keywords):
 class OurKalman(KalmanModel):
     """filters/kalman.py over the model of the examples."""
 
-    def start(self, initial, N):
-        return initial.mean, initial.covariance
-
     def model(self, interval):
         F, Q = self.motion(interval)
         return F, 2.0**2 * Q
 
-    def update(self, measurement, memory):
-        predicted = kalman.predict(*memory, *self.model(measurement.interval))
-        result = self.update_estimate(predicted, measurement)
-        return result.mean, result.covariance, (result.mean, result.covariance)
+    def update(self, state, given):
+        predicted = kalman.predict(*state[:2], *self.model(given.measurement.interval))
+        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
 class OurContinuousKalman(OurKalman):

@@ -20,6 +20,7 @@ from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.competitors import likelihood as likelihood_module
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Estimate
+from models import Asked
 
 from filtergym import evaluate
 from filtergym.reports.tables.advice import advice_lines, parameter_lines
@@ -394,7 +395,7 @@ def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):
         kind, parameters, lane_parameters = "estimator", {"acceleration": (0.5, 0.8, 1.0)}, True
 
         def __init__(self, task, acceleration=0.8):
-            self.own = ConstantVelocity(task, acceleration)
+            self.own = Asked(ConstantVelocity(task, acceleration))
 
         def start(self, initial, N):
             return self.own.start(initial, N), np.zeros(N)

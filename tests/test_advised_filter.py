@@ -19,6 +19,7 @@ from filtergym.envs.contract.filter import Initial
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.envs.maneuvering_target.logs import scale_noise
 from filtergym.envs.maneuvering_target.world import Measurement
+from models import Asked
 
 import filtergym
 from filtergym.exports.c_source import FLAGS, export_c
@@ -160,7 +161,7 @@ def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
     """By dense matrices, step by step: the mixture's likelihood, and the update that is kept; rounding of 60 steps."""
     task = make_task(PROBLEM.task, None)
     share, g = 0.05, np.random.default_rng(1)
-    estimator = RobustEstimator(ConstantVelocity(task, acceleration=2.0), scale_noise, share, np)
+    estimator = Asked(RobustEstimator(ConstantVelocity(task, acceleration=2.0), scale_noise, share))
     m, P, T = np.array([0.0, 0.0, 50.0, 10.0]), np.diag([1e4, 1e4, 400.0, 400.0]), 4.0
     memory = estimator.start(Initial(m[:, None], P[:, :, None]), 1)
     F, H = np.eye(4) + T * np.eye(4, k=2), np.eye(2, 4)

@@ -98,13 +98,13 @@ def flown(make, scenario, episodes, **keywords):
     kept = []
 
     class Kept(make):
-        def start(self, initial, N):
+        def start(self, initial):
             kept.append(initial)
-            return super().start(initial, N)
+            return super().start(initial)
 
-        def update(self, measurement, memory):
-            found = super().update(measurement, memory)
-            kept.append((measurement, found))
+        def update(self, state, given):
+            found = super().update(state, given)
+            kept.append((given.measurement, found))
             return found
 
     model = make_model(ID, None, scenario, **keywords)
@@ -206,9 +206,9 @@ def test_a_change_moves_the_weight_to_its_class():
     weights, classes = [], []
 
     class Kept(Watched):
-        def update(self, measurement, memory):
-            found = super().update(measurement, memory)
-            weights.append(found[2].weights.sum(axis=1))
+        def update(self, state, given):
+            found = super().update(state, given)
+            weights.append(found.tracks.weights.sum(axis=1))
             return found
 
     def target_class(model, episode):

@@ -99,9 +99,9 @@ class Symmetric:
 def test_a_state_keeps_each_number_once_and_nothing_that_is_never_read():
     traced, given = replayed("ManeuveringTarget", Symmetric, episodes=2, measurements=5)
     assert [(member.name, member.place) for member in traced.state] == [
-        ("P", 0),
-        ("apart_0", 0),
-        ("apart_1", 0),
+        ("memory_P", 0),
+        ("memory_apart_0", 0),
+        ("memory_apart_1", 0),
     ]
     # Deviations are one, means some ten thousand: the last bit.
     assert given.largest_difference(run_filter(traced, given)[:, mean_rows(traced)]) < 1e-11

@@ -5,10 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.baselines.table import Variant
-from filtergym.envs.contract.filter import Initial
-from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
+from filtergym.envs.contract.filter import Initial, Input
+from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE, FaultBank
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.running.rollout import rollout
@@ -108,12 +107,12 @@ def enumerated(bank, task, seen):
 
 def of_bank(bank, seen):
     """The same of the bank."""
-    memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))), 1)
+    state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
     total = 0.0
     for said in seen:
-        mean, covariance, memory, likelihood = bank.update(said, memory)
-        total += np.nan_to_num(likelihood.log_likelihood[0])
-    return total, mean[0, 0], covariance[0, 0, 0]
+        state = bank.update(state, Input(said))
+        total += np.nan_to_num(state.likelihood.log_likelihood[0])
+    return total, state.mean[0, 0], state.covariance[0, 0, 0]
 
 
 def small(**changed):
@@ -154,8 +153,8 @@ def test_merging_costs_little(seed):
 def test_the_first_fix_gives_the_exact_mixture():
     bank, task = small(levels=(1.0, 6.0), distrust=0.4)
     (first, *_) = measurements(3)
-    memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))), 1)
-    _, _, memory, found = bank.update(first, memory)
+    state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
+    found = bank.update(state, Input(first)).likelihood
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
     mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
@@ -177,19 +176,14 @@ def test_the_first_fix_gives_the_exact_mixture():
 
 def test_probabilities_stay_probabilities_and_covariances_positive():
     model = make_model(ID, "gain", "random", axes=2)
-    bank = FaultBank(model.task, TRAINING, points=3, onsets=4)
     found = []
 
-    class Watched:
-        kind = "estimator"
-        start = bank.start
+    class Watched(FaultBank):
+        def update(self, state, given):
+            found.append(super().update(state, given))
+            return found[-1]
 
-        def update(self, measurement, memory):
-            answer = bank.update(measurement, memory)
-            found.append(answer)
-            return answer
-
-    for _ in rollout(model, Watched(), episode_seeds("test", 4, 30)):
+    for _ in rollout(model, Watched(model.task, TRAINING, points=3, onsets=4), episode_seeds("test", 4, 30)):
         pass
     for mean, covariance, memory, likelihood in found[::25]:
         total = sum(part.weights.sum(axis=(0, 1)) for part in (memory.free, memory.pulled))

@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
-from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import FaultFilter
+from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 from models import act, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
@@ -25,7 +24,7 @@ def steered():
     model = make_model(ID, "hypotheses", "random", **faults)
     bank = model.filter
     # A leg may end from the start, or no manoeuvre would begin so early.
-    bank.bank, estimator = (make(model.task, quiet=0.0) for make in (FaultFilter, FaultHypotheses))
+    bank.bank, estimator = (FaultHypotheses(model.task, quiet=0.0) for _ in range(2))
     scans, answers = watch_hypotheses(model, estimator, "readings", ZERO)
     assert max(state.expected[3].max() for state, _ in scans) > 0.1
     assert 0.0 < np.mean([state.between for state, _ in scans]) < 1.0
@@ -41,7 +40,7 @@ def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
         np.testing.assert_array_equal(bank.mean(after), mean)
         np.testing.assert_array_equal(bank.covariance(after), covariance)
         records = bank.records(after, measurement)
-        np.testing.assert_array_equal(records["mode_probability"], memory.probabilities)
+        np.testing.assert_array_equal(records["mode_probability"], memory.hypotheses.probabilities)
         for name in ("log_likelihood", "nis", "nis_degrees"):
             np.testing.assert_array_equal(records[name], getattr(likelihood, name))
 
@@ -68,7 +67,7 @@ def test_hypotheses_scales_renewals_levels_and_noises(steered):
     task.sensor_variance = [factor * r for factor, r in zip(scale, task.sensor_variance, strict=True)]
     heights = np.log(bank.bank.prior.levels) / math.log(bank.bank.prior.levels[-1])
 
-    class Other(FaultFilter):
+    class Other(FaultHypotheses):
         def _move_levels(self, levels):
             q = (level**heights)[:, None] * super()._move_levels(levels)
             return q / q.sum(axis=0)

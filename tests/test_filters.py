@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.contract.filter import Likelihood
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors.filters import find_fault, is_lacking, put_in_loop
-from filtergym.evaluation.competitors.kinds import Likelihood
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import FAULTS
@@ -120,10 +120,10 @@ def test_log_likelihood_is_the_density_of_every_measurement_as_it_was_predicted(
     seen = missed = 0
     for measurement, state in run:
         for lane in range(8):
-            density = state.likelihood.log_likelihood[lane]
+            density = state.own.likelihood.log_likelihood[lane]
             if measurement.available[lane] == 0.0:
                 assert math.isnan(density)
-                assert state.likelihood.nis_degrees[lane] == 0.0
+                assert state.own.likelihood.nis_degrees[lane] == 0.0
                 missed += 1
                 continue
             # P is the posterior of H P' H^T + R: invert the update of the position, which is linear.

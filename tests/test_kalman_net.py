@@ -17,7 +17,7 @@ from filtergym.envs.tightly_coupled_navigation import kalman_net as satellites
 from filtergym.envs.uav_autopilot import kalman_net as aircraft
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.filters import coordinated_turn, gnss_ins, kalman, loosely_coupled, packed_covariance
-from models import make_model
+from models import Asked, make_model
 
 import filtergym
 
@@ -73,7 +73,7 @@ def test_who_has_one():
 def test_of_a_radar_zero_answers_are_a_kalman_filter():
     model, initial, measurements = episodes(RADAR, 8, 60, undisturbed=0.0)
     assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
-    estimator = EstimatorMaker(NAME, network)(model.task)
+    estimator = Asked(EstimatorMaker(NAME, network)(model.task))
     memory = estimator.start(initial, 8)
     H = np.eye(2, 4)
     mean, P = [initial.mean[:, i] for i in range(8)], [initial.covariance[:, :, i] for i in range(8)]
@@ -311,7 +311,7 @@ def test_the_estimator_is_the_policy_in_its_bank(id):
     """What is trained in the environment is what is evaluated outside of it."""
     model, initial, measurements = episodes(id, 8, 40)
     estimator, policy = (
-        EstimatorMaker(NAME, lambda model: network(model, "random"))(model.task),
+        Asked(EstimatorMaker(NAME, lambda model: network(model, "random"))(model.task)),
         network(model, "random"),
     )
     memory, state, hidden = estimator.start(initial, 8), model.filter.start(initial), None

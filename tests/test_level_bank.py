@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.uav_autopilot.level_bank import LevelBank
-from filtergym.envs.uav_autopilot.level_bank import grid
+from filtergym.envs.uav_autopilot.level_bank import LevelBank, grid
 from filtergym.filters import noise_levels, packed_covariance
 from models import act, make_model, watch_hypotheses
 
@@ -59,7 +58,7 @@ def test_hypotheses_scales_noises(steered):
     for k in chosen[::6]:
         state, measurement = scans[k]
         before = inner.switch(act(bank, *scans[k - 1], bank.no_action).memory)
-        mean, covariance = inner.predict(before, measurement)
+        mean, covariance = inner.propagate(before, measurement)
         covariance = covariance + (process - 1.0) * inner.process
         for i, rows in enumerate(inner.rows):
             noise = noise_levels.SensorNoise(factors[i] * inner.variances[i], before.sensors[i])

@@ -22,7 +22,7 @@ from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
-from models import make_model
+from models import Asked, make_model
 from scipy.stats import multivariate_normal
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -49,7 +49,7 @@ def model(request):
 
 def estimates(model, estimator, horizon=100):
     """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
-    given, answers = [], []
+    given, answers, estimator = [], [], Asked(estimator)
 
     class Watched:
         def start(self, initial, N):

@@ -4,12 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.baselines.maneuvering_target.semi_markov import SemiMarkov
-from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR
+from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR, SemiMarkov
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
-from models import make_model
+from models import Asked, make_model
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -151,7 +150,7 @@ def enumerated(filter, initial, measurements, b):
 
 def answers_of(model, estimator, count):
     """Start, measurements and answers of the first scans."""
-    given, answers = [], []
+    given, answers, estimator = [], [], Asked(estimator)
 
     class Watched:
         def start(self, initial, N):
@@ -220,10 +219,11 @@ def test_survives_what_its_prior_rules_out():
     for settings in ({}, {"hazards": (0.0, 1.0)}, VAGUE_PRIOR):
         filter = SemiMarkov(model.task, **settings)
         initial, measurements, _ = answers_of(model, filter, 12)
-        memory = filter.start(initial, LANES)
+        asked = Asked(filter)
+        memory = asked.start(initial, LANES)
         for k, m in enumerate(measurements):
             moved = m._replace(position=m.position + (3e5 if k % 5 == 4 else 0.0))
-            mean, covariance, memory, likelihood = filter.update(moved, memory)
+            mean, covariance, memory, likelihood = asked.update(moved, memory)
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
@@ -232,7 +232,7 @@ def test_survives_what_its_prior_rules_out():
 @pytest.mark.filterwarnings("error")
 def test_is_compiled_with_the_world():
     # What cannot be traced runs as Python code, and a warning says so.
-    assert SemiMarkov.traceable
+    assert not SemiMarkov.in_python
     evaluate(ID, ["semi-markov", "semi-markov-vague"], episodes=8, horizon=4, backend="compiled")
 
 

@@ -9,10 +9,9 @@ import scipy.stats
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
-from filtergym.baselines.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.contract.filter import Initial
-from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE
+from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE, FaultHypotheses
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.running.rollout import rollout
@@ -86,7 +85,7 @@ def test_bound_is_the_dense_recursion():
             return super().update(measurement, truth, memory)
 
     run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
-    bounds = [episode.filter.mean_square for episode, _ in run]
+    bounds = [episode.filter.own.mean for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
     assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
     p, S = model.task.parameters, model.task.satellites
@@ -212,8 +211,8 @@ def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
     found = []
 
     class Watched(FaultHypotheses):
-        def update(self, measurement, memory):
-            answer = super().update(measurement, memory)
+        def update(self, state, given):
+            answer = super().update(state, given)
             found.append((answer[2].means[17:], answer[2].probabilities))
             return answer
 
@@ -241,8 +240,8 @@ def test_levels_of_a_rate_find_the_noisy_one():
     levels, noisy = [], []
 
     class Watched(FaultHypotheses):
-        def update(self, measurement, memory):
-            answer = super().update(measurement, memory)
+        def update(self, state, given):
+            answer = super().update(state, given)
             levels.append(answer[2].levels[0])
             return answer
 
@@ -422,7 +421,7 @@ def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
     available[8:11, 1] = 0.0
     available[9, 2:] = 0.0
     measurement = Measurement(*[None] * 2, available, *[None] * 4)
-    check = estimators.HuberStuckCheck(model.task, rates=2.0, manoeuvre=3.0).huber.bank
+    check = estimators.HuberStuckCheck(model.task, rates=2.0, manoeuvre=3.0).bank
     average = numpy.full((4, 3, 4), 9.0)
     average[1, 2, 3] = 2.9
     state = check.start(Initial(numpy.ones((17, 4)), numpy.ones((17, 17, 4))))._replace(average_nis=average)
@@ -445,13 +444,13 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
     )
     estimator = estimators.HuberStuckCheck(model.task)
     seen = []
-    predict = estimator.huber.bank.predict
+    predict = estimator.bank.predict
 
     def watched(state, measurement):
         seen.append(measurement.available)
         return predict(state, measurement)
 
-    estimator.huber.bank.predict = watched
+    estimator.bank.predict = watched
     told = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
     stuck = numpy.stack([episode.truth.stuck for episode in told])
     there = numpy.stack([episode.measurement.available for episode in told])

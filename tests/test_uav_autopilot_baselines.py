@@ -11,12 +11,11 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.measurement_noise import VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
-from filtergym.baselines.uav_autopilot.level_bank import LevelBank
 from filtergym.baselines.uav_autopilot.metrics import METRICS, detect_raised_noise
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.theory import stationary
 from filtergym.envs.uav_autopilot.banks import MODES
-from filtergym.envs.uav_autopilot.level_bank import Kind
+from filtergym.envs.uav_autopilot.level_bank import Kind, LevelBank
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds

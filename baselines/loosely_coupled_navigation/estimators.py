@@ -5,22 +5,24 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Filter, Initial, Input, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters.ordered_sums import ordered_sum
 from ..measurement_noise import MeasurementNoise
 from .augmented import AugmentedFilter, AugmentedMemory
 
 
 class Navigator(NamedTuple):
-    """Memory of the augmented filter."""
+    """State of the augmented filter."""
 
-    position: Array
-    """``(A, N)``, m."""
+    mean: Array
+    """Position, ``(A, N)``, m."""
+    covariance: Array
+    """``(A, A, N)``."""
     rates: AugmentedMemory
+    likelihood: Likelihood
 
 
 def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
@@ -39,29 +41,26 @@ def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: 
     return Likelihood(xp.where(there, density, math.nan), xp.where(there, nis, math.nan), axes * available)
 
 
-class AugmentedEstimator:
+class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator]):
     """The augmented filter, which also estimates the constant and coloured rate errors, reported as it is."""
-
-    kind = "estimator"
-    traceable = True
 
     def __init__(
         self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
+        super().__init__(task)
         self.filter = AugmentedFilter(task.parameters, rule(**values))
-        self.xp = task.xp
         self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
-    def start(self, initial: Initial, N: int) -> Navigator:
+    def start(self, initial: Initial) -> Navigator:
         """Start where INS and reference agree."""
-        return Navigator(initial.mean, self.filter.start(0.0 * initial.mean))
+        rates = self.filter.start(0.0 * initial.mean)
+        return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 
-    def update(
-        self, measurement: Measurement, memory: Navigator
-    ) -> tuple[Array, Array, Navigator, Likelihood]:
+    def update(self, state: Navigator, given: Input) -> Navigator:
         """Predict by the increment of the INS, update by the fix where there is one."""
-        displacement, predicted = self.filter.predict(memory.rates)
-        position = memory.position + (measurement.increment - displacement)
+        measurement = given.measurement
+        displacement, predicted = self.filter.predict(state.rates)
+        position = state.mean + (measurement.increment - displacement)
         innovation = self.xp.where(measurement.available > 0.0, measurement.fix - position, 0.0)
         reported = measurement.reported_deviation * measurement.reported_deviation
         correction, rates = self.filter.update(predicted, innovation, reported, measurement.available)
@@ -69,4 +68,4 @@ class AugmentedEstimator:
         likelihood = likelihood_of_fix(
             innovation, predicted.covariance.position + rates.variance, measurement.available, self.xp
         )
-        return position, self.eye * rates.covariance.position, Navigator(position, rates), likelihood
+        return Navigator(position, self.eye * rates.covariance.position, rates, likelihood)

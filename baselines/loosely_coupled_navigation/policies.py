@@ -11,7 +11,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
-from ...envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE
+from ...envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE, FaultBank
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import select_nested
@@ -20,7 +20,6 @@ from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
 from .estimators import AugmentedEstimator
-from .fault_bank import FaultBank
 from .metrics import METRICS
 from .references import Matched, MatchedCovariance
 

@@ -17,12 +17,11 @@ from typing import NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.contract.schedules import within
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import loosely_coupled as ins_gnss
 from ...filters import receiver_faults
 from .estimators import likelihood_of_fix

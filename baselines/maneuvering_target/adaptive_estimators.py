@@ -5,20 +5,19 @@ A scan that missed the target says nothing of any noise: what is estimated holds
 
 from typing import NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Input, Likelihood, Track
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import kalman, noise_adaptation, predicted_covariance
 from .estimators import KalmanModel
 
 
 class ProcessNoiseTrack(NamedTuple):
-    """Memory of a filter that estimates its process noise."""
+    """State of a filter that estimates its process noise."""
 
     mean: Array
     covariance: Array
+    likelihood: Likelihood
     level: noise_adaptation.Level
 
 
@@ -32,36 +31,32 @@ class SageHusa(KalmanModel):
         least: smallest standard deviation of the acceleration, m/s^2.
     """
 
-    kind = "estimator"
-
     def __init__(
         self, task: ManeuveringTarget, acceleration: float = 1.0, forgetting: float = 0.9, least: float = 0.1
     ) -> None:
         super().__init__(task)
         self.variance, self.forgetting, self.least = acceleration**2, forgetting, least**2
 
-    def start(self, initial: Initial, N: int) -> ProcessNoiseTrack:
+    def start(self, initial: Initial) -> ProcessNoiseTrack:
         """Start where everyone starts."""
         nothing = 0.0 * initial.mean[0]
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
-        return ProcessNoiseTrack(initial.mean, initial.covariance, level)
+        return ProcessNoiseTrack(*self.first_track(initial), level)
 
-    def update(
-        self, measurement: Measurement, memory: ProcessNoiseTrack
-    ) -> tuple[Array, Array, ProcessNoiseTrack, Likelihood]:
+    def update(self, state: ProcessNoiseTrack, given: Input) -> ProcessNoiseTrack:
         """Predict with the noise estimated so far, update, and estimate it anew."""
+        measurement = given.measurement
         F, unit = self.motion(measurement.interval)
-        mean, carried = kalman.predict(memory.mean, memory.covariance, F, 0.0 * unit)
-        predicted = carried + unit * memory.level.value
+        mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
+        predicted = carried + unit * state.level.value
         result = self.update_estimate((mean, predicted), measurement)
         sample = noise_adaptation.process_noise_factor(
             result.mean - mean,
             *(self.diagonal(P) for P in (result.covariance, carried, unit)),
         )
-        level = noise_adaptation.fading_mean(memory.level, sample, self.forgetting, measurement.available)
+        level = noise_adaptation.fading_mean(state.level, sample, self.forgetting, measurement.available)
         level = level._replace(value=self.xp.clip(level.value, self.least, None))
-        track = ProcessNoiseTrack(result.mean, result.covariance, level)
-        return result.mean, result.covariance, track, self.likelihood(measurement, *result[2:])
+        return ProcessNoiseTrack(*self.track(measurement, result), level)
 
     def diagonal(self, covariance: Array) -> Array:
         """Variances, ``(4, N)``."""
@@ -69,10 +64,11 @@ class SageHusa(KalmanModel):
 
 
 class MeasurementNoiseTrack(NamedTuple):
-    """Memory of a filter that estimates its measurement noise."""
+    """State of a filter that estimates its measurement noise."""
 
     mean: Array
     covariance: Array
+    likelihood: Likelihood
     noise: noise_adaptation.InverseGamma
 
 
@@ -88,7 +84,6 @@ class VariationalBayes(KalmanModel):
         shape: half the number of measurements for which the radar's own variance stands at the start.
     """
 
-    kind = "estimator"
     iterations = 3
 
     def __init__(
@@ -101,20 +96,17 @@ class VariationalBayes(KalmanModel):
         super().__init__(task)
         self.variance, self.forgetting, self.shape = acceleration**2, forgetting, shape
 
-    def start(self, initial: Initial, N: int) -> MeasurementNoiseTrack:
+    def start(self, initial: Initial) -> MeasurementNoiseTrack:
         """Start where everyone starts, and believe the radar."""
         shape = self.shape + 0.0 * initial.mean[:2]
-        return MeasurementNoiseTrack(
-            initial.mean, initial.covariance, noise_adaptation.InverseGamma(shape, shape)
-        )
+        return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
-    def update(
-        self, measurement: Measurement, memory: MeasurementNoiseTrack
-    ) -> tuple[Array, Array, MeasurementNoiseTrack, Likelihood]:
+    def update(self, state: MeasurementNoiseTrack, given: Input) -> MeasurementNoiseTrack:
         """Predict, and update state and noise together."""
+        measurement = given.measurement
         xp, variance, available = self.xp, measurement.variance, measurement.available
         F, unit = self.motion(measurement.interval)
-        predicted = kalman.predict(memory.mean, memory.covariance, F, self.variance * unit)
+        predicted = kalman.predict(state.mean, state.covariance, F, self.variance * unit)
 
         def update(factor: Array) -> tuple[Array, Array, kalman.Update]:
             result = self.update_estimate(predicted, measurement._replace(variance=factor * variance))
@@ -122,12 +114,12 @@ class VariationalBayes(KalmanModel):
             residual = xp.where(available > 0.0, measurement.position - result.mean[:2], 0.0)
             return residual / xp.sqrt(variance), updated / variance, result
 
-        before = noise_adaptation.forget(memory.noise, self.forgetting, available)
+        before = noise_adaptation.forget(state.noise, self.forgetting, available)
         noise, result = noise_adaptation.variational_bayes(before, update, self.iterations, available)
-        track = MeasurementNoiseTrack(result.mean, result.covariance, noise)
         # With the noise known before this scan: with that of its own update, it would have predicted itself.
         nominal = self.update_estimate(predicted, measurement._replace(variance=before.variance * variance))
-        return result.mean, result.covariance, track, self.likelihood(measurement, *nominal[2:])
+        told = self.likelihood(measurement, *nominal[2:])
+        return MeasurementNoiseTrack(result.mean, result.covariance, told, noise)
 
 
 class VariationalBayesPrediction(KalmanModel):
@@ -139,21 +131,17 @@ class VariationalBayesPrediction(KalmanModel):
         strength: measurements for which the nominal prediction's covariance stands.
     """
 
-    kind = "estimator"
     iterations = 10
 
     def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, strength: float = 3.0) -> None:
         super().__init__(task)
         self.variance, self.strength = acceleration**2, strength
 
-    def start(self, initial: Initial, N: int) -> Initial:
-        """Start where everyone starts."""
-        return initial
-
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Predict, and update state and predicted covariance together."""
+        measurement = given.measurement
         F, unit = self.motion(measurement.interval)
-        predicted = Initial(*kalman.predict(memory.mean, memory.covariance, F, self.variance * unit))
+        predicted = Initial(*kalman.predict(state.mean, state.covariance, F, self.variance * unit))
         result = predicted_covariance.update(
             *predicted,
             measurement.position,
@@ -164,4 +152,4 @@ class VariationalBayesPrediction(KalmanModel):
         )
         estimate = self.where_detected(measurement, Initial(result.mean, result.covariance), predicted)
         nominal = self.update_estimate(predicted, measurement)
-        return *estimate, estimate, self.likelihood(measurement, *nominal[2:])
+        return Track(estimate.mean, estimate.covariance, self.likelihood(measurement, *nominal[2:]))

@@ -5,12 +5,9 @@ from typing import Any
 
 import numpy
 
-from ...envs.contract.filter import Initial
-from ...envs.contract.observation import Array
+from ...envs.contract.filter import Initial, Input, Track
 from ...envs.data.recording import Recording
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import dead_reckoning
 from .estimators import DEGREE, KalmanModel
 
@@ -34,7 +31,6 @@ class DeadReckoning(KalmanModel):
         heading_offset: by which these are turned clockwise, degrees.
     """
 
-    kind = "estimator"
     acceleration = 1.0
     """m/s^2, where the odometry says nothing; ours, of what has wheels or legs."""
 
@@ -52,12 +48,13 @@ class DeadReckoning(KalmanModel):
         self.scale, self.heading_offset = scale, DEGREE * heading_offset
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts, off by an unknown error."""
-        return Initial(*dead_reckoning.start(initial.mean, initial.covariance, self.deviation))
+        return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Move by the odometry and update with the measured position."""
+        measurement = given.measurement
         odometry = measurement.odometry
         if odometry is None:
             raise ValueError(
@@ -65,7 +62,8 @@ class DeadReckoning(KalmanModel):
                 "odometry_speed and odometry_heading"
             )
         predicted = dead_reckoning.predict_position(
-            *memory,
+            state.mean,
+            state.covariance,
             dead_reckoning.calibrate(odometry.displacement, self.scale, self.heading_offset),
             odometry.available,
             measurement.interval,
@@ -74,13 +72,7 @@ class DeadReckoning(KalmanModel):
             correlation_time=self.correlation_time,
             deviation=self.deviation,
         )
-        result = self.update_estimate(predicted, measurement)
-        return (
-            result.mean[:4],
-            result.covariance[:4, :4],
-            Initial(result.mean, result.covariance),
-            self.likelihood(measurement, *result[2:]),
-        )
+        return self.track(measurement, self.update_estimate(predicted, measurement))
 
 
 def regress_odometry(recording: Recording) -> tuple[float, float]:

@@ -3,18 +3,16 @@
 Equations: ``filters/data_association.py``. Without clutter each is the estimator that it is made of.
 """
 
-import math
-
+from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
+from ...envs.maneuvering_target.semi_markov import SemiMarkov
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement, Plots
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import data_association, kalman
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses
 from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
-from .semi_markov import SemiMarkov
 
 
 class AllPlots(KalmanModel):
@@ -48,7 +46,7 @@ class AllPlots(KalmanModel):
         """
         if measurement.plots is None:
             return super().likelihood(measurement, log_likelihood, nis)
-        return Likelihood(math.nan + 0.0 * log_likelihood)
+        return Likelihood.unknown(log_likelihood)
 
 
 class ProbabilisticDataAssociation(AllPlots, ConstantVelocity):
@@ -67,7 +65,7 @@ class InteractingMultipleModelDataAssociation(AllPlots, KalmanInteractingMultipl
     """The usual IMM over two Kalman filters of constant velocity, each of which weighs all plots of a scan."""
 
 
-class SemiMarkovDataAssociation(AllPlots, SemiMarkov):
+class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
     """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
 
     def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:

@@ -5,40 +5,41 @@ They predict over the time between two scans, whatever it is, and a scan that mi
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Filter, Initial, Input, Likelihood, Track
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import coordinated_turn, imm, kalman, unscented
 from ...filters.ordered_sums import weighted_sum
 
 DEGREE = math.pi / 180.0
 
 
-class KalmanModel(ConstantVelocityModel):
+class KalmanModel(ConstantVelocityModel, Filter):
     """The constant-velocity model with what estimators share."""
 
-    traceable = True
+    def start(self, initial: Initial) -> Any:
+        """Start where everyone starts."""
+        return self.first_track(initial)
 
-    def update_estimate(
-        self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
-    ) -> kalman.Update:
-        """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
-        nothing of how likely they are; H is that of the position unless another one is given.
-        """
-        H = self.H if H is None else H
-        result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)
-        return self.where_detected(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
+    def first_track(self, initial: Initial) -> Track:
+        """Estimate before the first scan."""
+        return Track(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
-    def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
-        """How well a scan was predicted; NaN where it missed the target."""
-        there = measurement.available > 0.0
-        log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
-        return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
+    def mean(self, state: Any) -> Array:
+        """Position and velocity, whatever else is estimated."""
+        return state.mean[:4]
+
+    def covariance(self, state: Any) -> Array:
+        """Likewise."""
+        return state.covariance[:4, :4]
+
+    def track(self, measurement: Measurement, result: kalman.Update) -> Track:
+        """State after an update."""
+        return Track(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
 class ConstantVelocity(KalmanModel):
@@ -49,29 +50,25 @@ class ConstantVelocity(KalmanModel):
         acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
     """
 
-    kind = "estimator"
-
     def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0) -> None:
         super().__init__(task)
         self.variance = acceleration**2
 
-    def start(self, initial: Initial, N: int) -> Initial:
-        """Start where everyone starts."""
-        return Initial(initial.mean, initial.covariance)
-
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """One cycle of the filter."""
-        F, Q = self.motion(measurement.interval)
-        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
-        state = Initial(result.mean, result.covariance)
-        return *state, state, self.likelihood(measurement, *result[2:])
+        F, Q = self.motion(given.measurement.interval)
+        predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
+        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
 class KalmanBank(NamedTuple):
-    """Memory of the IMM over Kalman filters."""
+    """State of the IMM over Kalman filters."""
 
     mean: Array
     covariance: Array
+    likelihood: Likelihood
+    means: Array
+    covariances: Array
     probabilities: Array
 
 
@@ -83,8 +80,6 @@ class KalmanInteractingMultipleModel(KalmanModel):
         accelerations: standard deviation of the acceleration of each filter, m/s^2.
         stay: probability of each mode to last another scan; it is left for any other alike.
     """
-
-    kind = "estimator"
 
     def __init__(
         self,
@@ -118,40 +113,37 @@ class KalmanInteractingMultipleModel(KalmanModel):
             for j, variance in enumerate(self.variances)
         ]
 
-    def start(self, initial: Initial, N: int) -> KalmanBank:
+    def start(self, initial: Initial) -> KalmanBank:
         """Start all filters where everyone starts."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanBank(
+            *self.first_track(initial),
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
             (self.probabilities[:, None] if self.probabilities.ndim == 1 else self.probabilities)
             + 0.0 * mean[:1],
         )
 
-    def update(
-        self, measurement: Measurement, memory: KalmanBank
-    ) -> tuple[Array, Array, KalmanBank, Likelihood]:
+    def update(self, state: KalmanBank, given: Input) -> KalmanBank:
         """One IMM cycle. Its normalised innovation squared is the mean of the filters' by their posterior weights."""
-        xp = self.xp
-        prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
-        mixed = imm.mix(memory.mean, memory.covariance, prediction.mixing)
+        xp, measurement = self.xp, given.measurement
+        prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
+        mixed = imm.mix(state.means, state.covariances, prediction.mixing)
         results = self.predict_and_update(*mixed, measurement)
         log_likelihood = xp.stack([r.log_likelihood for r in results])
         log_predicted = imm.log_probabilities(prediction.probabilities)
         probabilities = imm.mode_posterior(log_predicted, log_likelihood)
-        bank = KalmanBank(
-            xp.stack([r.mean for r in results], axis=1),
-            xp.stack([r.covariance for r in results], axis=2),
-            probabilities,
-        )
-        mean, covariance = imm.combine(*bank)
+        means = xp.stack([r.mean for r in results], axis=1)
+        covariances = xp.stack([r.covariance for r in results], axis=2)
+        mean, covariance = imm.combine(means, covariances, probabilities)
         density = imm.log_mixture_density(log_predicted, log_likelihood)
         nis = weighted_sum(probabilities, xp.stack([r.squared_distance for r in results]))
-        return mean[:4], covariance[:4, :4], bank, self.likelihood(measurement, density, nis)
+        likelihood = self.likelihood(measurement, density, nis)
+        return KalmanBank(mean[:4], covariance[:4, :4], likelihood, means, covariances, probabilities)
 
 
-class TurnModel(KalmanModel):
+class TurnModel(ConstantVelocityModel):
     """The nearly coordinated turn, with the turn rate as fifth state.
 
     Args:
@@ -220,7 +212,7 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         return [*results, self.turn.update_estimate(predicted, measurement)]
 
 
-class UnscentedTurn(TurnModel):
+class UnscentedTurn(TurnModel, KalmanModel):
     """Unscented Kalman filter of position, velocity and turn rate, always in a nearly coordinated turn.
 
     The measurement is linear, so only the prediction takes the unscented transform; the update is Kalman's.
@@ -232,8 +224,6 @@ class UnscentedTurn(TurnModel):
         turn_rate_start: of the turn rate at the start of the track, degrees/s.
     """
 
-    kind = "estimator"
-
     def __init__(
         self,
         task: ManeuveringTarget,
@@ -244,22 +234,15 @@ class UnscentedTurn(TurnModel):
         super().__init__(task, acceleration, turn_rate_change)
         self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts, with a turn rate about zero."""
-        return Initial(
-            *coordinated_turn.augment_turn_rate(initial.mean, initial.covariance, self.turn_variance)
-        )
+        return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """Carry the sigma points through the turn and update with the measured position."""
-        T = measurement.interval
+        T = given.measurement.interval
         mean, covariance = unscented.transform(
-            memory.mean, memory.covariance, lambda points: coordinated_turn.propagate(points, T)
+            state.mean, state.covariance, lambda points: coordinated_turn.propagate(points, T)
         )
-        result = self.update_estimate((mean, covariance + self.noise(T)), measurement)
-        return (
-            result.mean[:4],
-            result.covariance[:4, :4],
-            Initial(result.mean, result.covariance),
-            self.likelihood(measurement, *result[2:]),
-        )
+        predicted = mean, covariance + self.noise(T)
+        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))

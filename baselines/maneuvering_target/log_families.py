@@ -11,12 +11,9 @@ from typing import Any
 
 import numpy
 
-from ...envs.contract.filter import Initial
-from ...envs.contract.observation import Array
+from ...envs.contract.filter import Initial, Input, Track
 from ...envs.data.recording import Recording
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.maneuvering_target.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes
@@ -39,14 +36,12 @@ class ConstantAcceleration(KalmanModel):
         acceleration: of the acceleration at the start, m/s^2.
     """
 
-    kind = "estimator"
-
     def __init__(self, task: ManeuveringTarget, jerk: float = 0.3, acceleration: float = 1.0) -> None:
         super().__init__(task)
         self.variance, self.start_variance = jerk**2, acceleration**2
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
-    def start(self, initial: Initial, N: int) -> Initial:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts, with an acceleration about zero."""
         xp = self.xp
         zero = 0.0 * initial.mean
@@ -55,11 +50,12 @@ class ConstantAcceleration(KalmanModel):
         none = 0.0 * variance
         rows = [[*([none] * 4), *(variance if i == j else none for j in range(2))] for i in range(2)]
         below = xp.stack([xp.stack(row) for row in rows])
-        return Initial(xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0))
+        augmented = xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0)
+        return super().start(Initial(*augmented))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+    def update(self, state: Track, given: Input) -> Track:
         """One cycle of the filter."""
-        xp, T = self.xp, measurement.interval
+        xp, T = self.xp, given.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
         half = 0.5 * T**2
         kinematic = [[one, T, half], [none, one, T], [none, none, one]]
@@ -77,14 +73,8 @@ class ConstantAcceleration(KalmanModel):
                 for i in range(6)
             ]
         )
-        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
-        state = Initial(result.mean, result.covariance)
-        return (
-            result.mean[:4],
-            result.covariance[:4, :4],
-            state,
-            self.likelihood(measurement, *result[2:]),
-        )
+        predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
+        return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
 def _imm(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:

@@ -3,20 +3,21 @@
 from typing import NamedTuple
 
 from ...envs.contract.faults import GaussMarkov
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Input, Likelihood
 from ...envs.contract.observation import Array
+from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import bounds, kalman, polar
 from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
 
 class TurnMemory(NamedTuple):
-    """Memory of :class:`KnownTurn`."""
+    """State of :class:`KnownTurn`."""
 
     mean: Array
     covariance: Array
+    likelihood: Likelihood
     truth: Truth
     """At the last scan."""
 
@@ -42,14 +43,14 @@ class KnownTurn(KalmanModel):
         "deviation and correlation time of coloured errors, and which plot is the target's"
     )
 
-    def start(self, initial: Initial, truth: Truth) -> TurnMemory:
+    def initialise(self, given: Input) -> TurnMemory:
         """Start where everyone starts; a coloured error is stationary from the start."""
-        mean, covariance = initial
+        (mean, covariance), truth = given.measurement, given.truth
         if "coloured" in truth.disturbances:
             none, variance = 0.0 * mean[:2], truth.disturbances["coloured"].deviation ** 2
             mean = self.xp.concat([mean, none])
             covariance = self.block_diagonal(covariance, self.identity * variance)
-        return TurnMemory(mean, covariance, truth)
+        return TurnMemory(mean, covariance, Likelihood.unknown(mean[0]), truth)
 
     def block_diagonal(self, first: Array, second: Array) -> Array:
         """Matrix of two blocks, ``(n + m, n + m, N)``."""
@@ -61,21 +62,20 @@ class KnownTurn(KalmanModel):
             ]
         )
 
-    def update(
-        self, measurement: Measurement, truth: Truth, memory: TurnMemory
-    ) -> tuple[Array, Array, TurnMemory, Likelihood]:
+    def update(self, state: TurnMemory, given: Input) -> TurnMemory:
         """Predict with what is known of the flight since the scan before, and update with the measured position."""
+        measurement, truth = given.measurement, given.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances
         assert isinstance(world, RadarWorld)
         early = None
-        if truth.scans is not None and memory.truth.scans is not None:
-            early = memory.truth.scans.early, truth.scans.early
+        if truth.scans is not None and state.truth.scans is not None:
+            early = state.truth.scans.early, truth.scans.early
         one = xp.ones_like(truth.scan)
         identity = xp.stack([xp.stack([one, 0.0 * one]), xp.stack([0.0 * one, one])])
         columns = [world.course.carry(truth.flight, truth.scan, early, identity[i]) for i in range(2)]
         by_velocity = xp.stack([xp.concat(column) for column in columns], axis=1)
         F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
-        before, now = (xp.concat([state.position, state.velocity]) for state in (memory.truth, truth))
+        before, now = (xp.concat([state.position, state.velocity]) for state in (state.truth, truth))
         offset, Q, H = now - apply(F, before), 0.0 * F, self.H[:, :, None]
         variance = polar.cartesian_variances(
             truth.position, self.task.parameters.range_sigma, world.bearing_sigma
@@ -94,17 +94,15 @@ class KnownTurn(KalmanModel):
             H = xp.concat([H + 0.0 * sigma[0], self.identity * sigma], axis=1)
         if "glint" in disturbances:
             variance = disturbances["glint"] ** 2 * variance
-        predicted = kalman.predict(memory.mean, memory.covariance, F, Q, offset)
+        predicted = kalman.predict(state.mean, state.covariance, F, Q, offset)
         result = self.update_estimate(predicted, measurement._replace(variance=variance), H)
-        mean, covariance = result.mean[:4], result.covariance[:4, :4]
-        memory = TurnMemory(result.mean, result.covariance, truth)
-        return mean, covariance, memory, self.likelihood(measurement, *result[2:])
+        return TurnMemory(*self.track(measurement, result), truth)
 
 
-class KnownInputBound(KalmanModel):
+class KnownInputBound(ConstantVelocityModel):
     """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
 
-    kind = "bound"
+    kind, traceable = "bound", True
     knows = "the acceleration in every scan"
 
     def start(self, initial: Initial, truth: Truth) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import log10
 from typing import Any
 
-from ...envs.maneuvering_target.semi_markov import TRAINING_PRIOR, VAGUE_PRIOR
+from ...envs.maneuvering_target.semi_markov import TRAINING_PRIOR, VAGUE_PRIOR, SemiMarkov
 from ..table import Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .data_association import (
@@ -17,7 +17,6 @@ from .data_association import (
     SemiMarkovDataAssociation,
 )
 from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
-from .semi_markov import SemiMarkov
 
 Settings = tuple[dict[str, Any], Callable[[Any], Any]]
 

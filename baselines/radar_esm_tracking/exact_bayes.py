@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.contract.filter import Filter, Input, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import class_fusion, contaminated_normal, imm, kalman, packed_covariance
 from ...filters import emitter_association as emitters
 from ...filters.ordered_sums import ordered_sum
@@ -94,7 +94,7 @@ measurements of the radar may be outliers."""
 
 
 class ClassTracks(NamedTuple):
-    """Memory; S classes, M = B + 2 hypotheses each (unchanged, B onsets, older), J labels of emitters."""
+    """Hypotheses; S classes, M = B + 2 hypotheses each (unchanged, B onsets, older), J labels of emitters."""
 
     mean: Array
     """``(3, S, M, N)``."""
@@ -112,7 +112,18 @@ class ClassTracks(NamedTuple):
     """T1, likewise."""
 
 
-class ExactBayes:
+class ClassState(NamedTuple):
+    """State of the filter."""
+
+    mean: Array
+    """Of all hypotheses together, ``(3, N)``."""
+    covariance: Array
+    """``(3, 3, N)``."""
+    tracks: ClassTracks
+    likelihood: Likelihood
+
+
+class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
     """Filter.
 
     Args:
@@ -121,13 +132,10 @@ class ExactBayes:
         changed: fields of the prior that are otherwise.
     """
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: RadarEsmTracking, prior: ClassPrior = TRAINING, **changed: Any) -> None:
+        super().__init__(task)
         self.prior = prior = prior._replace(**changed)
-        self.task, self.xp, p = task, task.xp, task.parameters
-        self.parameters, self.classes = p, task.classes
+        p, self.classes = task.parameters, task.classes
         self.spacing = p.esm_period
         models, start = task.design_models(p)
         decay = math.exp(-p.sampling_interval / prior.correlation_time)
@@ -166,8 +174,13 @@ class ExactBayes:
         self.disturbed_by_type = [[v for v in points if disturbed[v, 0]] for points in self.by_type]
         self.grid = emitters.Surroundings(grid.other_type, *(task.constant(part) for part in grid[1:]))
 
-    def start(self, initial: Start, N: int) -> ClassTracks:
+    def start(self, initial: Start) -> ClassState:
         """Start on the first radar measurement, and weigh the classes by the first look."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return ClassState(initial.mean, initial.covariance, self.start_tracks(initial), unknown)
+
+    def start_tracks(self, initial: Start) -> ClassTracks:
+        """Hypotheses at the start."""
         xp, p, M = self.xp, self.prior, self.prior.onsets + 2
         none = 0.0 * initial.mean[0]
         state = xp.concat([initial.mean, xp.zeros((self.states - 3, 1)) + none])
@@ -239,11 +252,9 @@ class ExactBayes:
             later,
         )
 
-    def update(
-        self, measurement: Measurement, memory: ClassTracks
-    ) -> tuple[Array, Array, ClassTracks, Likelihood]:
+    def update(self, state: ClassState, given: Input) -> ClassState:
         """One cycle: motion and radar, change of class, ESM. Its likelihood is that of the radar."""
-        xp, prior = self.xp, self.prior
+        xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
         P = packed_covariance.unpack(memory.covariance, self.states)
         mean, P = kalman.predict(memory.mean, P, self.F, self.Q)
         radar = contaminated_normal.update_position(
@@ -287,7 +298,7 @@ class ExactBayes:
         )
         if self.prior.coloured:
             estimate, covariance = class_fusion.take_away_coloured_errors(estimate, covariance)
-        return estimate, mirror_lower(covariance), memory, likelihood
+        return ClassState(estimate, mirror_lower(covariance), memory, likelihood)
 
     def change(self, m: ClassTracks, scan: Array) -> ClassTracks:
         """Let the class change, at one scan of every ``spacing``."""

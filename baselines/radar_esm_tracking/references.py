@@ -7,10 +7,10 @@ Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sect
 
 from typing import NamedTuple
 
+from ...envs.contract.filter import Likelihood
 from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import bounds, kalman
 from ...filters.small_matrices import mirror_lower
 

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Filter, Initial, Input, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
-from ...evaluation.competitors.kinds import Likelihood
 
 
 class HuberBank(HypothesisBank):
@@ -43,7 +43,14 @@ class HuberBank(HypothesisBank):
         return [xp.where(robust, threshold, math.inf) for threshold in self.of_reading]
 
 
-class Huber:
+class HuberState(NamedTuple):
+    """State of the paper's bank with a robust update."""
+
+    filters: Filters
+    likelihood: Likelihood
+
+
+class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
     """The paper's bank with Huber's robust update of every sensor: outliers pull no further than a threshold.
 
     See ``filters/extended_kalman.py``.
@@ -54,35 +61,39 @@ class Huber:
         manoeuvre: see :class:`HuberBank`; by default every update is robust.
     """
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(
         self,
         task: TightlyCoupledNavigation,
         thresholds: Mapping[str, float] | None = None,
         manoeuvre: float = math.inf,
     ) -> None:
+        super().__init__(task)
         everywhere = {sensor.name: EFFICIENT for sensor in task.sensors}
         self.bank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
-    def start(self, initial: Initial, N: int) -> Filters:
+    def start(self, initial: Initial) -> HuberState:
         """Start every filter where everyone starts."""
-        return self.bank.start(initial)
+        return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters, Likelihood]:
+    def update(self, state: HuberState, given: Input) -> HuberState:
         """One cycle of the bank."""
-        xp, readings = self.bank.xp, measurement.readings
-        readings = xp.where(xp.isnan(readings), 0.0, readings)  # the bank weighs each by its availability
-        measurement = measurement._replace(readings=readings)
-        filters = self.bank.predict(memory, measurement)
-        filters = self.bank.weigh_by_bayes(filters, memory.last_action)
-        records = self.bank.records(filters, measurement)
-        likelihood = Likelihood(*(records[name] for name in Likelihood._fields))
-        return filters.mean, self.bank.covariance(filters), filters, likelihood
+        xp, measurement = self.xp, given.measurement
+        readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
+        measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
+        filters = self.bank.predict(state.filters, measurement)
+        filters = self.bank.weigh_by_bayes(filters, state.filters.last_action)
+        return HuberState(filters, Likelihood.told(self.bank.records(filters, measurement)))
+
+    def mean(self, state: HuberState) -> Array:
+        """That of the bank."""
+        return self.bank.mean(state.filters)
+
+    def covariance(self, state: HuberState) -> Array:
+        """That of the bank."""
+        return self.bank.covariance(state.filters)
 
 
-class HuberStuckCheck:
+class HuberStuckCheck(Huber):
     """Huber's update of ranges and rates, and accelerometers that repeat their last reading are left out at once.
 
     Noise never repeats itself, so the first repeated reading shows the stuck sensor for certain. Robustness alone
@@ -95,24 +106,16 @@ class HuberStuckCheck:
         manoeuvre: see :class:`HuberBank`.
     """
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(
         self, task: TightlyCoupledNavigation, rates: float = EFFICIENT, manoeuvre: float = 4.0
     ) -> None:
-        self.task = task
-        self.huber = Huber(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
+        super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
-    def start(self, initial: Initial, N: int) -> Filters:
-        """Start every filter where everyone starts."""
-        return self.huber.start(initial, N)
-
-    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters, Likelihood]:
+    def update(self, state: HuberState, given: Input) -> HuberState:
         """One cycle of the bank without what repeats itself."""
-        xp, forces = self.task.xp, self.task.sensors[2].readings
+        xp, forces, measurement = self.xp, self.task.sensors[2].readings, given.measurement
         available = measurement.available
-        fresh = xp.any(measurement.readings[forces] != memory.accelerometers, axis=0)
+        fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)
         kept = available[forces] * xp.astype(fresh, available.dtype)
         available = xp.concat([available[: forces.start], kept, available[forces.stop :]])
-        return self.huber.update(measurement._replace(available=available), memory)
+        return super().update(state, Input(measurement._replace(available=available)))

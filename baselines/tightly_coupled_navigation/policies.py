@@ -12,13 +12,17 @@ from typing import Any, ClassVar
 import numpy
 
 from ...envs.contract.model import Model
-from ...envs.tightly_coupled_navigation.fault_hypotheses import TRAINING, VAGUE, FaultPrior
+from ...envs.tightly_coupled_navigation.fault_hypotheses import (
+    TRAINING,
+    VAGUE,
+    FaultHypotheses,
+    FaultPrior,
+)
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
-from .fault_hypotheses import FaultHypotheses
 from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 

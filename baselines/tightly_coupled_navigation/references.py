@@ -5,12 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.parameters import LINE, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import extended_kalman, gnss_ins, range_errors
 from ...filters.ordered_sums import ordered_sum
 from ...filters.packed_covariance import diagonal, pack, unpack

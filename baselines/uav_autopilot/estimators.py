@@ -5,54 +5,44 @@ and a noisier sensor asks for another change of the filter than stronger gusts d
 ``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
 """
 
-import math
 from typing import Any, ClassVar, NamedTuple
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Filter, Initial, Input, Likelihood
 from ...envs.contract.observation import Array
+from ...envs.uav_autopilot.level_bank import likelihood_of
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
-from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ...filters.ordered_sums import weighted_sum
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
 from ..table import Variant
 
 
-def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
-    """How well the readings were predicted; NaN in a dropout of all sensors."""
-    count = ordered_sum(measurement.available)
-    there = count > 0.0
-    return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
-
-
-class SteadyKalman:
+class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
     """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
 
-    kind = "estimator"
-    traceable = True
-
     def __init__(self, task: UavAutopilot) -> None:
-        self.task, self.xp = task, task.xp
+        super().__init__(task)
         model, steady = task.design.model, task.design.steady
         self.F, self.B, self.gain = (task.constant(part) for part in (model.F, model.B, steady.gain))
-        self.covariance = task.constant(steady.posterior)[:, :, None]
+        self.settled = task.constant(steady.posterior)[:, :, None]
 
-    def start(self, initial: Start, N: int) -> Array:
-        """Mean at the start."""
-        return initial.mean
+    def start(self, initial: Start) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
 
-    def update(self, measurement: Measurement, memory: Array) -> tuple[Array, Array, Array]:
+    def update(self, state: Initial, given: Input) -> Initial:
         """Equations (10), (11) with the gain of the algebraic Riccati equation."""
-        predicted = self.xp.matmul(self.F, memory) + self.B * measurement.control
+        measurement = given.measurement
+        predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
         innovation = self.xp.where(measurement.available > 0.0, innovation, 0.0)
         mean = predicted + self.xp.matmul(self.gain, innovation)
-        return mean, self.covariance + 0.0 * measurement.number, mean
+        return Initial(mean, self.settled + 0.0 * measurement.number)
 
 
-class Filter(NamedTuple):
+class SensorAware(NamedTuple):
     """One filter and what it thinks of the sensors."""
 
     mean: Array
@@ -66,7 +56,7 @@ class Filter(NamedTuple):
 class Step(NamedTuple):
     """One measurement taken in."""
 
-    filter: Filter
+    filter: SensorAware
     log_likelihood: Array
     """Of the readings, ``(N,)``."""
     nis: Array
@@ -77,16 +67,26 @@ class Step(NamedTuple):
     """Packed covariance predicted without the disturbance."""
 
 
-class AdaptiveKalman:
-    """Kalman filter (10)-(12) of the paper with the noise of each sensor estimated."""
+class AdaptiveState(NamedTuple):
+    """State of a filter that estimates noise."""
 
-    kind = "estimator"
-    traceable = True
+    mean: Array
+    """``(n, N)``."""
+    covariance: Array
+    """``(n, n, N)``."""
+    likelihood: Likelihood
+    memory: Any
+    """What the filter remembers, the filters of an IMM with it."""
+
+
+class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
+    """Kalman filter (10)-(12) of the paper with the noise of each sensor estimated."""
 
     def __init__(
         self, task: UavAutopilot, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
-        self.task, self.xp, self.sensor_noise = task, task.xp, rule(**values)
+        super().__init__(task)
+        self.sensor_noise = rule(**values)
         model, pack = task.design.model, packed_covariance.pack
         self.F, self.B = task.constant(model.F), task.constant(model.B)
         self.propagator = task.constant(packed_covariance.propagator(model.F))
@@ -95,13 +95,15 @@ class AdaptiveKalman:
         )
         self.n = len(model.F)
 
-    def start_filter(self, initial: Initial) -> Filter:
+    def start_filter(self, initial: Start) -> SensorAware:
         """Filter where everyone starts, with sensors as stated."""
         zero = 0.0 * initial.mean[0]
         noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
-        return Filter(initial.mean, packed_covariance.pack(initial.covariance), noise)
+        return SensorAware(initial.mean, packed_covariance.pack(initial.covariance), noise)
 
-    def predict_and_update(self, before: Filter, measurement: Measurement, factor: Array | float) -> Step:
+    def predict_and_update(
+        self, before: SensorAware, measurement: Measurement, factor: Array | float
+    ) -> Step:
         """Predict with a factor on the disturbance's covariance, and take in one sensor after the other."""
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
@@ -122,17 +124,26 @@ class AdaptiveKalman:
             )
             noise.append(memory)
             log_likelihood, nis = log_likelihood + likelihood, nis + squared
-        return Step(Filter(mean, covariance, tuple(noise)), log_likelihood, nis, mean - predicted, carried)
+        return Step(
+            SensorAware(mean, covariance, tuple(noise)), log_likelihood, nis, mean - predicted, carried
+        )
 
-    def start(self, initial: Initial, N: int) -> Any:
+    def start(self, initial: Start) -> AdaptiveState:
         """Start where everyone starts."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return AdaptiveState(initial.mean, initial.covariance, unknown, self.first_memory(initial))
+
+    def first_memory(self, initial: Start) -> Any:
+        """What is remembered at the start."""
         return self.start_filter(initial)
 
-    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
+    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
         """One measurement, gusts as designed."""
-        after, log_likelihood, nis, *_ = self.predict_and_update(memory, measurement, 1.0)
-        likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
-        return after.mean, packed_covariance.unpack(after.covariance, self.n), after, likelihood
+        after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, given.measurement, 1.0)
+        likelihood = likelihood_of(given.measurement, log_likelihood, nis, self.xp)
+        return AdaptiveState(
+            after.mean, packed_covariance.unpack(after.covariance, self.n), likelihood, after
+        )
 
 
 class AdaptiveGusts(AdaptiveKalman):
@@ -151,14 +162,14 @@ class AdaptiveGusts(AdaptiveKalman):
         self.gust_memory, self.forgetting = gust_memory, 1.0 - 1.0 / gust_memory
         self.last = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
-    def start(self, initial: Initial, N: int) -> tuple[Filter, adaptation.Level]:
-        """Start with gusts as designed."""
+    def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
+        """Gusts as designed."""
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
-    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
+    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
         """One measurement, and the factor for the next."""
-        before, level = memory
+        (before, level), measurement = state.memory, given.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
             before, measurement, level.value
         )
@@ -169,13 +180,14 @@ class AdaptiveGusts(AdaptiveKalman):
         level = adaptation.fading_mean(level, sample, self.forgetting)
         level = level._replace(value=self.xp.clip(level.value, *self.limits))
         likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
-        return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level), likelihood
+        covariance = packed_covariance.unpack(after.covariance, self.n)
+        return AdaptiveState(after.mean, covariance, likelihood, (after, level))
 
 
 class GustModels(NamedTuple):
     """Filters for several levels of the gusts."""
 
-    filters: tuple[Filter, ...]
+    filters: tuple[SensorAware, ...]
     probabilities: Array
     """``(M, N)``."""
 
@@ -200,21 +212,19 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         change = (1.0 - stay) / 2.0
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
 
-    def start(self, initial: Initial, N: int) -> GustModels:
-        """Start all where everyone starts, as likely."""
+    def first_memory(self, initial: Start) -> GustModels:
+        """All where everyone starts, as likely."""
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 
-    def update(
-        self, measurement: Measurement, memory: GustModels
-    ) -> tuple[Array, Array, GustModels, Likelihood]:
+    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
         """One IMM cycle; each model keeps its own opinion of the sensors."""
-        xp = self.xp
+        xp, memory, measurement = self.xp, state.memory, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
         steps = [
             self.predict_and_update(
-                Filter(mean[:, j], packed_covariance.pack(covariance[:, :, j]), memory.filters[j].noise),
+                SensorAware(mean[:, j], packed_covariance.pack(covariance[:, :, j]), memory.filters[j].noise),
                 measurement,
                 level**2,
             )
@@ -227,9 +237,10 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         nis = weighted_sum(probabilities, xp.stack([step.nis for step in steps]))
         density = imm.log_mixture_density(log_predicted, likelihoods)
         likelihood = likelihood_of(measurement, density, nis, xp)
-        return *imm.combine(*self.stack_filters(after.filters), probabilities), after, likelihood
+        combined = imm.combine(*self.stack_filters(after.filters), probabilities)
+        return AdaptiveState(*combined, likelihood, after)
 
-    def stack_filters(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
+    def stack_filters(self, filters: tuple[SensorAware, ...]) -> tuple[Array, Array]:
         """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]

@@ -12,12 +12,11 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.uav_autopilot.banks import MODES
-from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelPrior
+from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelBank, LevelPrior
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, Tunable, Variant, tunable
 from .alarm import AutopilotAlarm
 from .estimators import ESTIMATORS, GustInteractingMultipleModel
-from .level_bank import LevelBank
 from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 

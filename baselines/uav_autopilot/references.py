@@ -5,13 +5,12 @@ Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 
 import numpy
 
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
+from ...envs.uav_autopilot.level_bank import likelihood_of
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
-from ...evaluation.competitors.kinds import Likelihood
 from ...filters import packed_covariance
-from .estimators import likelihood_of
 
 
 class TrueState:

@@ -7,8 +7,9 @@ a learned estimator, a reference that is told more, a bound. So there is one rol
 State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
 """
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import gymnasium
@@ -39,6 +40,45 @@ class Input(NamedTuple):
     """Of a bank: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space."""
 
 
+class Likelihood(NamedTuple):
+    """How well a filter has predicted a measurement."""
+
+    log_likelihood: Array
+    """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
+    nis: Array = None
+    """Normalised innovation squared, ``(N,)``; None where it is not known."""
+    nis_degrees: Array = None
+    """Numbers of the measurement that it counts, ``(N,)``; likewise."""
+
+    @classmethod
+    def of(cls, values: Any) -> "Likelihood":
+        """Take a log-likelihood alone for one."""
+        return cls(*values) if isinstance(values, tuple) else cls(values)
+
+    @classmethod
+    def unknown(cls, like: Array) -> "Likelihood":
+        """NaN, in the shape of an array ``(N,)``."""
+        return cls(None).fill_unknown(like)
+
+    @classmethod
+    def told(cls, records: Mapping[str, Array]) -> "Likelihood":
+        """What the records of a filter tell of it, see :meth:`Filter.records`; None for the rest."""
+        return cls(*(records.get(name) for name in cls._fields))
+
+    def fill_unknown(self, like: Array) -> "Likelihood":
+        """Put NaN in place of what is not known, in the shape of an array ``(N,)``."""
+        none = math.nan + 0.0 * like
+        return Likelihood(*(none if values is None else values for values in self))
+
+
+class Track(NamedTuple):
+    """State of a filter that remembers its estimate alone."""
+
+    mean: Array
+    covariance: Array
+    likelihood: Likelihood
+
+
 class Filter(ABC, Generic[TaskT, Measurement, State]):
     """What estimates.
 
@@ -46,11 +86,13 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         task: the estimation problem, with the constants that world and filter share.
     """
 
-    knows: ClassVar[str] = ""
+    knows: str = ""
     """What it is given that no competitor knows, in words; empty where that is nothing."""
-    in_python: ClassVar[bool] = False
-    """Whether ``start`` and ``update`` run as Python code, whatever computes the rest: they cannot be traced."""
-    adapts_covariance: ClassVar[bool] = False
+    kind: str = "estimator"
+    """As what it competes."""
+    in_python: bool = False
+    """Whether it runs as Python code, whatever computes the rest: it cannot be traced."""
+    adapts_covariance: bool = False
     """Whether the covariance that is reported grows with the innovations."""
     least_interval: ClassVar[float] = 0.0
     """Share of the sampling interval from which on its gains are good for the time between two measurements."""
@@ -96,6 +138,10 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
             given: the same measurement, and what else this filter is given.
         """
 
+    def step(self, state: State, given: Input) -> State:
+        """Predict to a measurement and take it in, where nobody acts between."""
+        return self.update(self.predict(state, given.measurement), given)
+
     def mean(self, state: State) -> Array:
         """Estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's ``mean``."""
         mean: Array = state.mean  # type: ignore[attr-defined]
@@ -122,9 +168,10 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
         How well the measurement was predicted is told by ``log_likelihood`` (log-density of the measurement as it was
         predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
-        dimension.
+        dimension. By default those of the state's ``likelihood``, if it has one.
         """
-        return {}
+        likelihood = getattr(state, "likelihood", None)
+        return {} if likelihood is None else likelihood._asdict()
 
 
 class Bank(Filter[TaskT, Measurement, State]):

@@ -27,7 +27,7 @@ from ...filters import imm
 from ...filters import receiver_faults as faults
 from ...filters.loosely_coupled import AugmentedCovariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.filter import Initial
+from ..contract.filter import Filter, Initial, Input, Likelihood
 from ..contract.observation import Array
 from ..contract.task import Task
 from .world import Measurement
@@ -177,8 +177,19 @@ class Posterior(NamedTuple):
     memory: Memory
 
 
-class FaultFilter:
-    """Bank.
+class FaultState(NamedTuple):
+    """State of the bank over faults."""
+
+    mean: Array
+    """Of all hypotheses together, ``(A, N)``, m."""
+    covariance: Array
+    """``(A, A, N)``."""
+    memory: Memory
+    likelihood: Likelihood
+
+
+class FaultBank(Filter[Task, Measurement, FaultState]):
+    """Kalman filters over the noises of INS and receiver and since when the receiver is pulled off.
 
     Args:
         task: the problem.
@@ -187,11 +198,11 @@ class FaultFilter:
     """
 
     def __init__(self, task: Task, prior: FaultPrior = TRAINING, **changed: Any) -> None:
-        self.prior = prior = prior._replace(**changed)
-        p = self.parameters = task.parameters
-        self.xp, self.step = task.xp, p.sampling_interval
+        super().__init__(task)
+        self.prior, p = prior._replace(**changed), task.parameters
+        prior, self.interval = self.prior, p.sampling_interval
         self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
-        self.spacing = max(round(prior.longest / (prior.onsets * self.step)), 1)
+        self.spacing = max(round(prior.longest / (prior.onsets * self.interval)), 1)
         self.noises = Noises(*(task.constant(each)[:, None, None] for each in self.draw_noises()))
         self.others = Noises(*(each[1:] for each in self.noises))
         self.noise_weights = task.constant(
@@ -222,10 +233,29 @@ class FaultFilter:
             p.drift * after(1.0, between(prior.drift, unit[0])),
             coloured,
             (coloured * p.sampling.coloured) ** 2,
-            white * self.step + p.sampling.residual * coloured**2,
+            white * self.interval + p.sampling.residual * coloured**2,
             after(0.0, low + (high - low) * unit[3]),
-            numpy.exp(-self.step / after(prior.lasting[0], between(prior.lasting, unit[4]))),
+            numpy.exp(-self.interval / after(prior.lasting[0], between(prior.lasting, unit[4]))),
         )
+
+    def start(self, initial: Initial) -> FaultState:
+        """Start where INS and reference agree, without a pull."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return FaultState(initial.mean, initial.covariance, self.start_bank(initial), unknown)
+
+    def update(self, state: FaultState, given: Input) -> FaultState:
+        """Change hypotheses, predict, update, and report the moments of all."""
+        measurement = given.measurement
+        predicted = self.predict_bank(state.memory, measurement)
+        weighing = self.weigh(predicted, measurement)
+        found = self.update_bank(predicted, measurement, weighing)
+        there = measurement.available > 0.0
+        likelihood = Likelihood(
+            self.xp.where(there, weighing.log_likelihood, math.nan),
+            self.xp.where(there, weighing.nis, math.nan),
+            self.parameters.axes * measurement.available,
+        )
+        return FaultState(found.mean, found.covariance, found.memory, likelihood)
 
     def start_bank(self, initial: Initial) -> Memory:
         """Start where INS and reference agree, without a pull."""
@@ -266,11 +296,11 @@ class FaultFilter:
 
     def age(self, number: Array) -> Array:
         """Age of each pull, s, ``(B, N)``: a pull begins in the middle between two hypotheses."""
-        return self.step * (self.since_onset(number) + 0.5 * (self.spacing + 1))
+        return self.interval * (self.since_onset(number) + 0.5 * (self.spacing + 1))
 
     def change(self, free: Hypotheses, pulled: Hypotheses, number: Array) -> tuple[Hypotheses, Hypotheses]:
         """End pulls and let others begin."""
-        xp, prior, T = self.xp, self.prior, self.step
+        xp, prior, T = self.xp, self.prior, self.interval
         since, age = self.since_onset(number), self.age(number)
         born = (since == 0.0) & (number >= self.onsets)
         left = xp.clip(prior.longest - age, T, None)
@@ -321,7 +351,7 @@ class FaultFilter:
         """Change hypotheses and predict them, and the receiver's levels, to the time of a measurement."""
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
-        changing = 1.0 - math.exp(-self.prior.level_rate * self.step)
+        changing = 1.0 - math.exp(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
         changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
         chain = self.xp.where(changed, self.fresh, chain)

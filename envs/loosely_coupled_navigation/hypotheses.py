@@ -32,7 +32,7 @@ from ..contract.filter import Initial
 from ..contract.observation import ACTION, BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
 from ..contract.task import Task
 from .banks import Innovations, KalmanBucyBank
-from .fault_bank import FaultFilter, Hypotheses, Memory, Noises
+from .fault_bank import FaultBank, Hypotheses, Memory, Noises
 from .world import Measurement
 
 ACTIONS = ("pull", "modelled", "level", "receiver", "inertial", "wandering")
@@ -98,7 +98,7 @@ class HypothesesBank(KalmanBucyBank):
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
-        bank = self.bank = FaultFilter(task)
+        bank = self.bank = FaultBank(task)
         prior, s = bank.prior, self.parameters.sampling
         self.noise_names = ("modelled", *(f"point_{j}" for j in range(1, prior.points + 1)))
         self.groups = (*self.noise_names, "young_pull", "old_pull")

@@ -1,9 +1,11 @@
 """The constant-velocity model of ManeuveringTarget, over the time between two scans, whatever it is."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from ...filters import kalman
 from ...filters.small_matrices import outer
+from ..contract.filter import Likelihood
 from ..contract.observation import Array
 from .world import Measurement
 
@@ -15,7 +17,7 @@ class ConstantVelocityModel:
     """The constant-velocity model in x and y."""
 
     def __init__(self, task: "ManeuveringTarget") -> None:
-        self.task, self.xp = task, task.xp
+        self.task, self.parameters, self.xp = task, task.parameters, task.xp
         moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
         self.unmoved = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
         self.moved = task.constant(moved)[:, :, None] - self.unmoved
@@ -40,3 +42,19 @@ class ConstantVelocityModel:
         there = measurement.available > 0.0
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
+
+    def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
+        """How well a scan was predicted; NaN where it missed the target."""
+        there = measurement.available > 0.0
+        log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
+        return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
+
+    def update_estimate(
+        self, predicted: tuple[Array, Array], measurement: Measurement, H: Array | None = None
+    ) -> kalman.Update:
+        """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
+        nothing of how likely they are; H is that of the position unless another one is given.
+        """
+        H = self.H if H is None else H
+        result = kalman.update(*predicted, measurement.position, H, self.identity * measurement.variance)
+        return self.where_detected(measurement, result, kalman.Update(*predicted, 0.0, 0.0))

@@ -29,7 +29,7 @@ from ..contract.filter import Initial
 from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
 from .banks import RadarBank
 from .kalman_net import FRAME, frame_of
-from .semi_markov import SemiMarkovFilter, SemiMarkovTrack, Tables
+from .semi_markov import SemiMarkov, SemiMarkovTrack, Tables
 from .world import Measurement
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class HypothesesBank(RadarBank):
 
     def __init__(self, task: "ManeuveringTarget", control: str) -> None:
         super().__init__(task, control)
-        self.filter = SemiMarkovFilter(task)
+        self.filter = SemiMarkov(task)
         ages, straight = self.filter.ages, self.filter.straight_ages
         tables = [
             range(straight + i * ages, straight + (i + 1) * ages) for i in range(1 + len(self.filter.turns))

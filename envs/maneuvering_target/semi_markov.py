@@ -14,7 +14,7 @@ from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_
 from ...filters.ordered_sums import weighted_sum
 from ...filters.semi_markov import Hypotheses
 from ...filters.small_matrices import mirror_lower
-from ..contract.filter import Initial
+from ..contract.filter import Filter, Initial, Input, Likelihood
 from ..contract.observation import Array
 from .constant_velocity import ConstantVelocityModel
 from .world import Measurement
@@ -56,7 +56,7 @@ VAGUE_PRIOR: dict[str, Any] = {
 
 
 class SemiMarkovTrack(NamedTuple):
-    """Memory of the semi-Markov filter; covariances are packed."""
+    """Hypotheses of the semi-Markov filter; covariances are packed."""
 
     straight: Hypotheses
     """By the time since the last manoeuvre; state of position and velocity."""
@@ -86,7 +86,18 @@ class Posterior(NamedTuple):
     """Likewise its normalised innovation squared."""
 
 
-class SemiMarkovFilter(ConstantVelocityModel):
+class SemiMarkovState(NamedTuple):
+    """State of the semi-Markov filter."""
+
+    mean: Array
+    """Of all hypotheses together, ``(4, N)``."""
+    covariance: Array
+    """``(4, 4, N)``."""
+    likelihood: Likelihood
+    track: SemiMarkovTrack
+
+
+class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement, SemiMarkovState]):
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
@@ -133,6 +144,18 @@ class SemiMarkovFilter(ConstantVelocityModel):
         """Mean acceleration of each kind of turn, to the left positive, m/s^2."""
         self.noise, self.change = noise, change
         self.outliers, self.outlier_factor = outliers, outlier_factor
+
+    def start(self, initial: Initial) -> SemiMarkovState:
+        """Start where everyone starts, long in straight flight."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return SemiMarkovState(initial.mean, initial.covariance, unknown, self.start_track(initial))
+
+    def update(self, state: SemiMarkovState, given: Input) -> SemiMarkovState:
+        """One cycle."""
+        measurement = given.measurement
+        found = self.update_track(self.predict_track(state.track, measurement.interval), measurement)
+        likelihood = self.likelihood(measurement, found.log_likelihood, found.nis)
+        return SemiMarkovState(found.mean, found.covariance, likelihood, found.track)
 
     def start_track(self, initial: Initial) -> SemiMarkovTrack:
         """Start where everyone starts, long in straight flight."""
@@ -204,7 +227,7 @@ class SemiMarkovFilter(ConstantVelocityModel):
         straight, (thrust, *kinds) = semi_markov.switch(straight, [thrusting, *turning])
         return straight, thrust, semi_markov.join(kinds)
 
-    def predict(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses, T: Array) -> Tables:
+    def fly(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses, T: Array) -> Tables:
         """Fly on for an interval (s) in the mode of each hypothesis."""
         F, unit = (matrix[:, :, None] for matrix in self.motion(T))
         Q = self.noise**2 * unit
@@ -229,7 +252,7 @@ class SemiMarkovFilter(ConstantVelocityModel):
 
     def predict_track(self, memory: SemiMarkovTrack, T: Array) -> Tables:
         """Let manoeuvres end and begin, and fly on for an interval, s: the tables that a measurement updates."""
-        return self.predict(*self.switch(*(table.unpack() for table in memory)), T)
+        return self.fly(*self.switch(*(table.unpack() for table in memory)), T)
 
     def update_track(self, tables: Tables, measurement: Measurement) -> Posterior:
         """Take in a measurement. Its normalised innovation squared is the mean of the filters' by their posterior

@@ -28,7 +28,7 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm, range_errors
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
-from ..contract.filter import Initial
+from ..contract.filter import Filter, Initial, Input, Likelihood
 from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
 from .world import Measurement
@@ -95,7 +95,7 @@ VAGUE = FaultPrior(
 
 
 class Hypotheses(NamedTuple):
-    """Memory of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
+    """Hypotheses of the bank; n = 17 + S states, M = 3 hypotheses on the motion."""
 
     means: Array
     """``(n, M, N)``."""
@@ -161,7 +161,18 @@ class Posterior(NamedTuple):
     """Whether the accelerometers repeat their last readings exactly, ``(N,)``."""
 
 
-class FaultFilter:
+class FaultState(NamedTuple):
+    """State of the bank."""
+
+    mean: Array
+    """Of all hypotheses together, ``(17, N)``."""
+    covariance: Array
+    """``(17, 17, N)``."""
+    hypotheses: Hypotheses
+    likelihood: Likelihood
+
+
+class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState]):
     """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
 
     Args:
@@ -173,7 +184,7 @@ class FaultFilter:
     def __init__(
         self, task: "TightlyCoupledNavigation", prior: FaultPrior = TRAINING, **changed: Any
     ) -> None:
-        self.task, self.xp = task, task.xp
+        super().__init__(task)
         self.prior = prior = prior._replace(**changed)
         T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
         self.size = n
@@ -201,6 +212,17 @@ class FaultFilter:
         chain[0, 1:], chain[1:, 0] = onset / (L - 1), over
         self.level_chain = chain
         self.first_levels = task.constant(numpy.array([1.0 - 1e-3] + [1e-3 / (L - 1)] * (L - 1)))[:, None]
+
+    def start(self, initial: Initial) -> FaultState:
+        """Start every filter from what is known of the start."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return FaultState(initial.mean, initial.covariance, self.start_bank(initial), unknown)
+
+    def update(self, state: FaultState, given: Input) -> FaultState:
+        """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
+        found = self.update_bank(given.measurement, state.hypotheses)
+        likelihood = Likelihood(found.log_likelihood, found.nis, found.degrees)
+        return FaultState(found.mean, found.covariance, found.memory, likelihood)
 
     def start_bank(self, initial: Initial) -> Hypotheses:
         """Start every filter from what is known of the start."""

@@ -27,7 +27,7 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.filter import Initial
 from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, SHARE, Array, Block
 from .banks import HypothesisBank
-from .fault_hypotheses import Factors, FaultFilter, Hypotheses
+from .fault_hypotheses import Factors, FaultHypotheses, Hypotheses
 from .parameters import HYPOTHESES
 from .world import Measurement
 
@@ -89,7 +89,7 @@ class FaultHypothesesBank(HypothesisBank):
 
     def __init__(self, task: "TightlyCoupledNavigation", control: str) -> None:
         super().__init__(task, control)
-        self.bank = FaultFilter(task)
+        self.bank = FaultHypotheses(task)
         levels = self.bank.prior.levels
         self.log_reach = task.constant([math.log(factor) for factor in REACH])[:, None]
         self.heights = task.constant([math.log(level) / math.log(levels[-1]) for level in levels])[:, None]

@@ -25,7 +25,7 @@ from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import ordered_sum
 from ..contract.observation import ACTION, BOUNDED_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block, within
 from .banks import AutopilotBank
-from .level_bank import LevelFilter, grid
+from .level_bank import LevelBank, grid
 from .world import Measurement, Start
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class HypothesesBank(AutopilotBank):
 
     def __init__(self, task: "UavAutopilot", control: str) -> None:
         super().__init__(task, control)
-        bank = self.bank = LevelFilter(task)
+        bank = self.bank = LevelBank(task)
         prior = bank.prior
         self.no_action = (0.0,) * (len(ACTIONS) + len(task.sensors))
         self.names = ("designed", *(f"level_{i}" for i in range(1, prior.gust_points + 1)))

@@ -17,8 +17,8 @@ import numpy
 
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import Hypotheses
-from ...filters.ordered_sums import weighted_sum
-from ..contract.filter import Initial
+from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ..contract.filter import Filter, Initial, Input, Likelihood
 from ..contract.observation import Array
 from .plant import Model, pitch_channel
 from .world import Measurement, Start
@@ -108,7 +108,25 @@ class Posterior(NamedTuple):
     """Their normalised innovation squared, ``(N,)``."""
 
 
-class LevelFilter:
+class Levels(NamedTuple):
+    """State of the bank over levels."""
+
+    mean: Array
+    """Of all hypotheses together, ``(n, N)``."""
+    covariance: Array
+    """``(n, n, N)``."""
+    likelihood: Likelihood
+    hypotheses: Hypotheses
+
+
+def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
+    """How well the readings were predicted; NaN in a dropout of all sensors."""
+    count = ordered_sum(measurement.available)
+    there = count > 0.0
+    return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
+
+
+class LevelBank(Filter["UavAutopilot", Measurement, Levels]):
     """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
@@ -118,8 +136,8 @@ class LevelFilter:
     """
 
     def __init__(self, task: "UavAutopilot", prior: LevelPrior = TRAINING, **changed: Any) -> None:
+        super().__init__(task)
         self.prior = prior = prior._replace(**changed)
-        self.task, self.xp = task, task.xp
         p, constant, n = task.parameters, task.constant, len(task.components)
         sensors, sigmas = list(task.sensors), p.value("sensor_sigmas")
         slow = [sensor for sensor in prior.slow if sensor in sensors]
@@ -165,6 +183,17 @@ class LevelFilter:
         self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
 
+    def start(self, initial: Start) -> Levels:
+        """Start all where everyone starts."""
+        unknown = Likelihood.unknown(initial.mean[0])
+        return Levels(initial.mean, initial.covariance, unknown, self.start_bank(initial))
+
+    def update(self, state: Levels, given: Input) -> Levels:
+        """Switch, predict, update, and report the moments of all."""
+        found = self.update_bank(self.predict_bank(state.hypotheses, given.measurement), given.measurement)
+        likelihood = likelihood_of(given.measurement, found.log_likelihood, found.nis, self.xp)
+        return Levels(found.mean, found.covariance, likelihood, found.memory)
+
     def start_bank(self, initial: Initial | Start) -> Hypotheses:
         """Start all where everyone starts."""
         xp, none = self.xp, 0.0 * initial.mean[0]
@@ -179,7 +208,7 @@ class LevelFilter:
     def predict_bank(self, memory: Hypotheses, measurement: Measurement) -> Hypotheses:
         """Let levels change, and predict every hypothesis to the time of a measurement."""
         h = self.switch(memory)
-        mean, covariance = self.predict(h, measurement)
+        mean, covariance = self.propagate(h, measurement)
         return h._replace(mean=mean, covariance=covariance)
 
     def update_bank(
@@ -245,7 +274,7 @@ class LevelFilter:
             tuple(xp.concat(list(q), axis=1) for q in zip(*(part.sensors for part in parts), strict=True)),
         )
 
-    def predict(self, h: Hypotheses, measurement: Measurement) -> tuple[Array, Array]:
+    def propagate(self, h: Hypotheses, measurement: Measurement) -> tuple[Array, Array]:
         """Equations (10), (12) in every hypothesis."""
         xp, u = self.xp, measurement.control
         mean = [

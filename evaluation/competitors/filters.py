@@ -1,9 +1,11 @@
 """Competitors as filters: what puts an estimator, a reference or a bound in the place of a task's bank.
 
-What says that it is ``traceable`` is compiled like a bank. The rest runs as Python code between compiled steps of the
-world, and keeps its memory to itself: it may be anything.
+What ships is a filter. What a user brings becomes one here (:func:`as_filter`): it is compiled like a bank if it says
+that it is ``traceable``. The rest runs as Python code between compiled steps of the world, and keeps its memory to
+itself: it may be anything.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,14 +15,14 @@ import numpy
 from ...compiler.functions import map_arrays
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, Input
+from ...envs.contract.filter import Filter, Input, Likelihood
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
 from ..storage.dataset import FAULTS
-from .kinds import Kind, Likelihood, check_competitor, compilation_key, make_competitor
+from .kinds import Kind, check_competitor, compilation_key, make_competitor
 
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
 """What starts and updates with nothing but the initial estimate and the measurements."""
@@ -33,93 +35,233 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     return map_arrays(lambda values: values[..., lanes], part)
 
 
-class Estimated(NamedTuple):
-    """State of an estimator or a reference in the loop."""
+class Adapted(NamedTuple):
+    """State of what a user brings."""
 
+    mean: Array
+    """``(C, N)``."""
+    covariance: Array
+    """``(C, C, N)``; None of a bound."""
+    memory: Any
+    """Its own, or None where that is kept in Python."""
+    likelihood: Likelihood
+    """Of the last measurement, NaN where it is not told."""
+
+
+class Adapter(Filter[Task, Any, Adapted]):
+    """A user's estimator as a filter, see :class:`.kinds.Estimator`.
+
+    Args:
+        task: the estimation problem.
+        own: the estimator, made for it.
+    """
+
+    def __init__(self, task: Task, own: Any) -> None:
+        super().__init__(task)
+        self.own, self.in_python = own, not getattr(own, "traceable", False)
+        self.tells = False
+        """Whether it has told how well it predicted, ever."""
+
+    def start(self, initial: Any) -> Adapted:
+        """Start where everyone starts."""
+        return self.first(initial, self.own.start(initial, initial.mean.shape[-1]))
+
+    def first(self, initial: Any, memory: Any) -> Adapted:
+        """State before the first measurement."""
+        return Adapted(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
+
+    def update(self, state: Adapted, given: Input) -> Adapted:
+        """Take its answer."""
+        answer = self.ask(given, state.memory)
+        if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
+            count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
+            raise TypeError(
+                "update must return mean, covariance and memory, and may return the log-likelihood, not "
+                f"{type(answer).__name__}{count}"
+            )
+        mean, covariance, memory, *reported = answer
+        likelihood = state.likelihood
+        if reported:
+            self.tells, likelihood = True, Likelihood.of(*reported)
+            likelihood = likelihood if self.in_python else likelihood.fill_unknown(mean[0])
+        return Adapted(mean, covariance, memory, likelihood)
+
+    def ask(self, given: Input, memory: Any) -> Any:
+        """Its answer to a measurement."""
+        return self.own.update(given.measurement, memory)
+
+    def smooth(self, measurements: Sequence[Any], states: Sequence[Adapted]) -> tuple[Array, Array]:
+        """Smooth the track, of a smoother."""
+        answer: tuple[Array, Array] = self.own.smooth(measurements, [state.memory for state in states])
+        return answer
+
+
+class ReferenceAdapter(Adapter):
+    """A user's reference as a filter, see :class:`.kinds.Reference`."""
+
+    def __init__(self, task: Task, own: Any) -> None:
+        super().__init__(task, own)
+        self.knows = getattr(own, "knows", "") or "the truth"
+
+    def initialise(self, given: Input) -> Adapted:
+        """Start where everyone starts, with the truth."""
+        return self.first(given.measurement, self.own.start(given.measurement, given.truth))
+
+    def ask(self, given: Input, memory: Any) -> Any:
+        """Its answer to a measurement and the truth."""
+        return self.own.update(given.measurement, given.truth, memory)
+
+
+class BoundAdapter(ReferenceAdapter):
+    """A bound as a filter whose mean is the limit, see :class:`.kinds.Bound`."""
+
+    def first(self, initial: Any, memory: Any) -> Adapted:
+        """Nothing is known before the first measurement."""
+        return Adapted(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
+
+    def ask(self, given: Input, memory: Any) -> Any:
+        """Its limit, without a covariance."""
+        limit, memory = super().ask(given, memory)
+        return limit, None, memory
+
+
+def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter:
+    """Return what was made for a task as a filter: itself, if it is one."""
+    if isinstance(own, Filter):
+        return own
+    adapters = {"reference": ReferenceAdapter, "bound": BoundAdapter}
+    return adapters.get(kind, Adapter)(task, own)
+
+
+class HeldInPython(Filter[Task, Any, Adapted]):
+    """A filter asked in Python: its state stays here, and may be anything; its answers are checked.
+
+    Args:
+        task: the estimation problem.
+        own: the filter; None beside traced steps.
+        name: what it is and its name, in errors.
+        count: number of episodes; lanes beyond are given the last of them. None: all lanes as they are.
+    """
+
+    in_python = True
+
+    def __init__(self, task: Task, own: Any = None, name: str = "", count: int | None = None) -> None:
+        super().__init__(task)
+        self.own, self.name, self.count = own, name, count
+        self.memory, self.step_number = None, 0
+        self.knows = getattr(own, "knows", "")
+
+    def _repeat_last(self, given: Input) -> Input:
+        """Copies, which may be changed in place."""
+        if self.count is None:
+            return given
+        width = given.measurement[0].shape[-1]
+        lanes = numpy.minimum(numpy.arange(width), self.count - 1)
+        return given._replace(measurement=select_lanes(given.measurement, lanes))
+
+    def initialise(self, given: Input) -> Adapted:
+        """Keep its state."""
+        with explain_errors(f"{self.name} failed at the start of the track"):
+            self.memory = self.own.initialise(self._repeat_last(given))
+        initial = given.measurement
+        return Adapted(initial.mean, initial.covariance, None, Likelihood.unknown(initial.mean[0]))
+
+    def start(self, initial: Any) -> Adapted:
+        """Start without the truth."""
+        return self.initialise(Input(initial))
+
+    def update(self, state: Adapted, given: Input) -> Adapted:
+        """Its answer.
+
+        Raises:
+            ValueError: if what it answers is no array of the right shape.
+        """
+        self.step_number += 1
+        given = self._repeat_last(given)
+        with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
+            self.memory = after = self.own.step(self.memory, given)
+            mean, covariance = self.own.mean(after), self.own.covariance(after)
+            told = self.own.records(after, given.measurement)
+        C, width = len(self.task.components), given.measurement[0].shape[-1]
+        # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
+        mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
+        if covariance is None:  # of a bound
+            covariance = state.covariance
+        else:
+            covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
+        known = (
+            None if values is None else self._numbers(name, values, (width,))
+            for name, values in Likelihood.told(told)._asdict().items()
+        )
+        return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
+
+    def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
+        """Return what was answered as float64, or raise ValueError if it has another shape."""
+        where = f"{self.name}: the {word} at measurement {self.step_number}"
+        try:
+            given = numpy.asanyarray(values)
+            # What float64 has no room for would vanish in it: masks, imaginary parts, words.
+            if isinstance(given, numpy.ma.MaskedArray) or given.dtype.kind not in "fiub":
+                masked = "a masked array of " * isinstance(given, numpy.ma.MaskedArray)
+                raise TypeError(f"expected an array of real numbers, got {masked}{given.dtype}")
+            array = numpy.asarray(given, dtype=numpy.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{where} is no array: {error}") from None
+        if array.shape != shape:
+            components = ", ".join(c.name for c in self.task.components)
+            raise ValueError(
+                f"{where} must have shape {shape}, {len(self.task.components)} components ({components}) of "
+                f"{shape[-1]} episodes, got {array.shape}"
+            )
+        return array
+
+
+class Checked(NamedTuple):
+    """State of a filter whose answers are checked."""
+
+    own: Any
+    """Of the filter."""
     mean: Array
     """Last valid answer, ``(C, N)``; before any the initial estimate."""
     covariance: Array
     """``(C, C, N)``."""
-    memory: Any
-    """Its own; None of what runs in Python."""
-    likelihood: Likelihood
-    """Of the last measurement, NaN where it is not told."""
     fault: Array
     """Number of the reason among ``FAULTS`` why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
     missed: Array
     """One where a measurement was not received in full so far, ``(N,)``."""
 
 
-class ReferenceFilter(Filter[Task, Any, Estimated]):
-    """A reference in the loop, see :class:`.kinds.Reference`.
-
-    Args:
-        task: the estimation problem.
-        own: the reference, made for it; None where it runs in Python, beside traced steps.
-        in_python: whether it does.
-    """
-
-    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
-        super().__init__(task)
-        self.own, self.in_python = own, in_python  # type: ignore[misc]  # of this filter, not of the class
-        self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
-
-    def initialise(self, given: Input) -> Estimated:
-        """Start where everyone starts, with the truth."""
-        return self._start_state(given.measurement, self.own.start(given.measurement, given.truth))
-
-    def start(self, initial: Any) -> Estimated:
-        """Start without the truth."""
-        return self.initialise(Input(initial))
-
-    def _start_state(self, initial: Any, memory: Any) -> Estimated:
-        zero = 0.0 * initial.mean[0]
-        nothing = Likelihood(None).fill_unknown(zero)
-        return Estimated(initial.mean, initial.covariance, memory, nothing, zero, zero)
-
-    def update(self, state: Estimated, given: Input) -> Estimated:
-        """Take its answer as it is."""
-        mean, covariance, memory, *reported = self.own.update(given.measurement, given.truth, state.memory)
-        likelihood = Likelihood.of(*reported).fill_unknown(mean[0]) if reported else state.likelihood
-        return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
-
-    def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
-        """How likely the measurement was."""
-        return state.likelihood._asdict()
-
-
-class EstimatorFilter(ReferenceFilter):
-    """An estimator in the loop, see :class:`.kinds.Estimator`, whose answers are checked.
+class CheckedFilter(Filter[Task, Any, Checked]):
+    """A filter in the loop that competes: it never sees what was not received, and its answers are checked.
 
     An episode in which an answer is not finite, or no covariance, is lost from that measurement on: the last valid
     answer, or else the initial estimate, is held to the end. Any estimator could give that answer itself, so
     that losing an episode is no advantage.
     """
 
-    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
-        super().__init__(task, own, in_python)
-        self.knows = ""  # type: ignore[misc]  # nothing, whatever it says
+    def __init__(self, task: Task, own: Filter) -> None:
+        super().__init__(task)
+        self.own, self.in_python = own, own.in_python
 
-    def initialise(self, given: Input) -> Estimated:
+    def start(self, initial: Any) -> Checked:
         """Start where everyone starts."""
-        initial = given.measurement
-        return self._start_state(initial, self.own.start(initial, initial.mean.shape[-1]))
+        zero = 0.0 * initial.mean[0]
+        return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero)
 
-    def update(self, state: Estimated, given: Input) -> Estimated:
+    def predict(self, state: Checked, measurement: Any) -> Checked:
+        """Let it predict."""
+        return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
+
+    def update(self, state: Checked, given: Input) -> Checked:
         """Check its answer, and keep the last valid one."""
         received = self.task.world.mask_missing(given.measurement)
-        mean, covariance, memory, *reported = self.own.update(received, state.memory)
+        own = self.own.update(state.own, Input(received))
+        mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
         lost = fault > 0.0
-        return Estimated(
-            self._held(lost, state.mean, mean),
-            self._held(lost, state.covariance, covariance),
-            memory,
-            Likelihood.of(*reported).fill_unknown(mean[0]) if reported else state.likelihood,
-            fault,
-            missed,
-        )
+        mean = self._held(lost, state.mean, mean)
+        return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed)
 
     def _held(self, lost: Array, last: Array, answer: Array) -> Array:
         """The last valid answer where the episode is lost."""
@@ -128,9 +270,10 @@ class EstimatorFilter(ReferenceFilter):
             return answer
         return self.xp.where(lost, last, answer)
 
-    def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
+    def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was, and why the episode is lost."""
-        return {**super().records(state, measurement), "lost": state.fault}
+        told = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
+        return {**told._asdict(), "lost": state.fault}
 
 
 def is_lacking(received: Any, xp: Any) -> Array:
@@ -181,31 +324,27 @@ class LimitState(NamedTuple):
 
     bank: Any
     """Of the bank, which flies the loop."""
-    mean_square: Array
-    """Of the task's components, ``(C, N)``."""
-    memory: Any
-    """The bound's own; None of what runs in Python."""
+    own: Any
+    """Of the bound."""
 
 
 class BoundFilter(Filter[Task, Any, LimitState]):
-    """A bound in the loop, see :class:`.kinds.Bound`, beside a bank under the action zero.
+    """A bound in the loop beside a bank under the action zero.
 
     Args:
         task: the estimation problem.
+        own: the bound as a filter.
         bank: what flies the loop.
-        own: the bound, made for it; None where it runs in Python, beside traced steps.
-        in_python: whether it does.
     """
 
-    def __init__(self, task: Task, bank: Any, own: Any, in_python: bool = False) -> None:
+    def __init__(self, task: Task, own: Filter, bank: Any) -> None:
         super().__init__(task)
-        self.own, self.bank, self.in_python = own, bank, in_python  # type: ignore[misc]
-        self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
+        self.own, self.bank, self.in_python = own, bank, own.in_python
+        self.knows = own.knows or "the truth"
 
     def initialise(self, given: Input) -> LimitState:
         """Start where everyone starts, with the truth."""
-        initial = given.measurement
-        return LimitState(self.bank.start(initial), 0.0 * initial.mean, self.own.start(initial, given.truth))
+        return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
 
     def start(self, initial: Any) -> LimitState:
         """Start without the truth."""
@@ -217,11 +356,11 @@ class BoundFilter(Filter[Task, Any, LimitState]):
 
     def update(self, state: LimitState, given: Input) -> LimitState:
         """Compute the limit at this measurement."""
-        mean_square, memory = self.own.update(given.measurement, given.truth, state.memory)
-        space, N = self.bank.action_space, mean_square.shape[-1]
+        own = self.own.update(state.own, given)
+        space, N = self.bank.action_space, self.own.mean(own).shape[-1]
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
         neutral = self.xp.zeros((*(space.shape or ()), N), dtype=dtype)
-        return LimitState(self.bank.act(state.bank, given.measurement, neutral), mean_square, memory)
+        return LimitState(self.bank.act(state.bank, given.measurement, neutral), own)
 
     def mean(self, state: LimitState) -> Array:
         """That of the bank."""
@@ -237,131 +376,14 @@ class BoundFilter(Filter[Task, Any, LimitState]):
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
         """The limit."""
-        return {"mean_square": state.mean_square}
+        return {"mean_square": self.own.mean(state.own)}
 
 
-def make_filter(kind: Kind, model: Model, own: Any, in_python: bool) -> Filter:
-    """Make the filter of a competitor.
-
-    Args:
-        kind: estimator, smoother, reference or bound.
-        model: in whose loop it is put; a bound flies beside its filter.
-        own: the competitor, made for the task; None where it runs in Python, beside traced steps.
-        in_python: whether it does.
-    """
+def surround(kind: Kind, model: Model, own: Filter) -> Filter:
+    """Return what runs in a model's loop: a competitor checked, a bound beside the bank, a reference as it is."""
     if kind == "bound":
-        return BoundFilter(model.task, model.filter, own, in_python)
-    return (EstimatorFilter if kind in UNTOLD else ReferenceFilter)(model.task, own, in_python)
-
-
-class _InPython:
-    """What competes, asked in Python: its memory stays here, and what it raises is explained.
-
-    Args:
-        own: the estimator, reference or bound.
-        task: that it is made for.
-        name: what it is and its name, in errors.
-    """
-
-    def __init__(self, own: Any, task: Task, name: str) -> None:
-        self.own, self.task, self.name = own, task, name
-        self.memory, self.step = None, 0
-        self.knows = getattr(own, "knows", "")
-
-    def start(self, initial: Any, second: Any) -> None:
-        """Keep the memory."""
-        with explain_errors(f"{self.name} failed at the start of the track"):
-            self.memory = self.own.start(initial, second)
-
-    def update(self, *given: Any) -> Any:
-        """Answer, with nothing in place of the memory.
-
-        Raises:
-            ValueError: if the mean, or what is computed of it, is not of all components: it would be broadcast.
-        """
-        self.step += 1
-        with explain_errors(f"{self.name} failed at measurement {self.step}"):
-            answer = list(self.own.update(*given[:-1], self.memory))
-        place = min(2, len(answer) - 1)
-        self.memory, answer[place] = answer[place], None
-        C, width = len(self.task.components), given[0][0].shape[-1]
-        for word, values, shape in zip(
-            ("mean", "covariance"), answer[:place], ((C, width), (C, C, width)), strict=False
-        ):
-            self._check_shape(word, values, shape)
-        return tuple(answer)
-
-    def _check_shape(self, word: str, array: Any, shape: tuple[int, ...]) -> None:
-        if array.shape != shape:
-            components = ", ".join(c.name for c in self.task.components)
-            raise ValueError(
-                f"{self.name}: the {word} at measurement {self.step} must have shape {shape}, "
-                f"{len(self.task.components)} components ({components}) of {shape[-1]} episodes, got {array.shape}"
-            )
-
-
-class _CheckedInPython(_InPython):
-    """A user's estimator: what it returns is checked, too.
-
-    Args:
-        own: the estimator.
-        task: that it is made for.
-        name: what it is and its name, in errors.
-        count: number of episodes; lanes beyond are given the last of them.
-    """
-
-    def __init__(self, own: Any, task: Task, name: str, count: int) -> None:
-        super().__init__(own, task, name)
-        self.count = count
-
-    def _repeat_last(self, part: Any) -> Any:
-        width = part[0].shape[-1]
-        return select_lanes(part, numpy.minimum(numpy.arange(width), self.count - 1))
-
-    def start(self, initial: Any, second: Any) -> None:
-        """Keep the memory; an array of the initial estimate may be changed in place."""
-        super().start(self._repeat_last(initial), second)
-
-    def update(self, *given: Any) -> Any:
-        """Answer, without the memory."""
-        self.step += 1
-        width = given[0][0].shape[-1]
-        with explain_errors(f"{self.name} failed at measurement {self.step}"):
-            answer = self.own.update(self._repeat_last(given[0]), self.memory)
-            if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
-                count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
-                raise TypeError(
-                    "update must return mean, covariance and memory, and may return the log-likelihood, not "
-                    f"{type(answer).__name__}{count}"
-                )
-            mean, covariance, self.memory, *reported = answer
-            likelihood = [Likelihood.of(*reported)] if reported else []
-        C = len(self.task.components)
-        # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
-        mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
-        covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
-        checked = [
-            Likelihood(
-                *(v if v is None else self._numbers(n, v, (width,)) for n, v in stated._asdict().items())
-            )
-            for stated in likelihood
-        ]
-        return (mean, covariance, None, *checked)
-
-    def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
-        """Return what was answered as float64, or raise ValueError if it has another shape."""
-        where = f"{self.name}: the {word} at measurement {self.step}"
-        try:
-            given = numpy.asanyarray(values)
-            # What float64 has no room for would vanish in it: masks, imaginary parts, words.
-            if isinstance(given, numpy.ma.MaskedArray) or given.dtype.kind not in "fiub":
-                masked = "a masked array of " * isinstance(given, numpy.ma.MaskedArray)
-                raise TypeError(f"expected an array of real numbers, got {masked}{given.dtype}")
-            array = numpy.asarray(given, dtype=numpy.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{where} is no array: {error}") from None
-        self._check_shape(word, array, shape)
-        return array
+        return BoundFilter(model.task, own, model.filter)
+    return CheckedFilter(model.task, own) if kind in UNTOLD else own
 
 
 @dataclass(frozen=True)
@@ -374,12 +396,13 @@ class _Maker:
 
     def __call__(self, model: Model) -> Filter:
         """Make it, on any arrays."""
-        own = None if self.maker is None else make_competitor(self.maker, model.task)
-        return make_filter(self.kind, model, own, self.maker is None)
+        task = model.task
+        own = HeldInPython(task) if self.maker is None else make_competitor(self.maker, task)
+        return surround(self.kind, model, as_filter(task, own, self.kind))
 
 
-def _can_be_traced(maker: Any, own: Any) -> bool:
-    if not (callable(maker) and getattr(own, "traceable", False)):
+def _can_be_traced(maker: Any, own: Filter) -> bool:
+    if own.in_python or not callable(maker):
         return False
     try:
         hash(maker)
@@ -403,17 +426,13 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
-    check_competitor(name, own, kind)
+    own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:
             return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
             warn_of(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None))
-    shown = f"{kind} {name!r}"
-    estimates = kind in UNTOLD
-    asked = (
-        _CheckedInPython(own, model.task, shown, count) if estimates else _InPython(own, model.task, shown)
-    )
-    looped.filter = make_filter(kind, model, asked, True)
+    held = HeldInPython(model.task, own, f"{kind} {name!r}", count if kind in UNTOLD else None)
+    looped.filter = surround(kind, model, held)
     return looped

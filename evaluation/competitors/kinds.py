@@ -11,13 +11,13 @@ Stable-Baselines3.
 
 import functools
 import inspect
-import math
 import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy
 
+from ...envs.contract.filter import Filter
 from ...envs.contract.model import Model
 from ...envs.contract.task import Array, Task
 from ...filters.array_namespace import host_array
@@ -33,8 +33,16 @@ NOT_CAUSAL = "Not causal, with later measurements"
 
 def kind_of(competitor: Any) -> Kind:
     """Say what a competitor is, or what a maker makes."""
-    estimates = not hasattr(competitor, "predict") and _has(competitor, "start", "update")
+    estimates = _has(competitor, "start", "update") and (
+        is_filter(competitor) or not hasattr(competitor, "predict")
+    )
     return getattr(competitor, "kind", "estimator" if estimates else "policy")
+
+
+def is_filter(competitor: Any) -> bool:
+    """Whether it is a filter, or makes one; what else estimates is put into one (:func:`.filters.as_filter`)."""
+    made = getattr(competitor, "func", competitor)
+    return issubclass(made if isinstance(made, type) else type(made), Filter)
 
 
 def _has(found: Any, *methods: str) -> bool:
@@ -259,27 +267,6 @@ class RandomPolicy(Policy):
         """Draw from the action space, each row from its generator."""
         actions = self.begin(range(len(observation))) if state is None else state
         return actions.next(), actions
-
-
-class Likelihood(NamedTuple):
-    """How well a filter has predicted a measurement: what an estimator may return beside its estimate."""
-
-    log_likelihood: Array
-    """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
-    nis: Array = None
-    """Normalised innovation squared, ``(N,)``; None where it is not known."""
-    nis_degrees: Array = None
-    """Numbers of the measurement that it counts, ``(N,)``; likewise."""
-
-    @classmethod
-    def of(cls, values: Any) -> "Likelihood":
-        """Take a log-likelihood alone for one."""
-        return cls(*values) if isinstance(values, tuple) else cls(values)
-
-    def fill_unknown(self, like: Array) -> "Likelihood":
-        """Put NaN in place of what is not known, in the shape of an array ``(N,)``."""
-        none = math.nan + 0.0 * like
-        return Likelihood(*(none if values is None else values for values in self))
 
 
 class Estimator(Protocol):

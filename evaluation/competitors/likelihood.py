@@ -16,12 +16,13 @@ from ...compiler import namespace
 from ...compiler.functions import Function, empty_lanes, leaves, map_arrays, round_up_lanes
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
+from ...envs.contract.filter import Filter, Input
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.data.recorded_world import fill_arrays, measure_once
 from ...envs.data.recording import Recording
 from ...envs.engine.compiled import AVAILABLE, warn_of
-from .kinds import Likelihood
+from .filters import as_filter
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]
 """From parameters to keywords of the task and what makes the estimator, see :class:`~..baselines.table.Tunable`."""
@@ -141,8 +142,13 @@ def _update(
 ) -> tuple[Any, Array]:
     """Memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
-    _, _, memory, *likelihood = own.update(task.world.mask_missing(measurement), memory)
-    return memory, Likelihood.of(*likelihood).log_likelihood
+    return _step(as_filter(task, own), measurement, memory)
+
+
+def _step(filter: Filter, measurement: Any, state: Any) -> tuple[Any, Array]:
+    received = filter.task.world.mask_missing(measurement)
+    after = filter.step(state, Input(received))
+    return after, filter.records(after, received).get("log_likelihood")
 
 
 class WindowLikelihood:
@@ -226,18 +232,20 @@ class WindowLikelihood:
         lanes = initial.mean.shape[-1]
         found = numpy.empty((len(measurements), lanes))
         given = values if self.in_lanes else values[:, 0]
-        own = self.apply({name: given[i] for i, name in enumerate(self.names)})[1](self.task)
-        memory = own.start(initial, lanes)
+        own = as_filter(
+            self.task, self.apply({name: given[i] for i, name in enumerate(self.names)})[1](self.task)
+        )
+        memory = own.start(initial)
         if self._compiled is not None:
             try:
                 self._run_compiled(self._compiled, values, measurements, memory, found)
                 return found
             except NotTraceable as error:
                 warn_of(type(own).__name__, error)
-                self._compiled, memory = None, own.start(initial, lanes)
+                self._compiled, memory = None, own.start(initial)
         for k, measurement in enumerate(measurements):
-            _, _, memory, *likelihood = own.update(self.task.world.mask_missing(measurement), memory)
-            found[k] = Likelihood.of(*likelihood).log_likelihood if likelihood else numpy.nan
+            memory, told = _step(own, measurement, memory)
+            found[k] = numpy.nan if told is None else told
         return found
 
     @staticmethod

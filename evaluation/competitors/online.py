@@ -416,7 +416,7 @@ class OnlineFilter:
         return copy.deepcopy(
             state._replace(
                 filter=self._stepper.state,
-                python=None if own is None else (own.memory, own.step),
+                python=None if own is None else (own.memory, own.step_number),
                 watch=None if self.watch is None else self.watch.memory,
             )
         )
@@ -439,7 +439,7 @@ class OnlineFilter:
         """Go on from a snapshot, which stays as it is."""
         state = copy.deepcopy(state)
         if self.model.filter.in_python:
-            self.model.filter.own.memory, self.model.filter.own.step = state.python
+            self.model.filter.own.memory, self.model.filter.own.step_number = state.python
         if self.watch is not None:
             self.watch.memory = state.watch
         self._go_on(state)

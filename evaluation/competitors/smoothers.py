@@ -7,33 +7,44 @@ import numpy
 
 from ...compiler.functions import map_arrays
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Initial
+from ...envs.contract.filter import Filter, Input
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
+from ...envs.contract.task import Task
 from ...envs.engine.compiled import can_step
 from ...envs.engine.lanes import Lanes, whole_episode
 
 
-class SmoothedTrack:
-    """An estimator that answers what a smoother has found before; its memory counts the measurements.
+class SmoothedTrack(Filter[Task, Any, int]):
+    """An estimator that answers what a smoother has found before; its state counts the measurements.
 
     Args:
+        task: the estimation problem.
         means: ``(C, K, N)``.
         covariances: ``(C, C, K, N)``.
     """
 
-    kind = "estimator"
+    in_python = True
 
-    def __init__(self, means: numpy.ndarray, covariances: numpy.ndarray) -> None:
+    def __init__(self, task: Task, means: numpy.ndarray, covariances: numpy.ndarray) -> None:
+        super().__init__(task)
         self.means, self.covariances = means, covariances
 
-    def start(self, initial: Initial, N: int) -> int:
-        """Start with the first measurement."""
+    def start(self, initial: Any) -> int:
+        """Nothing is measured yet."""
         return 0
 
-    def update(self, measurement: Any, memory: int) -> tuple[Array, Array, int]:
-        """Answer for the next measurement."""
-        return self.means[:, memory], self.covariances[:, :, memory], memory + 1
+    def update(self, state: int, given: Input) -> int:
+        """Count the measurement."""
+        return state + 1
+
+    def mean(self, state: int) -> Array:
+        """What was found at the last measurement."""
+        return self.means[:, state - 1]
+
+    def covariance(self, state: int) -> Array:
+        """Likewise."""
+        return self.covariances[:, :, state - 1]
 
 
 def is_open_loop(model: Model) -> bool:
@@ -89,7 +100,7 @@ def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], 
     """Measurements and memories of a smoother that is stepped."""
 
     def memory_in(episode: Any) -> Any:
-        return looped.filter.own.memory if looped.filter.in_python else episode.filter.memory
+        return looped.filter.own.memory if looped.filter.in_python else episode.filter.own
 
     measurements: list[Any] = []
     memories = [memory_in(lanes.state)]
@@ -103,12 +114,12 @@ def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], 
 
 def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
     """Report what a smoother is given back."""
-    return episode.measurement, episode.filter.memory
+    return episode.measurement, episode.filter.own
 
 
 def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
     """The same of one that is compiled; its measurements are masked afterwards, as it is shown them."""
-    first = lanes.state.filter.memory
+    first = lanes.state.filter.own
     kept, _ = lanes.run(report_forward, measurements=length)
     moments = [_moment(kept, k) for k in range(length)]
     measurements = [looped.task.world.mask_missing(measurement) for measurement, _ in moments]

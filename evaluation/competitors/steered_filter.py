@@ -146,7 +146,7 @@ class SteeredFilter(Filter[Any, Any, Steered]):
     def __init__(self, model: Model, decider: Decider) -> None:
         super().__init__(model.task)
         self.model, self.bank, self.decider = model, model.filter, decider
-        self.adapts_covariance = self.bank.adapts_covariance  # type: ignore[misc]  # of this bank
+        self.adapts_covariance = self.bank.adapts_covariance
 
     def start(self, initial: Any) -> Steered:
         """Start the bank; the policy begins at its first decision."""

@@ -127,7 +127,7 @@ class Experiment:
     threads: int = 1
     """How many share the episodes, of the compiled backend."""
     strict: bool = False
-    """Raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`."""
+    """Raise where an estimator would lose an episode, see :class:`.filters.CheckedFilter`."""
     timed: bool = False
     """Measure the processor time of every competitor, the coordinates ``nanoseconds`` and ``compiled``: of all that is
     kept the one thing that differs from run to run."""

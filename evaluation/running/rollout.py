@@ -99,7 +99,10 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
     """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
     if kind == "smoother":
         check_open_loop(model, name)
-        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
+        competitor, kind = (
+            SmoothedTrack(model.task, *_smoothed_estimates(model, competitor, seeds, name)),
+            "estimator",
+        )
     return put_in_loop(model, competitor, kind, name, len(seeds))
 
 

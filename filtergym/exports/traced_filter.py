@@ -6,11 +6,12 @@ the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept o
 
 import ast
 import copy
+import functools
 import inspect
 import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count as count_from
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -25,11 +26,12 @@ from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
 from ..compiler.program import Graph, Program, Result, program
-from ..envs.contract.filter import Input
+from ..envs.contract.filter import Filter, Input
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task
-from ..evaluation.competitors.kinds import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
-from ..evaluation.competitors.steered_filter import Decider, Decisions, Steered, SteeredFilter, steer
+from ..evaluation.competitors.filters import as_filter
+from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
+from ..evaluation.competitors.steered_filter import Decider, Decisions, steer
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
@@ -69,65 +71,32 @@ class TracedFilter(NamedTuple):
     """That answers between the two parts of ``update``; None where none is asked."""
 
 
-class EstimatorSteps:
-    """An estimator alone: an answer that an evaluation would not accept is returned all the same.
+class FilterSteps:
+    """A filter alone: an answer that an evaluation would not accept is returned all the same.
 
     Args:
-        task: on traced arrays.
-        own: the estimator, made for it.
+        filter: on traced arrays.
+        masked: puts something in place of what was not received, of what never sees it.
+        decider: asks a network inside; None without one.
     """
 
-    def __init__(self, task: Task, own: Any) -> None:
-        self.task, self.own = task, own
-
-    def start(self, initial: Any) -> Any:
-        """Its memory."""
-        return self.own.start(initial, 1)
+    def __init__(
+        self, filter: Filter, masked: Callable[[Any], Any] | None = None, decider: Decider | None = None
+    ) -> None:
+        self.filter, self.masked, self.decider = filter, masked, decider
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """Its answer."""
-        received = self.task.world.mask_missing(measurement)
-        mean, covariance, memory, *reported = self.own.update(received, state)
-        told = Likelihood.of(*reported)._asdict() if reported else {}
-        known = {name: values for name, values in told.items() if values is not None}
-        return memory, {"mean": mean, "covariance": covariance, **known}
-
-
-class GatedSteps(EstimatorSteps):
-    """An agent's filter and another side by side."""
-
-    def due_nodes(self, state: Any, graph: Graph) -> list[int]:
-        """Expression of whether the agent is asked at a measurement."""
-        return due_nodes(self.own.filter.decider, state.agent.policy, graph)
-
-
-class SteeredSteps:
-    """A bank closed by a policy.
-
-    Args:
-        steered: on traced arrays.
-        masked: whether it is an estimator, which never sees what was not received.
-    """
-
-    def __init__(self, steered: SteeredFilter, masked: bool = False) -> None:
-        self.steered, self.masked = steered, masked
-
-    def start(self, initial: Any) -> Steered:
-        """The bank at the start of the track."""
-        return self.steered.start(initial)
-
-    def update(self, state: Steered, measurement: Any) -> tuple[Steered, dict[str, Any]]:
-        """Predict, show, ask, update."""
-        own = self.steered
-        received = clear_missing(own.task, measurement) if self.masked else measurement
-        after = own.update(own.predict(state, received), Input(received))
+        """Its state after a measurement, and its answer."""
+        own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
+        after = own.step(state, Input(received))
         told = own.records(after, received)
-        known = {name: told[name] for name in LIKELIHOODS if name in told}
+        known = {name: told[name] for name in LIKELIHOODS if told.get(name) is not None}
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
-    def due_nodes(self, state: Steered, graph: Graph) -> list[int]:
-        """Expression of whether the policy is asked at a measurement."""
-        return due_nodes(self.steered.decider, state.policy, graph)
+    def due_nodes(self, state: Any, graph: Graph) -> list[int]:
+        """Expression of whether the network is asked at a measurement."""
+        assert self.decider is not None
+        return due_nodes(self.decider, getattr(state, "agent", state).policy, graph)
 
 
 def due_nodes(decider: Decider, decisions: Decisions, graph: Graph) -> list[int]:
@@ -191,7 +160,7 @@ def check_kind(name: str, maker: Any) -> None:
 
 def steps_of(
     task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
-) -> tuple[EstimatorSteps | GatedSteps | SteeredSteps, "AskedNetwork | None"]:
+) -> tuple[FilterSteps, "AskedNetwork | None"]:
     """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
 
     Args:
@@ -204,7 +173,8 @@ def steps_of(
     traced = task(plain.task.parameters, namespace)
     if isinstance(maker, EstimatorMaker):
         policy, network = with_asked_network(maker(plain.task).network, graph)
-        return SteeredSteps(steer(Model(traced, maker.bank), policy, 1), masked=True), network
+        steered = steer(Model(traced, maker.bank), policy, 1)
+        return FilterSteps(steered, functools.partial(clear_missing, traced), steered.decider), network
     if isinstance(maker, GatedMaker):
         inside: list[AskedNetwork | None] = []
 
@@ -213,12 +183,13 @@ def steps_of(
             inside.append(network)
             return replaced
 
-        return GatedSteps(traced, maker(traced, replace)), inside[0]
+        gated = maker(traced, replace)
+        return FilterSteps(gated, traced.world.mask_missing, gated.decider), inside[0]
     if kind_of(maker) == "estimator":
-        own = make_competitor(maker, traced)
-        if not getattr(own, "traceable", False):
+        own = as_filter(traced, make_competitor(maker, traced))
+        if own.in_python:
             raise NotTraceable("it does not say that it is traceable")
-        return EstimatorSteps(traced, own), None
+        return FilterSteps(own, traced.world.mask_missing), None
     policy, network = with_asked_network(make_competitor(maker, plain), graph)
     if isinstance(policy, RandomPolicy):
         raise NotTraceable("its actions are drawn")
@@ -227,7 +198,8 @@ def steps_of(
             f"{type(policy).__name__} runs in another library; `filtergym export RUN` writes an agent of a training "
             "run as arrays"
         )
-    return SteeredSteps(steer(Model(traced, control), policy)), network
+    steered = steer(Model(traced, control), policy)
+    return FilterSteps(steered, None, steered.decider), network
 
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
@@ -399,7 +371,7 @@ def trace_filter(
 
 
 def _trace(
-    steps: EstimatorSteps | GatedSteps | SteeredSteps,
+    steps: FilterSteps,
     asked: "AskedNetwork | None",
     template: tuple[Any, Any],
     graph: Graph,
@@ -409,7 +381,7 @@ def _trace(
     begin = fill(initial, [graph.input(INITIAL, next(rows)) for _ in nodes_of(initial)], graph)
     rows = count_from()
     z = fill(measurement, [graph.input(MEASUREMENT, next(rows)) for _ in nodes_of(measurement)], graph)
-    state = steps.start(begin)
+    state = steps.filter.start(begin)
     first = nodes_of(state)
     classes = _Classes(graph, first)
     while True:
@@ -421,7 +393,7 @@ def _trace(
         if not classes.split(after):
             break
     shown = []
-    if asked is not None and asked.shown and isinstance(steps, GatedSteps | SteeredSteps):
+    if asked is not None and asked.shown and steps.decider is not None:
         shown = [*steps.due_nodes(before, graph), *asked.shown]
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])

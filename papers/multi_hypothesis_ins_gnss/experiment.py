@@ -12,7 +12,6 @@ from ...envs.contract.model import Episode, Model
 from ...envs.engine.backend import make_model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
-from ...evaluation.competitors.filters import Estimated
 from ...evaluation.competitors.kinds import Policy
 from ...evaluation.running.parallel import Workers
 from ...evaluation.running.seeds import episode_seeds
@@ -156,7 +155,7 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
 
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
         squares, records, P = model.error(episode) ** 2, model.records(episode), model.covariance(episode)
-        if isinstance(episode.filter, Estimated):
+        if model.filter.knows:
             # The reference believes the truth; nothing but apertures takes a rate away here.
             available = episode.measurement.available
             records["mode_probability"] = numpy.eye(len(HYPOTHESES))[records["true_mode"]].T
