@@ -5,7 +5,8 @@ in common is here: times, missing values, rows that come twice, several recordin
 and true values, ``truth_NAME`` for the components of the environment.
 """
 
-from collections.abc import Iterable, Mapping
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -235,7 +236,11 @@ class TruthFile(NamedTuple):
 
 
 def read_columns(
-    path: Path, cls: type[Task], keywords: Mapping[str, Any], truth: TruthFile | None = None
+    path: Path,
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    truth: TruthFile | None = None,
+    rename: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read a table of what sensors said.
 
@@ -244,6 +249,7 @@ def read_columns(
         cls: the environment.
         keywords: parameters of it.
         truth: in a file of its own.
+        rename: what some columns of the file are, in the environment's names.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
@@ -258,18 +264,19 @@ def read_columns(
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     # All that begin with truth_, because components follow from the parameters.
-    read, names, notes = read_table(path, ColumnNames(known, TRUTH))
-    names = [name.lower() for name in names]
-    original: dict[str, str] = {}
+    renamed = {old.lower(): new.lower() for old, new in (rename or {}).items()}
+    read, names, notes = read_table(path, ColumnNames({*known, *renamed}, TRUTH))
+    in_file = names = [name.lower() for name in names]
+    if renamed:
+        read, names = _rename(read, names, renamed, ColumnNames(known, TRUTH))
     if log_format.plane:
-        before = names
         read, names = _rename_aliases(read, names)
-        original = {new: old for old, new in zip(before, names, strict=True) if new != old}
+    original = {new: old for old, new in zip(in_file, names, strict=True) if new != old}
     time_name = next((name for name in TIME if name in read), None)
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
             f"it has the columns {list_names(names) or 'none'}, and {cls.id} reads time and "
-            f"{', '.join(log_format.columns)}"
+            f"{', '.join(log_format.columns)}{_suggest(names, ['time'] * (time_name is None), log_format.columns)}"
         )
     if not len(read):
         raise ValueError("it has no rows below its columns, and a recording needs several")
@@ -302,7 +309,8 @@ def read_columns(
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _side_by_side(path, cls, keywords, parts, names, notes, {**original, "time": time_name})
+    original["time"] = original.get(time_name, time_name)
+    return _side_by_side(path, cls, keywords, parts, names, notes, original)
 
 
 def _add_truth(
@@ -328,6 +336,48 @@ def _add_truth(
     except ValueError as error:
         raise ValueError(f"truth {truth.path}: {error}") from error
     return table.assign(**columns), (note, *(f"truth: {each}" for each in found.notes))
+
+
+def _rename(
+    read: "pandas.DataFrame", names: list[str], renamed: Mapping[str, str], known: ColumnNames
+) -> tuple["pandas.DataFrame", list[str]]:
+    """Call columns as a user says.
+
+    Args:
+        read: columns.
+        names: of all columns of the file.
+        renamed: what some of them are.
+        known: names that are read.
+
+    Raises:
+        ValueError: for what the file has not, what nobody reads, or what is there twice then.
+    """
+    for old, new in renamed.items():
+        if old not in names:
+            raise ValueError(f"it has no column {old}, which was to be {new}; it has {list_names(names)}")
+        if new not in known:
+            raise ValueError(
+                f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}"
+            )
+    called = [renamed.get(name, name) for name in names]
+    twice = next((name for name in renamed.values() if called.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two columns would be {twice}: leave one of them out")
+    there = [name for name in read if name in renamed or name in known]
+    return read[there].rename(columns=dict(renamed)), called
+
+
+def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
+    """What to type where the columns of a file have names of their own."""
+    wanted, pairs = [*first, *columns], []
+    for name in names:
+        close = difflib.get_close_matches(name, [each for each in wanted if each not in names], 1, 0.4)
+        if close and name not in (*TIME, RECORDING, *columns):
+            pairs.append(f"{name}={close[0]}")
+            wanted.remove(close[0])
+    if not names:
+        return ""
+    return f"; say which is which, such as --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
@@ -393,7 +443,7 @@ def _side_by_side(
     true = _true_columns(task, first)
     log_format: Any = cls.log_format
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
-    components = [TRUTH + component.name for component in task.components]
+    components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
     notes = [*said, *unknown_column_notes(names, read)]
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
@@ -437,7 +487,7 @@ def _true_columns(task: Task, columns: Columns) -> list[str]:
     Raises:
         ValueError: if a table has a part of a position only, say, or nothing that is a component.
     """
-    names = [TRUTH + component.name for component in task.components]
+    names = [TRUTH + component.name.lower() for component in task.components]
     found = [name if columns.has(name) else "" for name in names]
     if columns.true and not any(found):
         raise ValueError(
