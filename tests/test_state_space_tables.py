@@ -171,6 +171,20 @@ def test_columns_are_called_as_the_user_says(make, tmp_path, rename, sentence):
         read_recording(path, ID, rename={"t": "time", **rename})
 
 
+def test_rows_of_one_time_from_several_sensors_are_one_measurement(make, tmp_path):
+    make()
+    text = "time,gps,odometry\n10,3.0,\n10,,10.0\n10.4,,9.8\n11.3,14.0,\n12,,10.1\n12,20.5,10.1\n"
+    found = read_recording(written(tmp_path / "log.csv", text), ID)
+    plain = read_recording(written(tmp_path / "plain.csv", TEXT), ID)
+    for name, values in plain.measurements.items():
+        np.testing.assert_array_equal(found.measurements[name], values, err_msg=name)
+    np.testing.assert_array_equal(found.log_time, plain.log_time)
+    assert any(note.startswith("2 rows joined with one of the same time") for note in found.notes)
+    other = TEXT.replace("10.4,,9.8", "10.0,5.0,9.8")
+    with pytest.raises(ValueError, match="time is the same in rows 0 and 1"):
+        read_recording(written(tmp_path / "other.csv", other), ID)
+
+
 def test_columns_of_a_radar_are_called_as_the_user_says(tmp_path):
     text = "t,range_m,azimuth_deg\n0,20000,30\n4,20300,30.5\n8,20600,31.1\n12,20900,31.5\n"
     env = "filtergym/ManeuveringTarget-v0"

@@ -82,11 +82,13 @@ class Columns:
         return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
-        """Leave out rows that have the time of the row before, and say so.
+        """Join rows of one time of which each says what the other does not, as of several sensors; leave out all others
+        that have the time of the row before, and say so.
 
         Raises:
             ValueError: if many of them say something else than the row before.
         """
+        self._join_rows()
         same = numpy.append(False, numpy.diff(self.time) == 0.0)
         if not same.any():
             return
@@ -105,6 +107,27 @@ class Columns:
             f"{count:,} {what} the time of the row before{differing}: left out, the first is row {row}"
         )
         self.table, self.log_time = kept, self.log_time[~same]
+
+    def _join_rows(self) -> None:
+        """Join rows of one time that supply each other."""
+        begins = numpy.append(True, numpy.diff(self.time) != 0.0)
+        if begins.all():
+            return
+        number = numpy.cumsum(begins) - 1
+        groups, heads = self.table.groupby(number), self.table[begins]
+        joined = groups.first()  # of each column the first value that is not missing
+        differ = (groups.max() != groups.min()) & joined.notna()
+        supplied = joined.notna().to_numpy().sum(axis=1) > heads.notna().to_numpy().sum(axis=1)
+        supplied &= ~differ.any(axis=1).to_numpy()
+        if not supplied.any():
+            return
+        whole = self.table.copy()
+        whole.loc[heads.index[supplied]] = joined[supplied].set_axis(heads.index[supplied])
+        kept = begins | ~supplied[number]
+        self.notes.append(
+            f"{(~kept).sum():,} rows joined with one of the same time, each with what the other lacks"
+        )
+        self.table, self.log_time = whole[kept], self.log_time[kept]
 
     def project_to_plane(self, plane: tuple[str, ...]) -> None:
         """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
