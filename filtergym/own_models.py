@@ -13,6 +13,7 @@ from .baselines.state_space import state_space_baselines
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
 from .envs.contract.model import Model
+from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.engine.catalogue import nearest
 from .envs.linear.state_space import (
     StateSpace,
@@ -42,6 +43,7 @@ def state_space(
     covariance: Any,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
+    measured: Sequence[str] = (),
     weights: Any = None,
     filter_model: Mapping[str, Any] | None = None,
     hypotheses: Sequence[Mapping[str, Any]] = (),
@@ -67,6 +69,8 @@ def state_space(
         covariance: of the initial state, ``(n, n)``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``.
+        measured: names of the m numbers that h returns, which are the columns of a table of yours; default: ``z1``,
+            ``z2`` and so on.
         weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
         filter_model: what the filters believe in place of f, h, Q or R.
         hypotheses: further models between which the world switches, each by what differs from the first: f, h, Q, R.
@@ -115,9 +119,10 @@ def state_space(
     units = tuple(units) or ("1",) * n
     if len(names) != n or len(units) != n:
         raise ValueError(f"names and units must be {n} each, got {names!r} and {units!r}")
+    measured = _measured(measured, world[0].h.size)
     name = id.rpartition("/")[2].rpartition("-")[0] or id
     module = sys._getframe(1).f_globals.get("__name__", "__main__")
-    attributes = state_space_attributes(definition, names, units, dict(parameters))
+    attributes = state_space_attributes(definition, names, units, measured, dict(parameters))
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
     cls.reward_unit = _typical_cost(cls, StateSpaceParameters(**parameters))
@@ -134,6 +139,17 @@ def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"{what} says f, h, Q or R, got {unknown[0]!r}")
     return dict(part)
+
+
+def _measured(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Names of what is measured, which can be told apart in a table."""
+    names = tuple(names) or tuple(f"z{j + 1}" for j in range(count))
+    lower = {str(name).lower() for name in names}
+    if len(names) != count or len(lower) != count or lower & {*TIME, RECORDING, ""}:
+        raise ValueError(f"measured must be {count} different names, none of them a time, got {names!r}")
+    if any(name.startswith(TRUTH) for name in lower):
+        raise ValueError(f"names of what is measured must not begin with {TRUTH}, got {names!r}")
+    return names
 
 
 def _array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:

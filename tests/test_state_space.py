@@ -597,6 +597,31 @@ def test_what_is_no_model_is_refused(make, wrong, sentence):
 
 
 @pytest.mark.slow
+def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
+    """Its commands, on a simulated drive whose odometer speaks at every second measurement."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "car.py").write_text(BLOCKS[4][1], encoding="utf-8")
+    try:
+        made = filtergym.record(importlib.import_module("car").Car.id, episodes=1, horizon=150, jitter=0.9)
+        gps, odometry = made.measurements["values"][0].T
+        odometry = np.where(np.arange(len(gps)) % 2, np.nan, odometry)
+        rows = np.column_stack([made.seconds[0], gps, odometry, made.truth[0]])
+        for file, header in (
+            ("drive.csv", "time,gps,odometry,truth_position,truth_velocity"),
+            ("other.csv", "t,pos,v,truth_position,truth_velocity"),
+        ):
+            text = "\n".join([header, *(",".join(map(str, row)).replace("nan", "") for row in rows.tolist())])
+            (tmp_path / file).write_text(text, encoding="utf-8")
+        for line in BLOCKS[5][1].splitlines():
+            code, shown, errors = command(*shlex.split(line)[1:])
+            assert (code, bool(shown)) == (0, True), errors
+    finally:
+        sys.modules.pop("car", None)
+        forget("mine/Car-v0")
+
+
+@pytest.mark.slow
 def test_the_page_runs(tmp_path, command, capsys, monkeypatch):
     """One block after the other in an empty folder, with a short search and training."""
     pytest.importorskip("torch")

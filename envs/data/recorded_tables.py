@@ -5,7 +5,8 @@ in common is here: times, missing values, rows that come twice, several recordin
 and true values, ``truth_NAME`` for the components of the environment.
 """
 
-from collections.abc import Iterable, Mapping
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -82,11 +83,13 @@ class Columns:
         return Columns(self.name, self.table[rows], self.given, self.log_time[rows])
 
     def drop_duplicates(self) -> None:
-        """Leave out rows that have the time of the row before, and say so.
+        """Join rows of one time of which each says what the other does not, as of several sensors; leave out all others
+        that have the time of the row before, and say so.
 
         Raises:
             ValueError: if many of them say something else than the row before.
         """
+        self._join_rows()
         same = numpy.append(False, numpy.diff(self.time) == 0.0)
         if not same.any():
             return
@@ -105,6 +108,27 @@ class Columns:
             f"{count:,} {what} the time of the row before{differing}: left out, the first is row {row}"
         )
         self.table, self.log_time = kept, self.log_time[~same]
+
+    def _join_rows(self) -> None:
+        """Join rows of one time that supply each other."""
+        begins = numpy.append(True, numpy.diff(self.time) != 0.0)
+        if begins.all():
+            return
+        number = numpy.cumsum(begins) - 1
+        groups, heads = self.table.groupby(number), self.table[begins]
+        joined = groups.first()  # of each column the first value that is not missing
+        differ = (groups.max() != groups.min()) & joined.notna()
+        supplied = joined.notna().to_numpy().sum(axis=1) > heads.notna().to_numpy().sum(axis=1)
+        supplied &= ~differ.any(axis=1).to_numpy()
+        if not supplied.any():
+            return
+        whole = self.table.copy()
+        whole.loc[heads.index[supplied]] = joined[supplied].set_axis(heads.index[supplied])
+        kept = begins | ~supplied[number]
+        self.notes.append(
+            f"{(~kept).sum():,} rows joined with one of the same time, each with what the other lacks"
+        )
+        self.table, self.log_time = whole[kept], self.log_time[kept]
 
     def project_to_plane(self, plane: tuple[str, ...]) -> None:
         """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
@@ -236,7 +260,11 @@ class TruthFile(NamedTuple):
 
 
 def read_columns(
-    path: Path, cls: type[Task], keywords: Mapping[str, Any], truth: TruthFile | None = None
+    path: Path,
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    truth: TruthFile | None = None,
+    rename: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read a table of what sensors said.
 
@@ -245,6 +273,7 @@ def read_columns(
         cls: the environment.
         keywords: parameters of it.
         truth: in a file of its own.
+        rename: what some columns of the file are, in the environment's names.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
@@ -259,18 +288,19 @@ def read_columns(
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     # All that begin with truth_, because components follow from the parameters.
-    read, names, notes = read_table(path, ColumnNames(known, TRUTH))
-    names = [name.lower() for name in names]
-    original: dict[str, str] = {}
+    renamed = {old.lower(): new.lower() for old, new in (rename or {}).items()}
+    read, names, notes = read_table(path, ColumnNames({*known, *renamed}, TRUTH))
+    in_file = names = [name.lower() for name in names]
+    if renamed:
+        read, names = _rename(read, names, renamed, ColumnNames(known, TRUTH))
     if log_format.plane:
-        before = names
         read, names = _rename_aliases(read, names)
-        original = {new: old for old, new in zip(before, names, strict=True) if new != old}
+    original = {new: old for old, new in zip(in_file, names, strict=True) if new != old}
     time_name = next((name for name in TIME if name in read), None)
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
             f"it has the columns {list_names(names) or 'none'}, and {cls.id} reads time and "
-            f"{', '.join(log_format.columns)}"
+            f"{', '.join(log_format.columns)}{_suggest(names, ['time'] * (time_name is None), log_format.columns)}"
         )
     if not len(read):
         raise ValueError("it has no rows below its columns, and a recording needs several")
@@ -303,7 +333,8 @@ def read_columns(
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _side_by_side(path, cls, keywords, parts, names, notes, {**original, "time": time_name})
+    original["time"] = original.get(time_name, time_name)
+    return _side_by_side(path, cls, keywords, parts, names, notes, original)
 
 
 def _add_truth(
@@ -329,6 +360,48 @@ def _add_truth(
     except ValueError as error:
         raise ValueError(f"truth {truth.path}: {error}") from error
     return table.assign(**columns), (note, *(f"truth: {each}" for each in found.notes))
+
+
+def _rename(
+    read: "pandas.DataFrame", names: list[str], renamed: Mapping[str, str], known: ColumnNames
+) -> tuple["pandas.DataFrame", list[str]]:
+    """Call columns as a user says.
+
+    Args:
+        read: columns.
+        names: of all columns of the file.
+        renamed: what some of them are.
+        known: names that are read.
+
+    Raises:
+        ValueError: for what the file has not, what nobody reads, or what is there twice then.
+    """
+    for old, new in renamed.items():
+        if old not in names:
+            raise ValueError(f"it has no column {old}, which was to be {new}; it has {list_names(names)}")
+        if new not in known:
+            raise ValueError(
+                f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}"
+            )
+    called = [renamed.get(name, name) for name in names]
+    twice = next((name for name in renamed.values() if called.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two columns would be {twice}: leave one of them out")
+    there = [name for name in read if name in renamed or name in known]
+    return read[there].rename(columns=dict(renamed)), called
+
+
+def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
+    """What to type where the columns of a file have names of their own."""
+    wanted, pairs = [*first, *columns], []
+    for name in names:
+        close = difflib.get_close_matches(name, [each for each in wanted if each not in names], 1, 0.4)
+        if close and name not in (*TIME, RECORDING, *columns):
+            pairs.append(f"{name}={close[0]}")
+            wanted.remove(close[0])
+    if not names:
+        return ""
+    return f"; say which is which, such as --rename '{','.join(pairs or [f'NAME={wanted[0]}'])}'"
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
@@ -394,7 +467,7 @@ def _side_by_side(
     true = _true_columns(task, first)
     log_format: Any = cls.log_format
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
-    components = [TRUTH + component.name for component in task.components]
+    components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
     notes = [*said, *unknown_column_notes(names, read)]
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
@@ -438,7 +511,7 @@ def _true_columns(task: Task, columns: Columns) -> list[str]:
     Raises:
         ValueError: if a table has a part of a position only, say, or nothing that is a component.
     """
-    names = [TRUTH + component.name for component in task.components]
+    names = [TRUTH + component.name.lower() for component in task.components]
     found = [name if columns.has(name) else "" for name in names]
     if columns.true and not any(found):
         raise ValueError(

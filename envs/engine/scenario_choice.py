@@ -109,6 +109,7 @@ def read_recording(
     speeds: tuple[float, float] = (1.0, 1000.0),
     truth: Any = None,
     truth_offset: float = 0.0,
+    rename: Mapping[str, str] | None = None,
     **keywords: Any,
 ) -> Recording:
     """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
@@ -124,6 +125,7 @@ def read_recording(
         truth: path of the truth in a file of its own, a table or a log of a receiver, matched by time; a note says how
             much of the recording has one. For tables.
         truth_offset: s, added to the times of that file.
+        rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:
@@ -144,7 +146,7 @@ def read_recording(
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(_read_recording(file, cls, speeds, keywords, true))
+            found.append(_read_recording(file, cls, speeds, keywords, true, rename))
             cls = cls or task_class(found[0].environment)
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
@@ -166,6 +168,7 @@ def _read_recording(
     speeds: tuple[float, float],
     keywords: Mapping[str, Any],
     truth: TruthFile | None,
+    rename: Mapping[str, str] | None,
 ) -> Recording:
     """Read one file."""
     if not file.is_file():
@@ -175,13 +178,15 @@ def _read_recording(
             raise ValueError(
                 "a recording in NetCDF holds its own truth: --truth is for tables and logs of receivers"
             )
+        if rename:
+            raise ValueError("a recording in NetCDF names its own variables: --rename is for tables")
         recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
     elif cls is None:
         raise ValueError(
             "it does not say of which environment it is: give its id, as the argument environment or before --recording"
         )
     else:
-        recording = read_columns(file, cls, keywords, truth)
+        recording = read_columns(file, cls, keywords, truth, rename)
     task = make_task(cls or task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))

@@ -27,6 +27,7 @@ from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
 from .live import StateSpaceInput
+from .logs import state_space_log_format
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,7 +401,11 @@ class StateSpace(Task):
 
 
 def state_space_attributes(
-    definition: StateSpaceDefinition, names: Sequence[str], units: Sequence[str], defaults: dict[str, Any]
+    definition: StateSpaceDefinition,
+    names: Sequence[str],
+    units: Sequence[str],
+    measured: Sequence[str],
+    defaults: dict[str, Any],
 ) -> dict[str, Any]:
     """Attributes of a task's class that follow from what its author gives.
 
@@ -408,6 +413,7 @@ def state_space_attributes(
         definition: the models.
         names: of the components.
         units: of each.
+        measured: names of what h returns.
         defaults: parameters in the training distribution, where they are not those of every such task.
     """
     from .state_space_banks import KalmanNetBank, bank_tables
@@ -418,8 +424,11 @@ def state_space_attributes(
     jitter = Scenario(
         "jitter", "Held out: intervals from a tenth to 1.9 times the usual.", {**defaults, "jitter": 0.9}
     )
+    places = _components_measured(definition.world[0].h)
+    measured_units = [units[places.index(j)] if j in places else "1" for j in range(len(measured))]
     return {
         "definition": definition,
+        "log_format": state_space_log_format(definition, measured, measured_units, defaults),
         "components": tuple(map(Component, names, units)),
         "banks": banks,
         "actions": actions,

@@ -27,6 +27,7 @@ from ..reports.tables.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
 from .terminal import (
+    RenameOption,
     TruthOffset,
     TruthOption,
     command_line,
@@ -34,6 +35,7 @@ from .terminal import (
     pair,
     parse_settings,
     progress_bar,
+    renamed,
 )
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
@@ -103,6 +105,7 @@ def advise_on_log(
     ] = None,
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
+    rename: RenameOption = None,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -139,6 +142,7 @@ def advise_on_log(
         speeds=pair("--speeds", speeds),
         truth=truth,
         truth_offset=truth_offset,
+        rename=renamed(rename),
         **keywords,
     )
     problem = problem_of(found.environment)

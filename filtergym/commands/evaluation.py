@@ -45,7 +45,7 @@ from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.work import work_of
 from ..reports.tables.worst import worst_figures
 from .shown import REPORT, make_report
-from .terminal import command_line, console, pair, print_sentence, print_table, progress_bar
+from .terminal import command_line, console, pair, print_sentence, print_table, progress_bar, renamed
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
@@ -68,6 +68,8 @@ class FileOptions(NamedTuple):
     truth: Path | None = None
     """Of a recording, in a file of its own."""
     truth_offset: float = 0.0
+    rename: str | None = None
+    """Of the columns of a recording."""
 
 
 class Outputs(NamedTuple):
@@ -121,13 +123,15 @@ def find_data(
             speeds=speeds,
             truth=options.truth,
             truth_offset=options.truth_offset,
+            rename=renamed(options.rename),
             **keywords,
         )
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
-    if options.truth is not None:
-        raise ValueError("--truth is for a recording: --recording FILE --truth FILE")
+    for option, given in (("--truth", options.truth), ("--rename", options.rename)):
+        if given is not None:
+            raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
     if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     if scenario in named or not names_flights(scenario):

@@ -12,6 +12,7 @@ from ..envs.engine.scenario_choice import read_recording
 from ..evaluation.storage.files import writable_file, writable_folder
 from .terminal import (
     Parameters,
+    RenameOption,
     ScenarioName,
     Trust,
     command_line,
@@ -22,6 +23,7 @@ from .terminal import (
     one_of,
     pair,
     parse_settings,
+    renamed,
 )
 
 if TYPE_CHECKING:
@@ -79,6 +81,7 @@ def export(
         str,
         typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
     ] = "1,1000",
+    rename: RenameOption = None,
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
@@ -116,7 +119,9 @@ def export(
     if recording is not None:
         if scenario is not None:
             raise ValueError("--recording takes the place of --scenario: leave one of them out")
-        data = read_recording(recording, problem.id, speeds=pair("--speeds", speeds), **keywords)
+        data = read_recording(
+            recording, problem.id, speeds=pair("--speeds", speeds), rename=renamed(rename), **keywords
+        )
     from ..exports.request import request_export
 
     request = request_export(problem, name, data, trust=trust, **keywords)

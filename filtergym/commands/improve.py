@@ -24,6 +24,7 @@ from .terminal import (
     Cluster,
     Environment,
     Jobs,
+    RenameOption,
     TrainedControl,
     TrainingScenario,
     Trust,
@@ -34,6 +35,7 @@ from .terminal import (
     pair,
     print_table,
     progress_bar,
+    renamed,
     whole_numbers,
 )
 from .training import open_run, open_runs, print_standing, train_runs, trainer_of
@@ -55,6 +57,7 @@ def tune_policy(
     ] = None,
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
+    rename: RenameOption = None,
     speeds: Annotated[
         str,
         typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
@@ -70,7 +73,12 @@ def tune_policy(
     problem = problem_of(environment)
     if recording is not None:
         found = read_recording(
-            recording, problem.id, speeds=pair("--speeds", speeds), truth=truth, truth_offset=truth_offset
+            recording,
+            problem.id,
+            speeds=pair("--speeds", speeds),
+            truth=truth,
+            truth_offset=truth_offset,
+            rename=renamed(rename),
         )
         fit_to_recording(problem, policy, found, out, seed)
         return

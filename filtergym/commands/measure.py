@@ -48,6 +48,7 @@ from .terminal import (
     Formats,
     Jobs,
     Parameters,
+    RenameOption,
     ScenarioName,
     Split,
     Threads,
@@ -113,6 +114,7 @@ def evaluate_policies(
     ] = None,
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
+    rename: RenameOption = None,
     estimates: Annotated[
         Path | None,
         typer.Option(
@@ -169,7 +171,7 @@ def evaluate_policies(
     """
     keywords = parse_settings(settings or [])
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
-    options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset)
+    options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename)
     outputs.check()
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})

@@ -134,6 +134,12 @@ TruthOption = Annotated[
         "much of it has one.",
     ),
 ]
+RenameOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rename", help="What columns of a table are, where they have other names: 't=time,pos=x'."
+    ),
+]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
 Backend = Annotated[
     str,
@@ -252,6 +258,19 @@ def close_output(*_: Any, **__: Any) -> None:
         raise ValueError(
             f"cannot write to standard output: {console.refusal.strerror or console.refusal}"
         ) from console.refusal
+
+
+def renamed(text: str | None) -> dict[str, str]:
+    """Names of columns by what they are called in a file, of an option such as ``t=time,pos=x``.
+
+    Raises:
+        ValueError: for what is none.
+    """
+    pairs = [part.split("=") for part in text.split(",")] if text else []
+    names = {pair[0].strip(): pair[-1].strip() for pair in pairs}
+    if len(names) != len(pairs) or not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
+        raise ValueError(f"--rename takes NAME=MEANING,NAME=MEANING, such as 't=time,pos=x', got {text!r}")
+    return names
 
 
 def pair(option: str, text: str) -> tuple[float, float]:

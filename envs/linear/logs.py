@@ -1,0 +1,130 @@
+"""Tables of measurements as those of a state-space model: a column for each number that h returns.
+
+The track starts with the model's mean and covariance one interval before the first row, as in the simulation.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy
+
+from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..data.recorded_tables import UNEVEN, Columns
+
+if TYPE_CHECKING:
+    from .state_space import StateSpaceDefinition
+
+MOST_MISSED = 1000
+"""Measurements that may be missing between two rows."""
+OF_EPISODES = ("horizon", "decision_interval", "jitter", "process_noise", "measurement_noise", "availability")
+"""Parameters of a simulation, which a log has not."""
+
+
+def state_space_log_format(
+    definition: "StateSpaceDefinition",
+    names: Sequence[str],
+    units: Sequence[str],
+    defaults: Mapping[str, Any],
+) -> LogFormat:
+    """Tables of a state-space model.
+
+    Args:
+        definition: the models.
+        names: of the m numbers that are measured.
+        units: of each.
+        defaults: parameters that the author has set.
+    """
+    one = len(definition.filters) == 1
+    return LogFormat(
+        {name.lower(): unit for name, unit in zip(names, units, strict=True)},
+        functools.partial(_read, definition, tuple(name.lower() for name in names), dict(defaults)),
+        _start,
+        predict=functools.partial(_predict, definition) if one else None,
+        predicted=tuple(Predicted(name, unit, name) for name, unit in zip(names, units, strict=True)),
+    )
+
+
+def _read(
+    definition: "StateSpaceDefinition",
+    names: tuple[str, ...],
+    defaults: Mapping[str, Any],
+    columns: Columns,
+) -> TrackLog:
+    """Make measurements of one track.
+
+    Raises:
+        ValueError: for what lacks or cannot be.
+    """
+    lacking = [name for name in names if not columns.has(name)]
+    if lacking:
+        raise ValueError(
+            f"it lacks the column {', '.join(lacking)}; it needs time, {', '.join(names)}, empty where nothing came; "
+            f"if it has another name, say --rename 'NAME={lacking[0]}'"
+        )
+    known = {name: value for name, value in defaults.items() if name not in OF_EPISODES}
+    parameters = {name: value for name, value in known.items() if name not in columns.given}
+    timed = definition.world[0].timed
+    typical: dict[str, float] = {}
+    notes: tuple[str, ...] = ()
+    if timed:
+        parameters.pop("sampling_interval", None)
+        usual = columns.interval()
+        typical["sampling_interval"] = usual
+        rows, time = numpy.arange(len(columns.time)), columns.time
+    else:
+        usual = float({"sampling_interval": 1.0, **known, **columns.given}["sampling_interval"])
+        rows, time = _fill_gaps(columns.time, usual)
+        missed = int((rows < 0).sum())
+        notes = (f"{missed:,} measurements without a row: nothing was received",) * bool(missed)
+    values = numpy.stack([columns[name] for name in names], axis=1)
+    there = (rows >= 0)[:, None] & numpy.isfinite(values[rows])
+    if not there.any():
+        raise ValueError(f"no row has a value of {', '.join(names)}")
+    start = float(time[0]) - usual
+    measurements = {"values": numpy.where(there, values[rows], 0.0), "available": there.astype(float)}
+    if timed:
+        measurements["interval"] = numpy.diff(time, prepend=start)
+    initial = {"mean": definition.mean, "covariance": definition.covariance}
+    return TrackLog(measurements, initial, rows, parameters, start, time, notes, typical)
+
+
+def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Row of every measurement of a model that moves by one interval, -1 where there is none, and the times, s.
+
+    Raises:
+        ValueError: for rows that are not whole intervals apart.
+    """
+    steps = numpy.rint(numpy.diff(time) / interval)
+    wrong = (numpy.abs(numpy.diff(time) - steps * interval) > UNEVEN * interval) | (steps < 1.0)
+    wrong |= steps > MOST_MISSED
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"the model moves by {interval:g} s from one measurement to the next, and row {row + 1} is "
+            f"{time[row + 1] - time[row]:g} s after row {row}: say --set sampling_interval=SECONDS if the model is "
+            "made for another one, or write f(x, dt) and Q(dt), which take any time"
+        )
+    places = numpy.append(0, numpy.cumsum(steps)).astype(int)
+    rows = numpy.full(places[-1] + 1, -1)
+    rows[places] = numpy.arange(len(time))
+    return rows, numpy.interp(numpy.arange(len(rows)), places, time)
+
+
+def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any) -> TrackStart:
+    """Refuse to start from measurements: a track starts where the model says."""
+    raise ValueError(
+        "it lacks initial_mean and initial_covariance, and the model does not start from measurements"
+    )
+
+
+def _predict(
+    definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each."""
+    model = definition.filters[0]
+    given = numpy.reshape(mean, (len(mean), -1))
+    if model.timed:
+        given = numpy.concatenate([given, numpy.reshape(measurement.interval, (1, -1))])
+    predicted = model.h.value(model.f.value(given, numpy), numpy).reshape(-1, *mean.shape[1:])
+    return predicted, numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)

@@ -1,0 +1,239 @@
+"""Tables of one's own as measurements of a state-space model, against its simulation and naive loops."""
+
+import shutil
+import sys
+
+import gymnasium
+import numpy as np
+import pandas
+import pytest
+from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine import registration
+from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.evaluation.statistics.innovations import with_innovations
+
+import filtergym
+from filtergym import read_recording, record
+from filtergym.__main__ import main
+from filtergym.exports.c_source import export_c
+from filtergym.exports.request import request_export
+
+TIMED = {
+    "f": lambda x, dt: [x[0] + dt * x[1], x[1]],
+    "Q": lambda dt: [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]],
+}
+FIXED = {"f": [[1.0, 0.5], [0.0, 1.0]], "Q": [[0.1, 0.2], [0.2, 0.5]], "sampling_interval": 0.5}
+BOTH = {
+    "h": [[1, 0], [0, 1]],
+    "R": [[25.0, 0.0], [0.0, 0.25]],
+    "mean": [0, 10],
+    "covariance": [[100, 0], [0, 25]],
+    "names": ["Position", "velocity"],
+    "units": ["m", "m/s"],
+    "measured": ["gps", "Odometry"],
+}
+TEXT = "time,gps,odometry\n10,3.0,10.0\n10.4,,9.8\n11.3,14.0,\n12,20.5,10.1\n"
+ID = "mine/Table-v0"
+
+
+@pytest.fixture
+def make():
+    """Make the environment; forgotten afterwards."""
+    yield lambda **keywords: filtergym.state_space(ID, **{**TIMED, **BOTH, **keywords})
+    for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
+        table.pop(ID, None)
+
+
+def written(path, text):
+    path.write_text(text)
+    return path
+
+
+def naive(rows, R):
+    """Kalman filter of the timed model, of rows ``(dt, gps, odometry)``, with NumPy's inverse."""
+    x, P = np.array([0.0, 10.0]), np.diag([100.0, 25.0])
+    for dt, *z in rows:
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        x, P = F @ x, F @ P @ F.T + np.array(TIMED["Q"](dt))
+        there = np.isfinite(z)
+        if there.any():
+            H = np.eye(2)[there]
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R[np.ix_(there, there)])
+            x, P = x + K @ (np.array(z)[there] - H @ x), (np.eye(2) - K @ H) @ P
+    return x, P
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_table_of_any_times_is_what_a_naive_filter_makes_of_it(make, tmp_path, suffix):
+    make()
+    path = written(tmp_path / "log.csv", TEXT)
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+        pandas.read_csv(path).to_parquet(tmp_path / "log.parquet")
+    recording = read_recording(tmp_path / f"log.{suffix}", ID)
+    usual = float(np.median(np.diff([10.0, 10.4, 11.3, 12.0])))
+    rows = [(usual, 3.0, 10.0), (0.4, np.nan, 9.8), (0.9, 14.0, np.nan), (0.7, 20.5, 10.1)]
+    np.testing.assert_allclose(recording.measurements["interval"][0], [row[0] for row in rows], rtol=1e-12)
+    np.testing.assert_array_equal(recording.measurements["available"][0], [[1, 1], [0, 1], [1, 0], [1, 1]])
+    assert recording.truth is None
+    run = filtergym.evaluate(ID, ["kalman", "extended"], scenario=recording, tracks=True)
+    mean, P = naive(rows, np.diag([25.0, 0.25]))
+    for name in ("kalman", "extended"):
+        own = run.sel(policy=name).isel(episode=0, time=-1)
+        np.testing.assert_allclose(own["estimate"].values.ravel(), mean, rtol=1e-12)
+        np.testing.assert_allclose(own["covariance"].values.reshape(2, 2), P, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [TIMED, FIXED])
+def test_a_recording_that_is_written_as_a_table_is_read_as_it_was(make, tmp_path, kind):
+    make(**kind)
+    jitter = {"jitter": 0.9} if kind is TIMED else {}
+    made = record(ID, episodes=1, horizon=30, availability=0.8, **jitter)
+    there = made.measurements["available"][0] > 0.0
+    columns = np.where(there, made.measurements["values"][0], np.nan)
+    table = pandas.DataFrame(
+        {
+            "time": 500.0 + made.seconds[0],
+            "gps": columns[:, 0],
+            "odometry": columns[:, 1],
+            "truth_position": made.truth[0, :, 0],
+            "truth_velocity": made.truth[0, :, 1],
+        }
+    )
+    if (
+        kind is FIXED
+    ):  # where nothing was received a row may lack; the last is needed to know how long it went on
+        table = table[
+            there.any(axis=1) | (np.arange(len(table)) == len(table) - 1) | (np.arange(len(table)) == 0)
+        ]
+        assert len(table) < len(there)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    first = float(made.seconds[0, 0]) if kind is TIMED else 0.5
+    read = read_recording(tmp_path / "log.csv", ID, sampling_interval=first)
+    for name, values in made.measurements.items():
+        np.testing.assert_allclose(read.measurements[name], values, rtol=0.0, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(read.seconds, made.seconds, rtol=0.0, atol=1e-9)
+    runs = [filtergym.evaluate(ID, ["kalman"], scenario=each, tracks=True) for each in (made, read)]
+    np.testing.assert_allclose(*(run["estimate"].values[:, :, :30] for run in runs), rtol=0.0, atol=1e-7)
+    first, second = (run["error"].values[:, :, :30] for run in runs)
+    known = np.isfinite(second)
+    assert known.sum() > 40
+    np.testing.assert_allclose(first[known], second[known], rtol=0.0, atol=1e-7)
+
+
+def test_the_innovation_of_a_table_is_the_measurement_less_its_prediction(make, tmp_path):
+    cls = make()
+    recording = read_recording(written(tmp_path / "log.csv", TEXT), ID)
+    run = filtergym.evaluate(ID, ["kalman"], scenario=recording, tracks=True)
+    found = with_innovations(run, make_task(cls, recording))["prediction_error"].values[0, 0]
+    x = run["estimate"].transpose("policy", "episode", "time", "component").values[0, 0]
+    np.testing.assert_allclose(found[1, 1], 9.8 - x[0, 1], rtol=1e-12)
+    np.testing.assert_allclose(found[2, 0], 14.0 - (x[1, 0] + 0.9 * x[1, 1]), rtol=1e-10)
+    assert np.isnan([*found[0], found[1, 0], found[2, 1]]).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "sentence"),
+    [
+        (TIMED, "time,gps\n0,1\n1,2\n", r"lacks the column odometry; .* say --rename 'NAME=odometry'"),
+        (TIMED, "t,pos,odom\n0,1,2\n1,2,3\n", "such as --rename 't=time,pos=gps,odom=odometry'"),
+        (TIMED, "time,gps,odometry\n0,,\n1,,\n", "no row has a value of gps, odometry"),
+        (TIMED, "time,gps,odometry\n0,1,2\n-1,2,3\n", "time decreases between rows 0 and 1"),
+        (TIMED, "time,gps,odometry,truth_height\n0,1,2,3\n1,2,3,4\n", "truth_height is no truth of"),
+        (FIXED, "time,gps,odometry\n0,1,2\n0.7,2,3\n", r"moves by 0.5 s .* row 1 is 0.7 s after row 0: say --set"),
+        (FIXED, "time,gps,odometry\n0,1,2\n0.001,2,3\n", "row 1 is 0.001 s after row 0"),
+        (FIXED, "time,gps,odometry\n0,1,2\n9000,2,3\n", "row 1 is 9000 s after row 0"),
+    ],
+)  # fmt: skip
+def test_a_table_that_does_not_fit_is_refused_with_what_to_type(make, tmp_path, kind, text, sentence):
+    make(**kind)
+    with pytest.raises(ValueError, match=sentence):
+        read_recording(written(tmp_path / "log.csv", text), ID)
+
+
+@pytest.mark.parametrize(
+    ("rename", "sentence"),
+    [
+        ({"position": "gps"}, "it has no column position, which was to be gps; it has t, pos, odom"),
+        ({"pos": "height"}, "pos was to be height, which is not read: choose from gps, odometry"),
+        ({"pos": "gps", "odom": "gps"}, "two columns would be gps"),
+    ],
+)
+def test_columns_are_called_as_the_user_says(make, tmp_path, rename, sentence):
+    make()
+    path = written(tmp_path / "log.csv", TEXT.replace("time,gps,odometry", "t,pos,odom"))
+    found = read_recording(path, ID, rename={"T": "time", "pos": "gps", "odom": "Odometry"})
+    plain = read_recording(written(tmp_path / "plain.csv", TEXT), ID)
+    np.testing.assert_array_equal(found.measurements["values"], plain.measurements["values"])
+    assert found.columns == {"time": "t", "gps": "pos", "odometry": "odom"}
+    with pytest.raises(ValueError, match=sentence):
+        read_recording(path, ID, rename={"t": "time", **rename})
+
+
+def test_rows_of_one_time_from_several_sensors_are_one_measurement(make, tmp_path):
+    make()
+    text = "time,gps,odometry\n10,3.0,\n10,,10.0\n10.4,,9.8\n11.3,14.0,\n12,,10.1\n12,20.5,10.1\n"
+    found = read_recording(written(tmp_path / "log.csv", text), ID)
+    plain = read_recording(written(tmp_path / "plain.csv", TEXT), ID)
+    for name, values in plain.measurements.items():
+        np.testing.assert_array_equal(found.measurements[name], values, err_msg=name)
+    np.testing.assert_array_equal(found.log_time, plain.log_time)
+    assert any(note.startswith("2 rows joined with one of the same time") for note in found.notes)
+    other = TEXT.replace("10.4,,9.8", "10.0,5.0,9.8")
+    with pytest.raises(ValueError, match="time is the same in rows 0 and 1"):
+        read_recording(written(tmp_path / "other.csv", other), ID)
+
+
+def test_columns_of_a_radar_are_called_as_the_user_says(tmp_path):
+    text = "t,range_m,azimuth_deg\n0,20000,30\n4,20300,30.5\n8,20600,31.1\n12,20900,31.5\n"
+    env = "filtergym/ManeuveringTarget-v0"
+    with pytest.raises(ValueError, match="such as --rename 't=time,range_m=range,azimuth_deg=azimuth'"):
+        read_recording(written(tmp_path / "log.csv", text), env)
+    found = read_recording(
+        tmp_path / "log.csv", env, rename={"t": "time", "range_m": "range", "azimuth_deg": "azimuth"}
+    )
+    plain = written(
+        tmp_path / "plain.csv", text.replace("_m", "").replace("_deg", "").replace("t,", "time,", 1)
+    )
+    np.testing.assert_array_equal(
+        found.measurements["position"], read_recording(plain, env).measurements["position"]
+    )
+
+
+def test_commands_take_a_table(make, tmp_path, monkeypatch, capsys):
+    make()
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.3, 2.0, 120))
+    speed = 10.0 + np.cumsum(rng.normal(0.0, 1.0, 120))
+    rows = np.column_stack([time, 10.0 * time + rng.normal(0.0, 5.0, 120), speed])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,gps,odometry", comments="")
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        ["evaluate", ID, "--recording", "log.csv", "--rename", "t=time", "--policy", "kalman"],
+        ["tune", ID, "--recording", "log.csv", "--rename", "t=time", "--policy", "extended", "--out", "."],
+    ):
+        monkeypatch.setattr(sys, "argv", ["filtergym", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code in (0, None), capsys.readouterr()
+    assert "measurement noise" in capsys.readouterr().out
+    for words in (["--rename", "t"], ["--rename", "t=time,"], ["--rename", "t=time=x"]):
+        monkeypatch.setattr(sys, "argv", ["filtergym", "evaluate", ID, "--recording", "log.csv", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code not in (0, None)
+        assert "--rename takes NAME=MEANING" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no compiler")
+def test_a_filter_is_exported_and_tried_on_a_table(make, tmp_path):
+    make()
+    recording = read_recording(written(tmp_path / "log.csv", TEXT), ID)
+    assert export_c(request_export(problem_of(ID), "extended", recording), tmp_path).difference < 1e-9
+
+
+@pytest.mark.parametrize("measured", [["one"], ["a", "A"], ["a", "time"], ["a", "truth_x"], ["a", ""]])
+def test_names_of_what_is_measured_can_be_told_apart(make, measured):
+    with pytest.raises(ValueError, match=r"measured must|names of what is measured must"):
+        make(measured=measured)
