@@ -28,6 +28,8 @@ PART = 200
 """Statements of a function."""
 SHORTER = 1.5
 """Straight statements that are as long, compiled, as a statement in a loop with its tables."""
+ROWS = 32
+"""Entries of tables that a second loop must save."""
 WIDTH = 100
 """Characters of a line of a comment."""
 _INFIX = {
@@ -346,9 +348,11 @@ class _Loops:
         self.scalar, self.tables, self.qualifier = scalar, tables, qualifier
         self.defined: list[str] = []
         self._found: dict[tuple[Any, ...], str] = {}
+        self._columns = 1
 
     def loop(self, loop: Loop) -> list[str]:
-        """Return the lines of a loop."""
+        """Return the lines of a loop, or of two where rows and columns take shorter tables than all members."""
+        self._columns = self._best_columns(loop)
         lines = []
         for number, operation, operands, logical, table, kept in loop.body:
             values = [self._value(operand) for operand in operands]
@@ -367,7 +371,40 @@ class _Loops:
                     lines.append(f"{place} = {own};")
         if loop.turns == 1:
             return lines
-        return [f"for (int k = 0; k < {loop.turns}; ++k) {{", *(f"    {line}" for line in lines), "}"]
+        head = [f"for (int k = 0; k < {loop.turns}; ++k) {{"]
+        if self._columns > 1:
+            head = [
+                f"for (int i = 0, k = 0; i < {loop.turns // self._columns}; ++i)",
+                f"for (int j = 0; j < {self._columns}; ++j, ++k) {{",
+            ]
+            if not any(re.search(r"\bk\b", line) for line in lines):
+                head = [line.replace(", k = 0", "").replace(", ++k", "") for line in head]
+        return [*head, *(f"    {line}" for line in lines), "}"]
+
+    def _best_columns(self, loop: Loop) -> int:
+        """Members of a row with which the tables of a loop are shortest; 1: no rows."""
+        tables = set()
+        for statement in loop.body:
+            for operands, rows in (
+                (statement.operands, self.arrays.read),
+                (statement.kept, self.arrays.written),
+            ):
+                for operand in operands:
+                    if operand.array not in (TURN, CONSTANTS):
+                        tables.add(self._own_places(operand, rows))
+        open_tables = [places for places in tables if steady(places) is None]
+        whole = sum(map(len, open_tables))
+
+        def cost(columns: int) -> int:
+            entries = 0
+            for places in open_tables:
+                for part in _grid(places, columns) or [places]:
+                    entries += len(part) if steady(part) is None else 0
+            return entries
+
+        divisors = [n for n in range(2, loop.turns // 2 + 1) if loop.turns % n == 0] if open_tables else []
+        best = min(divisors, key=cost, default=1)
+        return best if best > 1 and cost(best) + ROWS < whole else 1
 
     def _number(self, value: str, logical: bool) -> str:
         one, zero = literal(1.0, self.scalar), literal(0.0, self.scalar)
@@ -389,27 +426,34 @@ class _Loops:
     def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
         """Expression of a member of an array, in a turn of the loop."""
         array, places = operand.array, operand.places
-        if array != SCRATCH:
-            if len(set(places)) == 1:
-                return single(array, places[0])
-            pointer, of_row = rows[array]
-            places = tuple(of_row[place] for place in places)
-        else:
-            pointer = "w"
-        return f"{pointer}[{self._index(places)}]"
+        if array != SCRATCH and len(set(places)) == 1:
+            return single(array, places[0])
+        pointer = "w" if array == SCRATCH else rows[array].array
+        return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
+
+    def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
+        """Places of the members behind the pointer to their array."""
+        if operand.array == SCRATCH:
+            return operand.places
+        of_row = rows[operand.array].places
+        return tuple(of_row[row] for row in operand.places)
 
     def _index(self, places: tuple[int, ...]) -> str:
-        step, first = steady(places), places[0]
+        """Expression of the place of member ``k``, which is the one in row ``i`` and column ``j``."""
+        grid = _grid(places, self._columns) if steady(places) is None else None
+        parts = zip(grid, "ij", strict=True) if grid else [(places, "k")]
+        terms = [self._term(part, letter) for part, letter in parts]
+        first = sum(least for least, _ in terms)
+        return " + ".join([str(first)] * (first != 0) + [text for _, text in terms if text]) or "0"
+
+    def _term(self, places: Sequence[int], letter: str) -> tuple[int, str]:
+        """The least of some places, and an expression of how far the others are from it."""
+        step, least = steady(places), min(places)
         if step is None:
-            first = min(places)
-            moved = f"{self._table(tuple(place - first for place in places))}[k]"
-        elif step == 0:
-            return str(first)
-        elif step < 0:
-            return f"{first} - k" if step == -1 else f"{first} - {-step} * k"
-        else:
-            moved = "k" if step == 1 else f"{step} * k"
-        return f"{first} + {moved}" if first else moved
+            return least, f"{self._table(tuple(place - least for place in places))}[{letter}]"
+        if step < 0:
+            letter = f"({len(places) - 1} - {letter})"
+        return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
 
     def _table(self, values: tuple[Any, ...]) -> str:
         """Name of a constant array: of numbers, or of distances."""
@@ -426,6 +470,15 @@ class _Loops:
                 text = f"{self.qualifier}const unsigned {kind} {name}[{len(values)}] = {{\n{inside}\n}};\n"
             self.defined.append(text)
         return self._found[key]
+
+
+def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
+    """Places of rows and of columns whose sums all places are, row by row; None where there are none."""
+    if columns == 1:
+        return None
+    rows, row = tuple(places[::columns]), tuple(place - places[0] for place in places[:columns])
+    alike = all(place == rows[k // columns] + row[k % columns] for k, place in enumerate(places))
+    return [rows, row] if alike else None
 
 
 def write_program(

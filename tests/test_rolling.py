@@ -108,7 +108,8 @@ def arrays_of(x):
     sorted_ones = xp.sort(xp.concat([of_table, x[12:16]]))
     truths = xp.logical_and(sorted_ones > 0.0, xp.logical_not(xp.isnan(sorted_ones)))
     counted = xp.sum(xp.where(truths, 1.0, 0.0))
-    numbers = xp.concat([turned.reshape(16), of_table, one_of, sorted_ones, xp.sqrt(xp.abs(x)), x[:3]])
+    outer = xp.sum(x[:8, None] * x[None, 8:], axis=0)
+    numbers = xp.concat([outer, turned.reshape(16), of_table, one_of, sorted_ones, xp.sqrt(xp.abs(x)), x[:3]])
     return xp.concat([numbers, xp.stack([counted, xp.asarray(3.0)])]), truths
 
 
@@ -154,6 +155,7 @@ def test_loops_in_c_have_the_bits_of_the_straight_line(tmp_path):
             code, name, parameters, lambda _, row: f"a[{row}]", lambda _, row: f"b[{row}]", arrays=places
         )
         assert ("for (" in "".join([source.functions, *source.body])) == (name == "rolled")
+        assert ("++j" in "".join([source.functions, *source.body])) == (name == "rolled")
         text += [source.functions, function_text("void", name, parameters, source.body)]
     library = compiled(tmp_path, "\n".join(text))
     found = {}
