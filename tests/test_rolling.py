@@ -108,8 +108,11 @@ def arrays_of(x):
     sorted_ones = xp.sort(xp.concat([of_table, x[12:16]]))
     truths = xp.logical_and(sorted_ones > 0.0, xp.logical_not(xp.isnan(sorted_ones)))
     counted = xp.sum(xp.where(truths, 1.0, 0.0))
+    some_known = xp.maximum(x[3:9], xp.concat([x[:3], xp.zeros(3)]))
     outer = xp.sum(x[:8, None] * x[None, 8:], axis=0)
-    numbers = xp.concat([outer, turned.reshape(16), of_table, one_of, sorted_ones, xp.sqrt(xp.abs(x)), x[:3]])
+    numbers = xp.concat(
+        [some_known, outer, turned.reshape(16), of_table, one_of, sorted_ones, xp.sqrt(xp.abs(x)), x[:3]]
+    )
     return xp.concat([numbers, xp.stack([counted, xp.asarray(3.0)])]), truths
 
 
