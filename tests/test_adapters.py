@@ -260,9 +260,11 @@ def test_without_a_measurement_filterpy_only_predicts():
             return None, np.eye(2)
 
     class Predicting(OurKalman):
-        def update(self, measurement, memory):
-            memory = kalman.predict(*memory, *self.model(measurement.interval))
-            return *memory, memory
+        def update(self, state, given):
+            mean, covariance = kalman.predict(
+                state.mean, state.covariance, *self.model(given.measurement.interval)
+            )
+            return state._replace(mean=mean, covariance=covariance)
 
     compare(Deaf, Predicting, horizon=5)
 

@@ -86,7 +86,6 @@ REFUSED = {
     "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
     "submit": (ENV, "nobody", "--out", "new/mine.json"),
-    "verify": ("missing.json",),
 }
 
 
