@@ -11,6 +11,7 @@ from filtergym.evaluation.storage.dataset import notes_of
 from test_recording import table
 
 from filtergym import evaluate, read_recording, record
+from filtergym.reports.tables.advice import reading_lines
 
 TARGET, LOOSE, ESM = (
     f"filtergym/{name}-v0" for name in ("ManeuveringTarget", "LooselyCoupledNavigation", "RadarEsmTracking")
@@ -170,6 +171,7 @@ def late(values):
     return values + 600.0 * (values >= values[30])
 
 
+STATED = {"sigma_x": np.full(60, 100.0), "sigma_y": np.full(60, 100.0)}
 NOTED = {
     "an outlier": (TARGET, plots(x=outlier), r"measurement 19 is off the track, by up to 4\d,\d+ m"),
     "an outlier of a receiver": (LOOSE, drive(fix=outlier), "measurement 20 is off the track"),
@@ -177,6 +179,11 @@ NOTED = {
         ESM,
         echoes(range=lambda r: r + 4.0 * (outlier(r) - r)),
         "measurement 20 is off the track",
+    ),
+    "a target that stands": (
+        TARGET,
+        untold(plots(x=lambda x: x - 150.0 * TIME, y=lambda y: y - 0.02 * TIME**2)) | STATED,
+        r"all positions lie within \d\d\d m, where errors of 141 m are stated: the target stands still",
     ),
     "a value twice": (
         TARGET,
@@ -206,6 +213,14 @@ def test_what_is_noteworthy_is_said(case, tmp_path):
     assert note in notes_of(evaluate(env, ["random"], read_recording(path, env)))
     again = table(tmp_path / "again.csv", **columns)
     assert f"again: {note}" in read_recording([path, again], env).notes
+
+
+def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
+    short = {name: values[:10] for name, values in plots().items()}
+    said = [*reading_lines(read_recording(table(tmp_path / "ten.csv", **short), TARGET))]
+    assert any(line.startswith("Fewer than 30 measurements") for line in said)
+    said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
+    assert not any("guess" in line for line in said)
 
 
 @pytest.mark.parametrize(

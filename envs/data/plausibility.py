@@ -23,6 +23,8 @@ SMALLEST_STATED = 1e6
 """Times that positions scatter as stated, above which what is stated is none: motion between fixes is 1e4 at most."""
 FEWEST = 10
 """Values from which on noise is estimated."""
+STANDING = 5.0
+"""Deviations, as stated, within which a target stands for all that one sees; one error in 1e5 is larger."""
 MOST_NOTES = 10
 """Of a file; the rest is counted."""
 SPEED_UNITS = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
@@ -376,6 +378,15 @@ def _notes(
     """
     moved, steps = _length(numpy.diff(position, axis=0)), numpy.diff(time)
     step, error, notes = float(numpy.median(steps)), float(numpy.median(sigma)), []
+    half = len(position) // 2
+    extent = float(_length(position - numpy.median(position, axis=0)).max())
+    moved_on = float(numpy.linalg.norm(position[half:].mean(axis=0) - position[:half].mean(axis=0)))
+    still = extent < STANDING * error and moved_on < STANDING * error * 2.0 / math.sqrt(len(position))
+    if moving and len(position) >= FEWEST and extent > 0.0 and still:
+        notes.append(
+            f"all positions lie within {extent:.3g} m, where errors of {error:.3g} m are stated: the target stands "
+            "still, and this log tells nothing of how it moves"
+        )
     for gap in numpy.flatnonzero(steps > max(10.0 * step, 60.0)).tolist():
         where = f"between measurements {number[gap]} and {number[gap + 1]}"
         usual = 3.0 * float(numpy.median(moved)) + 6.0 * error

@@ -31,6 +31,8 @@ NEGLIGIBLE = 5e-4
 """Difference of errors that is none in the digits of a sentence."""
 FEW = 80
 """Measurements below which an advice warns."""
+FEWEST_MEASUREMENTS = 30
+"""From which on a log is more than a guess; a choice: six for each of some five parameters."""
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
@@ -106,6 +108,11 @@ def reading_lines(recording: Recording) -> Iterator[str]:
         f"{len(recording.names)} track{'s' * (len(recording.names) > 1)}{missed}, {numpy.nanmedian(steps):.3g} s apart"
         f"{', with truth' if recording.truth is not None else ''}."
     )
+    if int(recording.rows.sum()) < FEWEST_MEASUREMENTS:
+        yield (
+            f"Fewer than {FEWEST_MEASUREMENTS} measurements tell filters apart by chance alone: what follows is a "
+            "guess, and a longer log is better."
+        )
     if recording.deviations:
         units = {"azimuth_sigma": "degrees"}
         listed = ", ".join(f"{n} {v:.3g} {units.get(n, 'm')}" for n, v in recording.deviations.items())
