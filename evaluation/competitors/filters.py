@@ -15,7 +15,7 @@ import numpy
 from ...compiler.functions import map_arrays
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, Input, Likelihood
+from ...envs.contract.filter import Filter, Input, Likelihood, State
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
@@ -319,6 +319,32 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     return xp.where(before > 0.0, before, fault)
 
 
+class AroundBank(Filter[Task, Any, State]):
+    """A filter in the loop whose estimate is that of a bank; its state, a NamedTuple, has the bank's as ``bank``.
+
+    Attributes:
+        bank: what flies the loop.
+    """
+
+    bank: Any
+
+    def predict(self, state: Any, measurement: Any) -> Any:
+        """Predict in the bank."""
+        return state._replace(bank=self.bank.predict(state.bank, measurement))
+
+    def mean(self, state: Any) -> Array:
+        """That of the bank."""
+        return self.bank.mean(state.bank)
+
+    def covariance(self, state: Any) -> Array:
+        """That of the bank."""
+        return self.bank.covariance(state.bank)
+
+    def feedback(self, state: Any, measurement: Any) -> Any:
+        """That of the bank."""
+        return self.bank.feedback(state.bank, measurement)
+
+
 class LimitState(NamedTuple):
     """State of a bound in the loop."""
 
@@ -328,7 +354,7 @@ class LimitState(NamedTuple):
     """Of the bound."""
 
 
-class BoundFilter(Filter[Task, Any, LimitState]):
+class BoundFilter(AroundBank[LimitState]):
     """A bound in the loop beside a bank under the action zero.
 
     Args:
@@ -350,10 +376,6 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         """Start without the truth."""
         return self.initialise(Input(initial))
 
-    def predict(self, state: LimitState, measurement: Any) -> LimitState:
-        """Predict in the bank."""
-        return state._replace(bank=self.bank.predict(state.bank, measurement))
-
     def update(self, state: LimitState, given: Input) -> LimitState:
         """Compute the limit at this measurement."""
         own = self.own.update(state.own, given)
@@ -361,18 +383,6 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
         neutral = self.xp.zeros((*(space.shape or ()), N), dtype=dtype)
         return LimitState(self.bank.act(state.bank, given.measurement, neutral), own)
-
-    def mean(self, state: LimitState) -> Array:
-        """That of the bank."""
-        return self.bank.mean(state.bank)
-
-    def covariance(self, state: LimitState) -> Array:
-        """That of the bank."""
-        return self.bank.covariance(state.bank)
-
-    def feedback(self, state: LimitState, measurement: Any) -> Any:
-        """That of the bank."""
-        return self.bank.feedback(state.bank, measurement)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
         """The limit."""

@@ -14,10 +14,11 @@ from ...compiler.block import LANES
 from ...compiler.functions import Function, Specialised, leaves, map_arrays
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
-from ...envs.contract.filter import Filter, Input
+from ...envs.contract.filter import Input
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
 from ...envs.engine.compiled import CompiledModel, warn_of
+from .filters import AroundBank
 from .kinds import Policy, says_traceable
 
 
@@ -135,7 +136,7 @@ class Steered(NamedTuple):
     """Of the policy."""
 
 
-class SteeredFilter(Filter[Any, Any, Steered]):
+class SteeredFilter(AroundBank[Steered]):
     """A bank closed by a policy.
 
     Args:
@@ -152,27 +153,11 @@ class SteeredFilter(Filter[Any, Any, Steered]):
         """Start the bank; the policy begins at its first decision."""
         return Steered(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
-    def predict(self, state: Steered, measurement: Any) -> Steered:
-        """Predict in the bank."""
-        return state._replace(bank=self.bank.predict(state.bank, measurement))
-
     def update(self, state: Steered, given: Input) -> Steered:
         """Ask the policy where a decision is due, and apply its action."""
         observation = self.model.observe(Episode(None, given.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
         return Steered(self.bank.act(state.bank, given.measurement, action), decisions)
-
-    def mean(self, state: Steered) -> Array:
-        """That of the bank."""
-        return self.bank.mean(state.bank)
-
-    def covariance(self, state: Steered) -> Array:
-        """That of the bank."""
-        return self.bank.covariance(state.bank)
-
-    def feedback(self, state: Steered, measurement: Any) -> Any:
-        """That of the bank."""
-        return self.bank.feedback(state.bank, measurement)
 
     def records(self, state: Steered, measurement: Any) -> dict[str, Array]:
         """Those of the bank."""
