@@ -18,11 +18,13 @@ from ...evaluation.running.metrics import chi_square_band
 from ...evaluation.statistics.innovations import received
 from ..tables.advice import (
     COLUMNS,
+    PRICES,
     ParameterText,
     advice_rows,
     parameter_name,
     parameter_size,
     parameter_text,
+    price_cells,
     verdict,
 )
 from ..tables.results import Settings
@@ -69,6 +71,8 @@ def advice_html(
         parameters=list(_parameters(advice, advice.fitted.name)),
         rows=list(advice_rows(advice, learned)),
         columns=[title.replace("-\n", "") for title in COLUMNS],
+        price_columns=list(PRICES),
+        prices=_prices(advice, learned),
         families=[
             (name, list(_parameters(advice, name))) for name in advice.fits if name not in advice.diverging
         ],
@@ -94,6 +98,13 @@ def advice_html(
 def _shown(advice: Advice) -> list[str]:
     """Who is drawn: the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
+
+
+def _prices(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
+    """What an update of each filter in the table costs; empty where it is known of none."""
+    names = [row.competitor.name for row in advice_rows(advice, learned)]
+    known = any(advice.prices[name] for name in names)
+    return [(name, price_cells(advice.prices[name])) for name in names] if known else []
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:

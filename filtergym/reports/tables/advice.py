@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy
 from rich.table import Table
 
-from ...baselines.advice import APART, Advice, Competitor
+from ...baselines.advice import APART, Advice
 from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
+from ...baselines.judgement import Competitor
 from ...baselines.table import Tunable
 from ...envs.data.recording import Recording
 from ...evaluation.statistics.bootstrap import Estimate
@@ -27,6 +28,13 @@ NAME_WIDTH = 16
 """Columns of a name; longer ones go on below."""
 COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
 """Of the table, and how wide they are at least, so that no number is cut."""
+PRICES = {
+    "operations": "operations",
+    "state, bytes": "state_bytes",
+    "weights, bytes": "weight_bytes",
+    "stack, bytes": "stack_bytes",
+}
+"""Columns of what an update costs, and the parts of a price."""
 NEGLIGIBLE = 5e-4
 """Difference of errors that is none in the digits of a sentence."""
 FEW = 80
@@ -79,7 +87,11 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
-    rest = [c for c in advice.competitors if c not in keep]
+    rest = []
+    for each in advice.competitors:  # a filter that answers as another does in this log needs no row
+        same = (c for c in [*keep, *rest] if c[3:7] == each[3:7])
+        if each not in keep and (math.isnan(each.log_likelihood) or next(same, None) is None):
+            rest.append(each)
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
     for one in [c for c in advice.competitors if c in keep]:
@@ -92,6 +104,25 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
             _interval(one.correlation, "+.2f"),
         )
         yield Row(one, _label(advice, one), cells)
+
+
+def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
+    """Say what an update of each filter of :func:`advice_table` costs; None where it is known of none."""
+    prices = {row.competitor.name: advice.prices[row.competitor.name] for row in advice_rows(advice, learned)}
+    if not any(prices.values()):
+        return None
+    table = Table(title="What an update costs in C, in double precision", title_justify="left")
+    table.add_column("filter", no_wrap=True)
+    for title in PRICES:
+        table.add_column(title, justify="right")
+    for name, price in prices.items():
+        table.add_row(name, *price_cells(price))
+    return table
+
+
+def price_cells(price: Mapping[str, int] | None) -> tuple[str, ...]:
+    """Cells of a price, in the order of ``PRICES``."""
+    return tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
@@ -227,6 +258,8 @@ def verdict(advice: Advice) -> str:
                 text += " That is beyond chance: a longer log may turn the choice."
         return text
     name = f"Take {one.name}, with the parameters below"
+    if one.gain.low <= 0.0 and not advice.tunables[one.name].anchored:
+        name += f", as good as {rival} and cheaper"
     if math.isnan(one.relative_error.value) and advice.anchor is not None and one.name == advice.anchor.name:
         return f"{name}, by the second sensor: there is no truth to say how much it gains."
     if math.isnan(one.relative_error.value):
@@ -238,7 +271,12 @@ def verdict(advice: Advice) -> str:
     if one.relative_error.low > 0.0:
         text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
     elif one.relative_error.low <= 0.0 <= one.relative_error.high:
-        text += f" The difference may be chance: {rival} is good enough."
+        costs = [advice.prices[each] for each in (rival, one.name)]
+        text += " The difference may be chance"
+        if costs[0] and costs[1] and costs[0]["operations"] > costs[1]["operations"]:
+            text += f"; {rival} takes {costs[0]['operations']:,} operations an update for {costs[1]['operations']:,}."
+        else:
+            text += f": {rival} is good enough."
     return text
 
 
@@ -341,13 +379,18 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 
 def _dearer(advice: Advice) -> Iterator[str]:
-    """What a family of more computation would bring."""
-    if advice.dearer is not None:
-        name, gain = advice.dearer
-        yield (
-            f"{advice.fitted.name} is the simplest of the fitted ones that are as likely within chance: {name} would "
-            f"bring {_interval(gain, '+.3f')} nats per measurement and takes more computation."
-        )
+    """What the likeliest would bring, where something cheaper is as good."""
+    if advice.dearer is None or math.isnan(advice.dearer[1].value):
+        return
+    name, gain = advice.dearer
+    one, other = (advice.prices[each] for each in (advice.advised.name, name))
+    costs = ""
+    if one is not None and other is not None:
+        costs = f" and takes {other['operations']:,} operations an update for {one['operations']:,}"
+    yield (
+        f"{name} is likelier where filters were chosen: it would bring {_interval(gain, '+.3f')} nats per measurement"
+        f"{costs}."
+    )
 
 
 def _outliers(advice: Advice) -> Iterator[str]:
