@@ -139,6 +139,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
         f"{len(recording.names)} track{'s' * (len(recording.names) > 1)}{missed}, {numpy.nanmedian(steps):.3g} s apart"
         f"{', with truth' if recording.truth is not None else ''}."
     )
+    yield from _extent(recording)
     if int(recording.rows.sum()) < FEWEST_MEASUREMENTS:
         yield (
             f"Fewer than {FEWEST_MEASUREMENTS} measurements tell filters apart by chance alone: what follows is a "
@@ -153,6 +154,23 @@ def reading_lines(recording: Recording) -> Iterator[str]:
         else:
             yield f"Errors as stated: {listed} (median of {source})."
     yield from (note for note in recording.notes if "no column" not in note)
+
+
+def _extent(recording: Recording) -> Iterator[str]:
+    """Say how far and how fast the positions move, which shows a wrong unit to who knows the target."""
+    position = recording.measurements.get("position")
+    if position is None:
+        return
+    there = numpy.isfinite(position).all(axis=-1) & (recording.measurements["available"] > 0.0)
+    found = []
+    for own, seconds, known in zip(position, recording.seconds, there, strict=True):
+        step = max(1, int(known.sum()) // 20)  # far apart, noise is no speed
+        moved = numpy.linalg.norm(numpy.diff(own[known][::step], axis=0), axis=-1)
+        found.append(moved / numpy.diff(seconds[known][::step]))
+    speeds = numpy.concatenate(found)
+    if len(speeds):
+        width, height = numpy.ptp(position[there], axis=0)
+        yield f"Positions span {width:,.4g} m by {height:,.4g} m, at {numpy.median(speeds):.3g} m/s in the median."
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
