@@ -169,8 +169,8 @@ def _extent(recording: Recording) -> Iterator[str]:
         found.append(moved / numpy.diff(seconds[known][::step]))
     speeds = numpy.concatenate(found)
     if len(speeds):
-        width, height = numpy.ptp(position[there], axis=0)
-        yield f"Positions span {width:,.4g} m by {height:,.4g} m, at {numpy.median(speeds):.3g} m/s in the median."
+        width, height = (f"{x:,.0f}" if x >= 100.0 else f"{x:.3g}" for x in numpy.ptp(position[there], axis=0))
+        yield f"Positions span {width} m by {height} m, at {numpy.median(speeds):.3g} m/s in the median."
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
