@@ -2,8 +2,8 @@
 
 For each pair of files: who is advised, its error on the second file as saved, the best shipped filter there in
 hindsight, and a Kalman filter of constant velocity fitted by maximum likelihood in a few lines, without and with a
-gate. The error is of positions where the second file holds the truth, else of predicted measurements. Seconds are of the
-processor: until the first verdict, and until the end.
+gate. The error is of positions where the second file holds the truth, else of predicted measurements. Seconds are of
+the processor: until the first verdict, and until the end.
 
 Example: python benchmarks/log_advice.py first.csv:second.csv
 """
