@@ -55,7 +55,7 @@ def episodes(id, count, steps, **keywords):
     draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
     truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
     # A loop that is closed by the initial estimate, as no filter is here.
-    found, feedback = [], model.task.feedback(initial.mean, initial) if id in (AIRCRAFT, SATELLITES) else None
+    found, feedback = [], model.task.feedback(initial.mean, initial.covariance, initial)
     for _ in range(steps):
         noise = (
             rng.normal(size=(model.task.noise.normals, count)),

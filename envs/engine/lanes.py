@@ -21,7 +21,7 @@ from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode, Model
-from ..contract.observation import Array
+from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
@@ -128,14 +128,9 @@ class ModelStepper:
         """What is shown where it was computed, else None."""
         return self._shown
 
-    def show_means(self, fields: Sequence[int], means: Array) -> None:
-        """Show other values of some fields, ``(fields, width)``."""
-        model, xp = self.model, self.model.task.xp
-        fresh = model.task.constant([[1.0 if i in fields else 0.0] for i in range(len(model.fields))])
-        spread = [
-            means[list(fields).index(i)] if i in fields else 0.0 * means[0] for i in range(len(model.fields))
-        ]
-        self._shown = xp.where(fresh > 0.0, xp.stack(spread), self.observation_by_field())
+    def show(self, observation: Array) -> None:
+        """Show something else, ``(fields, width)``."""
+        self._shown = observation
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -186,9 +181,7 @@ class Lanes:
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
         self._lengths = numpy.full(count, self.decisions_per_episode)
         """Decisions of each lane's episode."""
-        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
-        self._averaged = averaged if task.decision_interval > 1 else []
-        """Fields that are shown as their means over a decision."""
+        self._means = DecisionMeans(model.fields, task.decision_interval)
 
     # --- episodes
 
@@ -269,10 +262,10 @@ class Lanes:
             for stepper in steppers:
                 stepper.step(self.noise)
             answers.append((own.report(), steppers[1].report() if self.beside else None))
-            if self._averaged:
-                total = total + own.observation_by_field()[self._averaged]
-        if self._averaged:
-            own.show_means(self._averaged, total / self.task.decision_interval)
+            if self._means.columns:
+                total = self._means.add(total, own.observation_by_field())
+        if self._means.columns:
+            own.show(self._means.show(own.observation_by_field(), total, self.task.xp))
         self.decisions += 1
         return answers
 
@@ -348,7 +341,7 @@ class Lanes:
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
-                averaged = i == 0 and self._averaged
+                averaged = i == 0 and self._means.columns
                 new.load(old.episode(), old.observation_by_field().copy() if averaged else None)
 
     @property

@@ -264,9 +264,9 @@ class Stepper:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
 
-    def show_means(self, fields: Sequence[int], means: numpy.ndarray) -> None:
-        """Show other values of some fields, ``(fields, width)``."""
-        self._shown[:, fields] = means.T
+    def show(self, observation: numpy.ndarray) -> None:
+        """Show something else, ``(fields, width)``."""
+        self._shown[...] = observation.T
 
     def observation(self, count: int) -> numpy.ndarray:
         """Observation of the first lanes, batch first; the caller may keep it."""

@@ -168,8 +168,8 @@ class FaultHypothesesBank(HypothesisBank):
         )
 
     def feedback(self, state: SteeredHypotheses, measurement: Any) -> Array | None:  # type: ignore[override]
-        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        return self.task.feedback(state.mean, measurement)
+        """None: the tracking loops expect what follows from the estimate."""
+        return None
 
     def predict(  # type: ignore[override]
         self, state: SteeredHypotheses, measurement: Measurement

@@ -107,8 +107,8 @@ class KalmanNetBank(RobustBank):
         return Prediction(mean, pack(covariance), state.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        return self.task.feedback(state.mean, measurement)
+        """None: the tracking loops expect what follows from the estimate."""
+        return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update by the gain that was answered."""

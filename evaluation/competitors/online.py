@@ -15,6 +15,7 @@ import numpy
 
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
+from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer
 from ...envs.data.recorded_world import measure_examples
 from ...envs.engine.stepper import filter_stepper
@@ -188,8 +189,7 @@ class OnlineFilter:
         self.names = tuple(component.name for component in self.task.components)
         self.units = tuple(component.unit for component in self.task.components)
         interval = self.task.decision_interval
-        averaged = [i for i, f in enumerate(self.model.fields) if f.over_interval == "mean"]
-        self._interval, self._averaged = interval, averaged if interval > 1 else []
+        self._interval, self._means = interval, DecisionMeans(self.model.fields, interval)
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
         self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
         of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
@@ -454,8 +454,11 @@ class OnlineFilter:
         """Ask the policy where a decision is due; the action is ``(A, width)`` or ``(width,)``."""
         assert self._policy is not None
         number = state.measurements - 1
-        if self._averaged:
-            observation, state = self._average(observation, state, number)
+        if number:
+            state = state._replace(total=self._means.add(state.total, observation))
+        if number and number % self._interval == 0:
+            observation = self._means.show(observation, state.total, numpy)
+            state = state._replace(total=0.0)
         if number % self._interval == 0:
             shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(shown, state.policy, state.fresh)
@@ -463,19 +466,6 @@ class OnlineFilter:
         action = state.action
         turned = action.T if action.ndim == 2 else action
         return state, numpy.ascontiguousarray(turned[..., self._pad])
-
-    def _average(
-        self, observation: numpy.ndarray, state: OnlineState, number: int
-    ) -> tuple[numpy.ndarray, OnlineState]:
-        """Show means over the measurements since the last decision."""
-        if number == 0:
-            return observation, state
-        total = state.total + observation[self._averaged]
-        if number % self._interval:
-            return observation, state._replace(total=total)
-        observation = observation.copy()
-        observation[self._averaged] = total / self._interval
-        return observation, state._replace(total=0.0)
 
     def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
         cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
