@@ -231,7 +231,7 @@ def test_of_satellites_the_noise_of_the_motion_holds_until_the_next_measurement(
     for measurement in measurements:
         before, state = state, bank.predict(state, measurement)
         for i in range(8):
-            a = before.last_action[names.index("manoeuvre"), i]
+            a = before.action[names.index("manoeuvre"), i]
             motion = gnss_ins.singer_model(
                 p.sampling_interval, p.singer_alpha, p.singer_sigma * satellites.MANOEUVRE_RANGE**a
             )

@@ -25,7 +25,7 @@ from ..drawing.rendering import (
     grown,
 )
 from .banks import NOISES, Augmented, Schemes, Steered
-from .hypotheses import SteeredBank
+from .hypotheses import SteeredFaults
 from .task import LooselyCoupledNavigation
 
 TRACK = (0.06, 0.075, 0.43, 0.80)
@@ -69,7 +69,7 @@ class LooselyCoupledNavigationPicture(Picture):
             values["innovation"] = math.nan if missing else normalised[0, 0]
             for name, action in zip(NOISES, filters.action[:, 0], strict=True):
                 values[f"noise.{name}"] = action
-        elif isinstance(filters, SteeredBank):
+        elif isinstance(filters, SteeredFaults):
             values["innovation"] = math.nan if missing else normalised[0, 0]
             probabilities = filters.probabilities[:, 0]
             values["kind.modelled"], values["kind.pulled off"] = probabilities[0], probabilities[-2:].sum()

@@ -124,7 +124,7 @@ class HypothesesBank(SteeredBank, RadarBank):
         """Start where the estimator starts."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         groups = self.group(self.xp.concat([table.probability for table in own.track]))
-        action = 0.0 * (self.log_reach + none[0])
+        action = self.xp.stack([none[0]] * len(self.own.settings))
         return Steered(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:

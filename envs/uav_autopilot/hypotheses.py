@@ -136,7 +136,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
         return SteeredLevels(
             own=own,
             likelihood=own.likelihood,
-            action=0.0 * (self.log_reach + none),
+            action=self.xp.stack([none] * len(self.own.settings)),
             innovation=zeros,
             nis=none + 1.0,
             mean_innovation=zeros,
