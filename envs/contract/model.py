@@ -141,7 +141,9 @@ class Model:
         return self.filter.update(state, Input(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop or a recording."""
+        if self.task.recording is not None:
+            return None
         own = self.filter.feedback(state, measurement)
         if own is not None:
             return own
