@@ -33,7 +33,7 @@ Arrays inside a task have the batch as their last axis and belong to the namespa
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
 in place.
 
-A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Filter.feedback`
+A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Task.feedback`
 returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
 """
 
@@ -284,25 +284,16 @@ class Task(ABC):
             return numpy.full(uniforms.shape[1], self.horizon)
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
-    def feedback(self, mean: Array, measurement: Any) -> Any:
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
         """Report what an estimate gives back to the world; None in an open loop. A filter may give back something
-        else, see :meth:`Filter.feedback`.
+        else, see :meth:`.Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.
+            covariance: that is reported for it, ``(C, C, N)``.
             measurement: that it has taken in, or the initial estimate.
         """
         return None
-
-    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Any:
-        """Report what a filter gives back to the world, by default what follows from its mean (:meth:`feedback`).
-
-        Args:
-            filter: a :class:`~.filter.Filter` that does not say it itself.
-            state: its state, see :meth:`.Filter.feedback`.
-            measurement: that it has taken in, or the initial estimate.
-        """
-        return self.feedback(filter.mean(state), measurement)
 
     def records(self, model: Any, episode: Any, kept: dict[str, Array]) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement, beside what filter and world report; here nothing.

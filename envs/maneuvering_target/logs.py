@@ -12,10 +12,10 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.live_input import Feed
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..data.plausibility import check_bearings, scatter_of
 from ..data.recorded_tables import Columns
+from ..data.recorded_world import Feed
 from ..data.recording import Recording
 from .parameters import ManeuveringTargetParameters
 

@@ -219,7 +219,7 @@ class TightlyCoupledNavigation(Task):
             self.xp.take(self._satellite_velocity, row, axis=2),
         )
 
-    def feedback(self, mean: Array, measurement: Any) -> Array | None:
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array | None:
         """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""
         if not self.parameters.aperture:
             return None

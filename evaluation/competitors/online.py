@@ -15,9 +15,10 @@ import numpy
 
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
+from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer
-from ...envs.data.recorded_world import measure_examples
-from ...envs.engine.stepper import filter_stepper
+from ...envs.engine.episode_noise import MeasurementRow
+from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .filters import find_fault, put_in_loop
@@ -173,10 +174,8 @@ class OnlineFilter:
         tracks = check_integer("tracks", tracks, 1)
         self.name, self.tracks, self.watch, self._lag = name, tracks, watch, _check_lag(lag)
         self.task = model.task
-        initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
-        if self.task.recording.second_sensor:
-            measurement = self.task.world.add_recorded_fields(measurement)
-        self.input = self.task.live_input(self.task, initial, measurement, tracks)
+        world: Any = self.task.world
+        self.input = self.task.live_input(self.task, world.initial, world.measurement, tracks)
         self._policy: SteppingPolicy | None = None
         if kind == "policy":
             self._policy = SteppingPolicy(
@@ -188,10 +187,11 @@ class OnlineFilter:
         self.names = tuple(component.name for component in self.task.components)
         self.units = tuple(component.unit for component in self.task.components)
         interval = self.task.decision_interval
-        averaged = [i for i, f in enumerate(self.model.fields) if f.over_interval == "mean"]
-        self._interval, self._averaged = interval, averaged if interval > 1 else []
+        self._interval, self._means = interval, DecisionMeans(self.model.fields, interval)
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
+        self._stepper = make_stepper(self.model, report_estimate, len(self._pad))
+        self._stepper.take(numpy.zeros((len(self._pad), *(self.model.action_space.shape or ()))))
+        self._measured = MeasurementRow(world.measurement, len(self._pad))
         of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
@@ -380,11 +380,12 @@ class OnlineFilter:
         measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
         stepper = self._stepper
-        stepper.predict(self._padded(measurement))
-        action = numpy.zeros(stepper.width, dtype=numpy.int64)
+        self._measured.put(self._padded(measurement))
+        stepper.arrive(self._measured)
         if self._policy is not None:
-            after, action = self._decide(after, stepper.observe())
-        stepper.update(action)
+            after = self._decide(after, stepper.observation_by_field())
+            stepper.take(after.action[self._pad])
+        stepper.answer()
         self._state = after
         return self._estimate(at, stepper.report())
 
@@ -415,7 +416,7 @@ class OnlineFilter:
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(
             state._replace(
-                filter=self._stepper.state,
+                filter=self._stepper.filter_state,
                 python=None if own is None else (own.memory, own.step_number),
                 watch=None if self.watch is None else self.watch.memory,
             )
@@ -445,37 +446,25 @@ class OnlineFilter:
         self._go_on(state)
 
     def _go_on(self, state: OnlineState) -> None:
-        self._stepper.state = state.filter
+        self._stepper.filter_state = state.filter
         self._state = state._replace(filter=None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> tuple[OnlineState, numpy.ndarray]:
-        """Ask the policy where a decision is due; the action is ``(A, width)`` or ``(width,)``."""
+    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
+        """Ask the policy where a decision is due."""
         assert self._policy is not None
         number = state.measurements - 1
-        if self._averaged:
-            observation, state = self._average(observation, state, number)
+        if number:
+            state = state._replace(total=self._means.add(state.total, observation))
+        if number and number % self._interval == 0:
+            observation = self._means.show(observation, state.total, numpy)
+            state = state._replace(total=0.0)
         if number % self._interval == 0:
             shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(shown, state.policy, state.fresh)
             state = state._replace(policy=memory, action=action, fresh=numpy.zeros(self.tracks, dtype=bool))
-        action = state.action
-        turned = action.T if action.ndim == 2 else action
-        return state, numpy.ascontiguousarray(turned[..., self._pad])
-
-    def _average(
-        self, observation: numpy.ndarray, state: OnlineState, number: int
-    ) -> tuple[numpy.ndarray, OnlineState]:
-        """Show means over the measurements since the last decision."""
-        if number == 0:
-            return observation, state
-        total = state.total + observation[self._averaged]
-        if number % self._interval:
-            return observation, state._replace(total=total)
-        observation = observation.copy()
-        observation[self._averaged] = total / self._interval
-        return observation, state._replace(total=0.0)
+        return state
 
     def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
         cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
@@ -586,7 +575,7 @@ class OnlineFilter:
             ) from None
         old = self._running()
         return old._replace(
-            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
+            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.filter_state),
             input=select_nested(chosen, begun.input, old.input),
             fresh=chosen | old.fresh,
             history=History(),

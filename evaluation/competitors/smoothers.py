@@ -52,7 +52,7 @@ def is_open_loop(model: Model) -> bool:
     plain = model.on_numpy()
     noise = plain.task.noise
     episode = plain.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
-    return plain.filter.feedback(episode.filter, episode.measurement) is None
+    return plain.feedback(episode.filter, episode.measurement) is None
 
 
 def check_open_loop(model: Model, name: str) -> None:
