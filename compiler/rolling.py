@@ -20,6 +20,8 @@ LEAST = 3
 """Members of a statement: fewer are statements of their own."""
 MOST = 100
 """Statements of a loop."""
+SHORTER = 1.5
+"""Straight statements that are as long, compiled, as a statement in a loop with its tables."""
 SCRATCH, CONSTANTS, TURN = -1, -2, -3
 """In place of an argument: the scratch array, the constants, and what a statement of the same loop has computed in the
 same turn."""
@@ -349,6 +351,22 @@ def roll(program: Program, results: int = 0) -> Rolled:
         results: first results that are written before any other input than theirs is read.
     """
     return _Roller(program, results).finish()
+
+
+def roll_where_shorter(program: Program, least: int = 0, results: int = 0) -> Rolled | None:
+    """Roll a program up where that makes less code; None: it stays a straight line.
+
+    Args:
+        program: with origins.
+        least: operations of a program that is worth it.
+        results: as :func:`roll` has it.
+    """
+    operations = sum(step.operation not in FREE for step in program.steps)
+    if operations < least or any(step.operation == "product" for step in program.steps):
+        return None
+    rolled = roll(program, results)
+    statements = sum(len(loop.body) for loop in rolled.loops)
+    return rolled if SHORTER * statements < operations + len(program.results) else None
 
 
 def steady(places: Sequence[int]) -> int | None:
