@@ -3,6 +3,7 @@
 import contextvars
 import ctypes
 import functools
+import hashlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -10,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
+
+import numpy
 
 from . import cache
 from .block import LANES, block_for, block_of
@@ -174,11 +177,9 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         binding, (_, features) = llvm(), processor()
         library = library or fastest(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
-        # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
-        steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
         has_loops = any(step.operation == "product" for step in program.steps)
         quick = quick_setting(features, has_loops)
-        made_of = repr((steps, results, list(lane_first), symbols)), _own_text()
+        made_of = _text_of(program), repr((list(lane_first), symbols)), _own_text()
         key = _key(*made_of, repr(quick))
         if key not in _CODES:
             for own in library.functions.values():
@@ -195,10 +196,10 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
                     )
 
             better = _key(*made_of, repr(OPTIMISED))
-            if cache.holds(better) or (_EAGER.get() and len(steps) < LONG):
+            if cache.holds(better) or (_EAGER.get() and len(program.steps) < LONG):
                 _CODES[key] = Code(code(OPTIMISED, better))
             else:
-                optimise = functools.partial(code, OPTIMISED, better) if len(steps) < LONG else None
+                optimise = functools.partial(code, OPTIMISED, better) if len(program.steps) < LONG else None
                 _CODES[key] = Code(code(quick, key), optimise)
         return _CODES[key]
 
@@ -223,6 +224,18 @@ def native_text(text: str, signature: Any = NATIVE) -> Any:
 def _key(*texts: str) -> str:
     """Name of the code that is made of some texts for this processor."""
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
+
+
+def _text_of(program: Program) -> str:
+    """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
+    and other numbers leave it as it is.
+    """
+    operations = " ".join([step[0] for step in program.steps])
+    arguments = numpy.fromiter(
+        (number for step in program.steps for number in (len(step[1]), *step[1], step[2])), dtype=numpy.int64
+    )
+    results = numpy.array(program.results, dtype=numpy.int64)
+    return operations + hashlib.sha256(arguments.tobytes() + results.tobytes()).hexdigest()
 
 
 @functools.cache

@@ -338,22 +338,22 @@ class Graph:
         """
         seen: set[int] = set()
         order: list[int] = []
-        operations, arguments = self.operations, self.arguments
+        operations, arguments, add, finish = self.operations, self.arguments, seen.add, order.append
         for root in wanted:
             waiting = [root]
+            pop, wait, wait_all = waiting.pop, waiting.append, waiting.extend
             while waiting:
-                node = waiting.pop()
+                node = pop()
                 if node < 0:  # its parts are there
-                    order.append(~node)
+                    finish(~node)
                 elif node not in seen:
-                    seen.add(node)
+                    add(node)
                     name = operations[node]
                     if name == "input" or name == "constant":
-                        order.append(node)
+                        finish(node)
                         continue
-                    waiting.append(~node)
-                    parts = self.parts(node) if name in OTHERS else arguments[node]
-                    waiting.extend(parts[::-1])
+                    wait(~node)
+                    wait_all(self.parts(node)[::-1] if name in OTHERS else arguments[node][::-1])
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
@@ -418,8 +418,9 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     starts = dict(zip(tables, numpy.cumsum([len(scalars), *lengths]).tolist(), strict=False))
     sizes = dict(zip(tables, lengths, strict=True))
     steps = []
+    operations, given, logical, make = graph.operations, graph.arguments, graph.logical, tuple.__new__
     for node in order:
-        name, arguments = graph.operations[node], graph.arguments[node]
+        name, arguments = operations[node], given[node]
         if name == "constant":
             arguments = (scalar[node],)
         elif name == "take":
@@ -430,7 +431,7 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
             arguments = (arguments[0], place[arguments[1]])
         elif name != "input":
             arguments = tuple([place[argument] for argument in arguments])
-        steps.append(Step(name, arguments, graph.logical[node]))
+        steps.append(make(Step, (name, arguments, logical[node])))  # Step itself takes twice as long
     values: list[Any] = [graph.values[node] for node in scalars]
     constants = numpy.concatenate(
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
