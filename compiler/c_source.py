@@ -516,7 +516,7 @@ def write_program(
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
     ]
-    rolled = None if arrays is None else roll_where_shorter(program, 0, results if between else 0)
+    rolled = None if arrays is None else roll_where_shorter(program, results if between else 0)
     if arrays is not None and rolled is not None:
         loops = _Loops(program, name, read, write, arrays, scalar, tables, qualifier)
         blocks, before = _packed([loops.loop(loop) for loop in rolled.loops], rolled.before)

@@ -18,8 +18,8 @@ from .parts import cut_parts, product_places, scratch_slots
 from .program import BAND, FUNCTIONS, OPERATIONS, Program
 from .rolling import roll_where_shorter
 
-LONG = 1000
-"""Operations from which on a program is computed in loops: shorter ones run faster as a straight line."""
+LONG = 5000
+"""Steps from which on loops take LLVM half the time of a straight line; shorter programs take it as long either way."""
 
 
 class _Places(NamedTuple):
@@ -108,7 +108,14 @@ class _Part(Instructions):
         self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
 
 
-def emit(program: Program, lane_first: Sequence[bool], library: Library, block: Block, part: int) -> str:
+def emit(
+    program: Program,
+    lane_first: Sequence[bool],
+    library: Library,
+    block: Block,
+    part: int,
+    loops: bool = False,
+) -> str:
     """Text of a program.
 
     Args:
@@ -117,12 +124,13 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library, block: 
         library: where functions come from; none takes more lanes than the block has.
         block: lanes that are computed at a time.
         part: statements of a part: steps that are computed, results that are written.
+        loops: whether a long program is computed in loops where they are shorter.
 
     Raises:
         KeyError: for a function that the library lacks.
     """
     text = [*_declarations(program, library, block)]
-    rolled = roll_where_shorter(program, LONG)
+    rolled = roll_where_shorter(program) if loops and len(program.steps) >= LONG else None
     if rolled is None:
         functions, slots = _parts(program, lane_first, block, part)
     else:

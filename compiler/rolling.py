@@ -386,17 +386,16 @@ def roll(program: Program, results: int = 0) -> Rolled:
     return _Roller(program, results).finish()
 
 
-def roll_where_shorter(program: Program, least: int = 0, results: int = 0) -> Rolled | None:
+def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
     """Roll a program up where that makes less code; None: it stays a straight line.
 
     Args:
         program: with origins.
-        least: operations of a program that is worth it.
         results: as :func:`roll` has it.
     """
-    operations = sum(step.operation not in FREE for step in program.steps)
-    if operations < least or any(step.operation == "product" for step in program.steps):
+    if any(step.operation == "product" for step in program.steps):
         return None
+    operations = sum(step.operation not in FREE for step in program.steps)
     rolled = roll(program, results)
     statements = sum(len(loop.body) for loop in rolled.loops)
     return rolled if SHORTER * statements < operations + len(program.results) else None
