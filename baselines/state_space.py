@@ -10,7 +10,8 @@ import numpy
 from ..envs.contract.filter import Filter, Initial, Input, Likelihood, Track
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
-from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
+from ..envs.linear.equations import Equations
+from ..envs.linear.state_space import Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
@@ -95,9 +96,8 @@ class Extended(Filter[StateSpace, Measurement, Track]):
 
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
-        interval = given.measurement.interval
-        mean, carried = self.equations.carry(state.mean, state.covariance, interval)
-        Q = self.factor * self.equations.process_noise(interval)
+        mean, carried = self.equations.carry(state.mean, state.covariance, given.measurement)
+        Q = self.factor * self.equations.process_noise(mean, given.measurement)
         result = _update(self.equations, mean, carried + Q, self.R, given.measurement, self.xp)
         return Track(
             result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
@@ -117,7 +117,7 @@ class Unscented(Extended):
 
     def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
         super().__init__(task, process_noise, measurement_noise)
-        usual = self.equations.model.process_noise(task.parameters.sampling_interval)
+        usual = task.definition.usual_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Track:
@@ -127,11 +127,11 @@ class Unscented(Extended):
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update by sigma points."""
         measurement = given.measurement
-        interval = measurement.interval
         mean, spread = unscented.transform(
-            state.mean, state.covariance, lambda x: self.equations.move(x, interval)
+            state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
         )
-        Q = self.factor * self.equations.process_noise(interval)
+        spread = spread + self.equations.input_noise(state.mean, measurement)
+        Q = self.factor * self.equations.process_noise(mean, measurement)
         z, h = _numbers(measurement, self.xp), self.equations.measure
         result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
@@ -182,8 +182,8 @@ class KnownModel:
         xp, chosen = self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
-            mean, carried = equations.carry(*memory, measurement.interval)
-            P = carried + truth.process_noise * equations.process_noise(measurement.interval)
+            mean, carried = equations.carry(*memory, measurement)
+            P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = truth.measurement_noise * equations.R[:, :, None]
             result = _update(equations, mean, P, R, measurement, xp)
             held = truth.hypothesis == float(j)
