@@ -66,9 +66,7 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
     return model
 
 
-def _motion(
-    f: Function, timed: bool, around: Surroundings
-) -> tuple[VectorFunction, VectorFunction | None]:
+def _motion(f: Function, timed: bool, around: Surroundings) -> tuple[VectorFunction, VectorFunction | None]:
     """f, and where an input has noise f as a function of the inputs."""
     n, p = len(around.mean), len(around.inputs)
     takes = further_arguments(f)

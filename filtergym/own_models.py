@@ -108,7 +108,9 @@ def state_space(
     inputs = _inputs(inputs)
     around = Surroundings(mean, interval, inputs)
     if inputs and not any("u" in further_arguments(one["f"]) for one in given):
-        raise ValueError(f"there are inputs, {', '.join(inputs)}, and f does not take u: write f(x, u) or f(x, dt, u)")
+        raise ValueError(
+            f"there are inputs, {', '.join(inputs)}, and f does not take u: write f(x, u) or f(x, dt, u)"
+        )
     world = tuple(make_model(one, around) for one in given)
     mistaken = _known("filter_model", filter_model or {})
     filters = tuple(make_model({**one, **mistaken}, around) for one in given) if mistaken else world

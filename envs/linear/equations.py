@@ -195,7 +195,9 @@ class Equations:
         inputs = passed.inputs + 0.0 * x[0]
         given = self._with_passed(x, Passage(passed.interval, None))
         G = self.model.G.jacobian(self.xp.concat([inputs, given]), self.xp)
-        scaled = self.xp.stack([G[:, j] * variance for j, variance in enumerate(self._input_variances)], axis=1)
+        scaled = self.xp.stack(
+            [G[:, j] * variance for j, variance in enumerate(self._input_variances)], axis=1
+        )
         return product(scaled, transpose(G))
 
     def measure(self, x: Array) -> Array:

@@ -1,6 +1,7 @@
 r"""Known inputs of a state-space model: a current, a commanded thrust, the rates of a gyroscope.
 
-A simulation draws each as a Gauss-Markov process around its mean (Gelb, Applied Optimal Estimation (1974), section 3.6),
+A simulation draws each as a Gauss-Markov process around its mean (Gelb, Applied Optimal Estimation (1974), section
+3.6),
 
     u(k) = mean + a (u(k-1) - mean) + deviation sqrt(1 - a^2) n(k),  a = exp(-dt / correlation_time),  n(k) ~ N(0, 1)
 

@@ -31,7 +31,9 @@ class StateSpaceInput(LiveInput):
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
         names = dict.fromkeys(self.measured, "a number, in place of values")
-        held = dict.fromkeys(self.inputs, "an input that acted since the last measurement; the last one holds on")
+        held = dict.fromkeys(
+            self.inputs, "an input that acted since the last measurement; the last one holds on"
+        )
         return {**names, **held, **found}, at_start
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
@@ -80,5 +82,7 @@ class StateSpaceInput(LiveInput):
         found = numpy.where(numpy.isfinite(given), given, before)
         if not numpy.isfinite(found).all():
             lacking = self.inputs[int((~numpy.isfinite(found)).any(axis=1).argmax())]
-            raise ValueError(f"{self.task.id} needs {lacking} at the first measurement; later the last one holds on")
+            raise ValueError(
+                f"{self.task.id} needs {lacking} at the first measurement; later the last one holds on"
+            )
         return found

@@ -165,7 +165,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
     def _inputs(
         self, truth: Truth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
-        """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None where there are none."""
+        """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
         if truth.inputs is None:
             return None, None
         seconds = self.parameters.sampling_interval + 0.0 * normals[0] if interval is None else interval
