@@ -15,7 +15,7 @@ from ..envs.linear.state_space import Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
-from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain
+from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
@@ -107,9 +107,8 @@ class Extended(Filter[StateSpace, Measurement, Track]):
 def _update(
     equations: Equations, mean: Array, P: Array, R: Array, measurement: Measurement, xp: Any
 ) -> kalman.Update:
-    nu = _numbers(measurement, xp) - equations.measure(mean)
-    received = keep_received(nu, equations.measurement_matrix(mean), R, measurement.available)
-    return update_with_gain(mean, P, received, kalman_gain(P, received))
+    received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
+    return update_with_gain(mean, P, received, equations.gain(P, received))
 
 
 class Unscented(Extended):
@@ -132,8 +131,17 @@ class Unscented(Extended):
         )
         spread = spread + self.equations.input_noise(state.mean, measurement)
         Q = self.factor * self.equations.process_noise(mean, measurement)
-        z, h = _numbers(measurement, self.xp), self.equations.measure
-        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available)
+        own = self.equations
+        z, h, near = _numbers(measurement, self.xp), own.measure, own.measure(mean)
+
+        def h_near(x: Array) -> Array:
+            """Measurements of sigma points, angles near that of the mean."""
+            return near[:, None] + own.subtract(own.measure(x), near[:, None])
+
+        if own.wraps:
+            z, h = near + own.subtract(z, near), h_near
+        gates = own.within_gates if own.gated else None
+        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available, gates)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .envs.data.trajectory import Trajectory
     from .envs.engine.scenario_choice import read_recording
     from .envs.linear.inputs import Input
+    from .envs.linear.sensors import Sensor
     from .evaluation.competitors.kinds import FunctionPolicy
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
@@ -60,6 +61,7 @@ __all__ = [
     "Input",
     "Likelihood",
     "Recording",
+    "Sensor",
     "Trajectory",
     "evaluate",
     "make_policy",
@@ -79,6 +81,7 @@ MODULES = {
     "envs.engine.scenario_choice": ("read_recording",),
     "envs.data.trajectory": ("Trajectory",),
     "envs.linear.inputs": ("Input",),
+    "envs.linear.sensors": ("Sensor",),
     "evaluation.competitors.kinds": ("FunctionPolicy",),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),

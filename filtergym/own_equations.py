@@ -47,7 +47,7 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
         ValueError: for what does not, or cannot be traced.
     """
     n, f, Q = len(around.mean), given["f"], given["Q"]
-    h = _function("h", given["h"], n, None)
+    h = trace("h", given["h"], n, None)
     timed = "dt" in further_arguments(f)
     noise: numpy.ndarray | VectorFunction
     if timed != callable(Q):
@@ -56,7 +56,7 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
             f"{'f(x, dt)' if timed else 'f without dt'} and {'Q(dt)' if callable(Q) else 'Q as a matrix'}"
         )
     if timed:
-        noise = _function("Q", lambda v: _entries(Q(v[n])), 0, n * n, n + 1 + len(around.inputs))
+        noise = trace("Q", lambda v: _entries(Q(v[n])), 0, n * n, n + 1 + len(around.inputs))
     else:
         noise = check_covariance("Q", Q, n)
     motion, of_inputs = _motion(f, timed, around)
@@ -73,7 +73,7 @@ def _motion(f: Function, timed: bool, around: Surroundings) -> tuple[VectorFunct
     if "u" in takes and not p:
         raise ValueError("f takes u, and there are no inputs: name them, such as inputs=['current']")
     if not takes and not p:
-        return _function("f", f, n, n), None
+        return trace("f", f, n, n), None
 
     def call(x: Any, dt: Any, u: Any) -> Any:
         given = {"dt": dt, "u": u}
@@ -83,11 +83,11 @@ def _motion(f: Function, timed: bool, around: Surroundings) -> tuple[VectorFunct
         f = check_array("f", f, (n, n))
     further = int(timed)  # the interval stands between state and inputs, or nothing does
     of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
-    motion = _function("f", of_state, n, n, further + p)
+    motion = trace("f", of_state, n, n, further + p)
     if not any(one.noise > 0.0 for one in around.inputs.values()):
         return motion, None
     of_inputs = lambda v: call(v[p : p + n], v[p + n] if timed else None, v[:p])  # noqa: E731
-    return motion, _function("f", of_inputs, p, n, n + further)
+    return motion, trace("f", of_inputs, p, n, n + further)
 
 
 def further_arguments(function: Any) -> tuple[str, ...]:
@@ -123,9 +123,14 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
     return 0.5 * (matrix + matrix.T)
 
 
-def _function(
+def trace(
     what: str, function: Function, size: int, answers: int | None, given: int = 0
 ) -> VectorFunction:
+    """Trace a function of so many numbers, and others without a derivative; None for any number of answers.
+
+    Raises:
+        ValueError: if it cannot be traced, or answers with another number.
+    """
     if not callable(function):
         function = check_array(what, function, (answers, size))
     try:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
@@ -10,10 +10,10 @@ import numpy
 from . import register_task
 from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
-from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition
 from .envs.linear.inputs import Input
+from .envs.linear.sensors import Sensor
 from .envs.linear.state_space import (
     StateSpace,
     StateSpaceParameters,
@@ -28,11 +28,11 @@ from .own_equations import (
     check_covariance,
     further_arguments,
     make_model,
+    trace,
 )
+from .own_sensors import check_columns, find_channels, replace_sensors, sensor_columns, stack_sensors
 
-RESERVED = (RECORDING, "values", "available")
-"""Names that mean something else in a table or a measurement."""
-EQUATIONS = ("f", "h", "Q", "R")
+EQUATIONS = ("f", "h", "Q", "R", "sensors")
 TRIED = 32, 64
 """Episodes and measurements from which the unit of the reward is estimated."""
 
@@ -41,11 +41,12 @@ def state_space(
     id: str,
     *,
     f: Function,
-    h: Function,
     Q: Any,
-    R: Any,
     mean: Any,
     covariance: Any,
+    h: Function | None = None,
+    R: Any = None,
+    sensors: Mapping[str, Sensor] | None = None,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
     measured: Sequence[str] = (),
@@ -68,12 +69,13 @@ def state_space(
             functions and without branches on numbers; or a matrix ``(n, n)``. With a second argument called ``dt``
             it is the state that interval later, s: the model is timed, and measurements may come at any time. With an
             argument called ``u`` it is given the inputs ``(p,)`` that act until then.
-        h: likewise what is measured, m numbers; or a matrix ``(m, n)``.
         Q: covariance of the process noise, ``(n, n)``; of a timed model a function that returns that of an interval,
             ``Q(dt)``.
-        R: covariance of the measurement noise, ``(m, m)``, positive definite.
         mean: of the initial state, ``(n,)``.
         covariance: of the initial state, ``(n, n)``.
+        h: as f what is measured, m numbers; or a matrix ``(m, n)``.
+        R: covariance of the measurement noise, ``(m, m)``, positive definite.
+        sensors: by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``.
         measured: names of the m numbers that h returns, which are the columns of a table of yours; default: ``z1``,
@@ -81,8 +83,8 @@ def state_space(
         inputs: known inputs, each with what a simulation draws for it and the noise with which it is told; or their
             names. They are columns of a table, too.
         weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
-        filter_model: what the filters believe in place of f, h, Q or R.
-        hypotheses: further models between which the world switches, each by what differs from the first: f, h, Q, R.
+        filter_model: what the filters believe in place of f, h, Q, R, or some of the sensors.
+        hypotheses: further models between which the world switches, each by what differs from the first, likewise.
             Filters then are interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
         switching: whether the world switches; otherwise only the filters take it for possible.
@@ -102,8 +104,12 @@ def state_space(
             raise nearest("argument of state_space", parameter, allowed)
     mean = check_array("mean", mean, (None,))
     n = len(mean)
-    first = {"f": f, "h": h, "Q": Q, "R": R}
-    given = [first, *({**first, **_known("hypotheses", one)} for one in hypotheses)]
+    sensors = _sensors(sensors, (h, R, measured))
+    first = {"f": f, "h": h, "Q": Q, "R": R, "sensors": sensors}
+    given = [first, *(_replace("hypotheses", first, one) for one in hypotheses)]
+    rates = [one.interval for one in sensors.values() if one.interval is not None]
+    if rates:
+        parameters.setdefault("sampling_interval", min(rates))
     interval = float(parameters.get("sampling_interval", StateSpaceParameters.sampling_interval))
     inputs = _inputs(inputs)
     around = Surroundings(mean, interval, inputs)
@@ -111,9 +117,10 @@ def state_space(
         raise ValueError(
             f"there are inputs, {', '.join(inputs)}, and f does not take u: write f(x, u) or f(x, dt, u)"
         )
-    world = tuple(make_model(one, around) for one in given)
-    mistaken = _known("filter_model", filter_model or {})
-    filters = tuple(make_model({**one, **mistaken}, around) for one in given) if mistaken else world
+    world = tuple(make_model(_stack(one, n), around) for one in given)
+    filters = world
+    if filter_model:
+        filters = tuple(make_model(_stack(_replace("filter_model", one, filter_model), n), around) for one in given)
     if len({model.h.size for model in (*world, *filters)}) > 1:
         raise ValueError("all models must measure as many numbers")
     if len({model.timed for model in (*world, *filters)}) > 1:
@@ -123,8 +130,14 @@ def state_space(
     units = tuple(units) or ("1",) * n
     if len(names) != n or len(units) != n:
         raise ValueError(f"names and units must be {n} each, got {names!r} and {units!r}")
+    m = world[0].h.size
+    counts = [trace("h", one.h, n, None).size for one in sensors.values()] or [m]
+    channels = find_channels(sensors, counts, interval)
+    columns = dict.fromkeys(measured or [f"z{j + 1}" for j in range(m)], "")
+    columns = sensor_columns(sensors, channels) if sensors else columns
+    check_columns(measured or tuple(columns), m, inputs)
     places = components_measured(world[0].h)
-    measured = _measured(measured, world[0].h.size, inputs)
+    measures = [units[places.index(j)] if j in places else "1" for j in range(m)]
     definition = StateSpaceDefinition(
         world,
         filters,
@@ -133,8 +146,9 @@ def state_space(
         mean,
         check_covariance("covariance", covariance, n),
         numpy.full(n, 1.0 / n) if weights is None else check_array("weights", weights, (n,)),
-        {name: units[places.index(j)] if j in places else "1" for j, name in enumerate(measured)},
+        {name: unit or own for (name, unit), own in zip(columns.items(), measures, strict=True)},
         inputs,
+        channels,
     )
     if not (definition.weights >= 0.0).all() or not definition.weights.any():
         raise ValueError(f"weights must not be negative, nor all zero, got {definition.weights.tolist()}")
@@ -151,12 +165,42 @@ def state_space(
     return made
 
 
-def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a mapping, or raise ValueError for what is none of f, h, Q and R."""
-    unknown = [name for name in part if name not in EQUATIONS]
+def _sensors(sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]) -> dict[str, Sensor]:
+    """Return the sensors, empty where h, R and perhaps names of what is measured stand for them.
+
+    Raises:
+        ValueError: for neither, or both.
+    """
+    h, R, measured = others
+    if sensors is None:
+        if h is None or R is None:
+            raise ValueError("what is measured is said by h and R, or by sensors")
+        return {}
+    if h is not None or R is not None or len(measured):
+        raise ValueError("sensors say h, R and names of what is measured: leave h, R and measured out")
+    if not sensors:
+        raise ValueError("sensors must name at least one")
+    return replace_sensors(None, sensors)
+
+
+def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return equations with some in place of others, or raise ValueError for what is none of them."""
+    own = first["sensors"]
+    known = [name for name in EQUATIONS if name not in (("h", "R") if own else ("sensors",))]
+    unknown = [name for name in part if name not in known]
     if unknown:
-        raise ValueError(f"{what} says f, h, Q or R, got {unknown[0]!r}")
-    return dict(part)
+        raise ValueError(f"{what} says {', '.join(known[:-1])} or {known[-1]}, got {unknown[0]!r}")
+    if "sensors" in part:
+        part = {**part, "sensors": replace_sensors(own, part["sensors"])}
+    return {**first, **part}
+
+
+def _stack(given: dict[str, Any], size: int) -> dict[str, Any]:
+    """Put h and R of all sensors in the place of these."""
+    if not given["sensors"]:
+        return given
+    h, R = stack_sensors(given["sensors"], size)
+    return {**given, "h": h, "R": R}
 
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
@@ -168,20 +212,6 @@ def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
         if not isinstance(one, Input):
             raise ValueError(f"the input {name!r} must be an Input, got {one!r}")
     return found
-
-
-def _measured(names: Sequence[str], count: int, inputs: Iterable[str]) -> tuple[str, ...]:
-    """Names of what is measured, which can be told apart in a table, also from the inputs."""
-    names = tuple(names) or tuple(f"z{j + 1}" for j in range(count))
-    lower = [str(name).lower() for name in (*names, *inputs)]
-    if len(names) != count or len({*lower}) != len(lower) or {*lower} & {*TIME, *RESERVED, ""}:
-        raise ValueError(
-            f"measured must be {count} different names, none of them a time or an input, got {names!r}; names may not "
-            f"be {', '.join(RESERVED)} either"
-        )
-    if any(name.startswith(TRUTH) for name in lower):
-        raise ValueError(f"names of what is measured must not begin with {TRUTH}, got {names!r}")
-    return names
 
 
 def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:

@@ -17,9 +17,12 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy
 
 from ...compiler.vector_functions import VectorFunction
+from ...filters.gaussian import log_density
+from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import product, transpose
 from ..contract.observation import Array
 from .inputs import Input
+from .sensors import Channel
 
 if TYPE_CHECKING:
     from .state_space import StateSpace
@@ -88,6 +91,8 @@ class StateSpaceDefinition:
     """Units of the m numbers that are measured, by their names."""
     inputs: Mapping[str, Input]
     """Known inputs by their names, p of them."""
+    channels: tuple[Channel, ...]
+    """Sensors, of which each measures some of the m numbers; without names one for all of them."""
 
     @property
     def usual_inputs(self) -> numpy.ndarray:
@@ -128,6 +133,18 @@ class Passed(Protocol):
         """What acted in it, ``(p, N)``; None where the model has no inputs."""
 
 
+class Measured(Passed, Protocol):
+    """A measurement."""
+
+    @property
+    def values(self) -> Array:
+        """``(m, N)``."""
+
+    @property
+    def available(self) -> Array:
+        """1 where a value was received, 0 where not, ``(m, N)``."""
+
+
 class Passage(NamedTuple):
     """No more than that."""
 
@@ -150,6 +167,9 @@ class Equations:
         self._F, self._H = (
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
+        self.channels = task.definition.channels
+        self.wraps = any(channel.period for channel in self.channels)
+        self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
     def move(self, x: Array, passed: Passed) -> Array:
@@ -203,6 +223,53 @@ class Equations:
     def measure(self, x: Array) -> Array:
         """Measurement without noise, ``(m, ...)``."""
         return self._value(self.model.h, x)
+
+    def subtract(self, z: Array, predicted: Array) -> Array:
+        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
+        nu = z - predicted
+        if not self.wraps:
+            return nu
+        rows = []
+        for channel in self.channels:
+            for place in range(channel.first, channel.first + channel.count):
+                turns = 0.0 if channel.period is None else channel.period * self.xp.round(nu[place] / channel.period)
+                rows.append(nu[place] - turns)
+        return self.xp.stack(rows)
+
+    def receive(self, measurement: Measured, mean: Array, R: Array) -> Received:
+        """What was received of a measurement, as it was predicted.
+
+        Args:
+            measurement: with numbers also where nothing was received.
+            mean: predicted, ``(n, N)``.
+            R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
+        """
+        nu = self.subtract(measurement.values, self.measure(mean))
+        return keep_received(nu, self.measurement_matrix(mean), R, measurement.available)
+
+    def gain(self, covariance: Array, received: Received) -> Array:
+        """Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates, ``(n, m, N)``."""
+        if self.gated:
+            S = product(product(received.H, covariance), transpose(received.H)) + received.R
+            kept = self.within_gates(received.innovation, S)
+            received = keep_received(received.innovation, received.H, received.R, received.available * kept)
+        return kalman_gain(covariance, received)
+
+    def within_gates(self, nu: Array, S: Array) -> Array:
+        """1 for numbers of sensors whose innovation is within their gate, else 0, ``(m, N)``.
+
+        Args:
+            nu: innovation, ``(m, N)``.
+            S: its covariance, ``(m, m, N)``.
+        """
+        xp, rows = self.xp, []
+        for channel in self.channels:
+            within = 1.0 + 0.0 * nu[channel.first]
+            if channel.gate is not None:
+                _, squared = log_density(nu[channel.places], S[channel.places, channel.places])
+                within = xp.where(squared <= channel.gate**2, within, 0.0)
+            rows += [within] * channel.count
+        return xp.stack(rows)
 
     def _value(self, function: VectorFunction, x: Array) -> Array:
         flat = self.xp.reshape(x, (x.shape[0], -1))

@@ -22,6 +22,7 @@ class StateSpaceInput(LiveInput):
 
     def __init__(self, task: "StateSpace", initial: Any, measurement: Any, tracks: int) -> None:
         self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
+        self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
         self.fuses = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
@@ -30,7 +31,8 @@ class StateSpaceInput(LiveInput):
         """Return what the sensors and inputs say; the interval follows from the times."""
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
-        names = dict.fromkeys(self.measured, "a number, in place of values")
+        sensors = {channel.name: f"shape ({channel.count},)" for channel in self.groups}
+        names = {**sensors, **dict.fromkeys(self.measured, "a number")}
         held = dict.fromkeys(
             self.inputs, "an input that acted since the last measurement; the last one holds on"
         )
@@ -65,12 +67,19 @@ class StateSpaceInput(LiveInput):
         Raises:
             ValueError: where it is said twice.
         """
-        named = [name for name in self.measured if values.get(name) is not None]
-        if not named:
+        whole = ["values", *(channel.name for channel in self.groups), *self.measured]
+        named = [name for name in whole if values.get(name) is not None]
+        if named in ([], ["values"]):
             return dict(values)
-        if values.get("values") is not None:
-            raise ValueError(f"values has {named[0]} already: give one of them")
-        return {**values, "values": numpy.stack([self.read(values, name) for name in self.measured])}
+        rows = numpy.stack([self.read(values, name) for name in self.measured])
+        for channel in self.groups:
+            given, own = self.read(values, channel.name, (channel.count,)), rows[channel.places]
+            if (numpy.isfinite(given) & numpy.isfinite(own)).any():
+                raise ValueError(f"{channel.name} has {self.measured[channel.first]} already: give one of them")
+            rows[channel.places] = numpy.where(numpy.isfinite(given), given, own)
+        if "values" in named:
+            raise ValueError(f"values has {named[1]} already: give one of them")
+        return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
         """Inputs, ``(p, N)``: what came, and else what came before.

@@ -31,6 +31,7 @@ from .equations import Equations, Passage, StateSpaceDefinition
 from .inputs import InputCourses
 from .live import StateSpaceInput
 from .logs import state_space_log_format
+from .sensors import Receptions, SensorStates, silence_causes
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,12 @@ class StateSpaceParameters(TaskParameters):
     """Likewise of R."""
     availability: float = parameter(1.0, at_least=0.0, at_most=1.0)
     """Probability that a measurement is received."""
+    gaps: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Probability at a measurement that a gap of a sensor begins, in which it says nothing; of each sensor."""
+    gap_length: float = parameter(10.0, at_least=1.0)
+    """Measurements in a gap, on average."""
+    bias: float = parameter(0.0, at_least=0.0)
+    """Offset of one sensor, up or down, in standard deviations of its noise."""
     noise_decades: float = parameter(2.0, above=0.0)
     """Decades by which an action of one scales Q or R (control ``noise``)."""
     gain_factor: float = parameter(4.0, above=1.0)
@@ -68,6 +75,8 @@ class Truth(NamedTuple):
     """True R over the model's, ``(N,)``."""
     inputs: Array | None = None
     """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
+    sensors: SensorStates | None = None
+    """Where the sensors stand; None where nothing is to be remembered."""
 
 
 class Measurement(NamedTuple):
@@ -110,7 +119,9 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.normals = self.noises + self.courses.normals
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
-        self.row_uniforms = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
+        self.row_uniforms = self.drawn + self.receptions.row_uniforms
         self.places = components_measured(own.world[0].h)
 
     def _root(self, covariance: numpy.ndarray) -> Array:
@@ -132,7 +143,8 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
         inputs = self.courses.begin(normals[self.states :])
-        return Truth(state, first, *factors, inputs), Initial(mean, covariance)
+        sensors = self.receptions.begin(draws, zero)
+        return Truth(state, first, *factors, inputs, sensors), Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
         """Switch, move, measure."""
@@ -154,13 +166,36 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             moved.append(state)
             measured.append(equations.measure(state) + apply(r[:, :, None], sensors))
         state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
-        available = 1.0 + 0.0 * values
+        here = None
         if self.loses:
-            here = xp.where(uniforms[-1] < self.parameters.availability, 1.0, 0.0)
-            available = available * here
-            values = xp.where(here > 0.0, values, 0.0)
-        truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs)
-        return truth, Measurement(values, available, interval, told)
+            here = xp.where(uniforms[self.drawn - 1] < self.parameters.availability, 1.0, 0.0)
+        sensors, due = self.receptions.advance(truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :])
+        truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
+        return truth, Measurement(*self._receive(truth, values, (here, due)), interval, told)
+
+    def _receive(self, truth: Truth, values: Array, here: Sequence[Array | None]) -> tuple[Array, Array]:
+        """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
+
+        Args:
+            truth: at this measurement.
+            values: ``(m, N)``.
+            here: where something is received, ``(N,)`` or ``(m, N)`` each.
+        """
+        available = 1.0 + 0.0 * values
+        if truth.sensors is not None and truth.sensors.bias is not None:
+            values = values + truth.sensors.bias
+        if self.equations[0].wraps:
+            values = self.equations[0].subtract(values, 0.0 * values)
+        for part in here:
+            if part is not None:
+                available = available * part
+                values = self.xp.where(part > 0.0, values, 0.0)
+        return values, available
+
+    def _seconds(self, truth: Truth, interval: Array | None) -> Array:
+        """Time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
+        usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
+        return usual if interval is None else interval
 
     def _inputs(
         self, truth: Truth, interval: Array | None, normals: Array
@@ -168,8 +203,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
         if truth.inputs is None:
             return None, None
-        seconds = self.parameters.sampling_interval + 0.0 * normals[0] if interval is None else interval
-        inputs = self.courses.advance(truth.inputs, seconds, normals)
+        inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
         return inputs, self.courses.report(inputs, normals)
 
     def _interval(self, truth: Truth, uniform: Array | None) -> Array | None:
@@ -321,11 +355,18 @@ def state_space_attributes(
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]
-    jitter = Scenario(
-        "jitter", "Held out: intervals from a tenth to 1.9 times the usual.", {**defaults, "jitter": 0.9}
-    )
+    held_out = {
+        "rough": ("ten times the process noise", {"process_noise": (10.0, 10.0)}),
+        "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
+        "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
+        "biased": ("one sensor is off by three standard deviations", {"bias": 3.0}),
+    }
+    if definition.world[0].timed:
+        held_out["jitter"] = ("intervals from a tenth to 1.9 times the usual", {"jitter": 0.9})
+    several = len(definition.channels) > 1
     return {
         "definition": definition,
+        **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
         "log_format": state_space_log_format(definition, defaults),
         "components": tuple(map(Component, names, units)),
         "banks": banks,
@@ -333,15 +374,10 @@ def state_space_attributes(
         "trained_banks": {"kalman-net": KalmanNetBank},
         "scenarios": {
             "random": Scenario("random", "The model as it is given.", defaults, training=True),
-            "rough": Scenario(
-                "rough", "Held out: ten times the process noise.", {**defaults, "process_noise": (10.0, 10.0)}
-            ),
-            "noisy": Scenario(
-                "noisy",
-                "Held out: ten times the measurement noise.",
-                {**defaults, "measurement_noise": (10.0, 10.0)},
-            ),
-            **({"jitter": jitter} if definition.world[0].timed else {}),
+            **{
+                name: Scenario(name, f"Held out: {words}.", {**defaults, **changed})
+                for name, (words, changed) in held_out.items()
+            },
         },
         "paper_policy": PaperPolicy(control, (0.0,) * count),
     }

@@ -17,7 +17,7 @@ import gymnasium
 import numpy
 
 from ...filters import imm
-from ...filters.innovation_update import Received, kalman_gain, keep_received, update_with_gain
+from ...filters.innovation_update import Received, update_with_gain
 from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import outer, product, transpose
 from ..contract.controls import bank_action_space, bank_probabilities
@@ -148,9 +148,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
 
     def received(self, state: Any, measurement: Measurement, action: Array) -> Received:
         """What was received, under the noises of an action."""
-        nu = measurement.values - self.equations.measure(state.mean)
-        H = self.equations.measurement_matrix(state.mean)
-        return keep_received(nu, H, self.sensor_noise(action), measurement.available)
+        return self.equations.receive(measurement, state.mean, self.sensor_noise(action))
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
         """How likely the measurement was; NaN where nothing was received."""
@@ -184,7 +182,7 @@ class NoiseBank(KalmanBank):
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
-        result = update_with_gain(state.mean, P, received, kalman_gain(P, received))
+        result = update_with_gain(state.mean, P, received, self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
@@ -202,7 +200,7 @@ class GainBank(KalmanBank):
         received = self.received(state, measurement, action)
         P = state.covariance + self.process_noise(state.mean, measurement, action)
         factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
-        result = update_with_gain(state.mean, P, received, factor[:, None] * kalman_gain(P, received))
+        result = update_with_gain(state.mean, P, received, factor[:, None] * self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
@@ -313,7 +311,7 @@ class KalmanNetBank(KalmanBank):
         received = self.received(state, measurement, action)
         agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
         cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
-        K = kalman_gain(agile, received._replace(R=cautious))
+        K = self.equations.gain(agile, received._replace(R=cautious))
         result = update_with_gain(state.mean, state.covariance + Q, received, K)
         return state._replace(
             mean=result.mean,
@@ -433,13 +431,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         for j, equations in enumerate(self.task.believed):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factors[0] * equations.process_noise(mean, measurement)
-            received = keep_received(
-                measurement.values - equations.measure(mean),
-                equations.measurement_matrix(mean),
-                self.factors[1] * equations.R[:, :, None],
-                measurement.available,
-            )
-            updates.append(update_with_gain(mean, P, received, kalman_gain(P, received)))
+            received = equations.receive(measurement, mean, self.factors[1] * equations.R[:, :, None])
+            updates.append(update_with_gain(mean, P, received, equations.gain(P, received)))
         return state._replace(
             means=xp.stack([u.mean for u in updates], axis=1),
             covariances=xp.stack([u.covariance for u in updates], axis=2),
