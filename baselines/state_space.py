@@ -3,7 +3,8 @@ filter that is told the true model.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy
 
@@ -19,6 +20,8 @@ from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
+SENSOR_NOISE = "_noise"
+"""Ends the name of a factor on R of a sensor."""
 UNCERTAIN = 1e-9
 """Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
 
@@ -82,13 +85,16 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
+        **sensor_noises: factors on R of some sensors, by their names with ``_noise``.
     """
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
         super().__init__(task)
         self.equations = task.believed[0]
         self.factor = process_noise
-        self.R = measurement_noise * self.equations.R[:, :, None]
+        self.R = self.equations.sensor_noise(measurement_noise, _by_sensor(sensor_noises))
 
     def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
@@ -114,8 +120,10 @@ def _update(
 class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`."""
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        super().__init__(task, process_noise, measurement_noise)
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
+        super().__init__(task, process_noise, measurement_noise, **sensor_noises)
         usual = task.definition.usual_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
@@ -148,9 +156,12 @@ class Unscented(Extended):
 class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
         super().__init__(task)
-        self.bank = HypothesisBank(task, "evidence", process_noise, measurement_noise)
+        factors = process_noise, measurement_noise
+        self.bank = HypothesisBank(task, "evidence", *factors, **_by_sensor(sensor_noises))
 
     def start(self, initial: Initial) -> Mixture:
         """Start where everyone starts."""
@@ -205,11 +216,18 @@ class KnownModel:
         return *after, after, _likelihood(chosen, measurement.available, xp)
 
 
-class _Scales(NamedTuple):
-    """What is tuned: lower limit, value without tuning, upper limit."""
+def _by_sensor(noises: Mapping[str, Any]) -> dict[str, Any]:
+    """Factors by the names of the sensors."""
+    return {name.removesuffix(SENSOR_NOISE): factor for name, factor in noises.items()}
 
-    log10_process_noise: tuple[float, float, float] = (-4.0, 0.0, 4.0)
-    log10_measurement_noise: tuple[float, float, float] = (-2.0, 0.0, 2.0)
+
+def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
+    """What is tuned: lower limit, value without tuning, upper limit."""
+    channels = task.definition.channels
+    noises = (
+        [channel.name + SENSOR_NOISE for channel in channels] if len(channels) > 1 else ["measurement_noise"]
+    )
+    return {"log10_process_noise": (-4.0, 0.0, 4.0), **{f"log10_{name}": (-2.0, 0.0, 2.0) for name in noises}}
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
@@ -240,6 +258,6 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         score_paper=paper,
         score_reference="known-model",
         physical=("rmse", task.components[0].name),
-        tunable={name: tunable(make, **_Scales()._asdict()) for name, make in estimators.items()},
+        tunable={name: tunable(make, **_scales(task)) for name, make in estimators.items()},
         benchmark=(*policies, *estimators, "known-model"),
     )

@@ -123,9 +123,7 @@ def check_covariance(what: str, values: Any, size: int, definite: bool = False) 
     return 0.5 * (matrix + matrix.T)
 
 
-def trace(
-    what: str, function: Function, size: int, answers: int | None, given: int = 0
-) -> VectorFunction:
+def trace(what: str, function: Function, size: int, answers: int | None, given: int = 0) -> VectorFunction:
     """Trace a function of so many numbers, and others without a derivative; None for any number of answers.
 
     Raises:

@@ -120,7 +120,9 @@ def state_space(
     world = tuple(make_model(_stack(one, n), around) for one in given)
     filters = world
     if filter_model:
-        filters = tuple(make_model(_stack(_replace("filter_model", one, filter_model), n), around) for one in given)
+        filters = tuple(
+            make_model(_stack(_replace("filter_model", one, filter_model), n), around) for one in given
+        )
     if len({model.h.size for model in (*world, *filters)}) > 1:
         raise ValueError("all models must measure as many numbers")
     if len({model.timed for model in (*world, *filters)}) > 1:
@@ -165,7 +167,9 @@ def state_space(
     return made
 
 
-def _sensors(sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]) -> dict[str, Sensor]:
+def _sensors(
+    sensors: Mapping[str, Sensor] | None, others: tuple[Any, Any, Sequence[str]]
+) -> dict[str, Sensor]:
     """Return the sensors, empty where h, R and perhaps names of what is measured stand for them.
 
     Raises:

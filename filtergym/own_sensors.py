@@ -11,6 +11,8 @@ from .own_equations import Function, check_array, check_covariance, trace
 
 RESERVED = (RECORDING, "values", "available")
 """Names that mean something else in a table or a measurement."""
+NOISES = ("process", "measurement")
+"""What has a noise of this name beside the sensors."""
 
 
 def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[str, Sensor]:
@@ -21,6 +23,8 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
     """
     if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
         raise ValueError(f"sensors must be a mapping from names to Sensor, got {given!r}")
+    if {*given} & {*NOISES}:
+        raise ValueError(f"sensors cannot be called {' or '.join(NOISES)}, whose noises are others")
     if sensors is not None and not {*given} <= {*sensors}:
         unknown = next(name for name in given if name not in sensors)
         raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
@@ -53,7 +57,9 @@ def _numbers(h: Function, x: Any) -> Any:
     return h(x) if callable(h) else check_array("h", h, (None, len(x))) @ x
 
 
-def find_channels(sensors: Mapping[str, Sensor], counts: Sequence[int], interval: float) -> tuple[Channel, ...]:
+def find_channels(
+    sensors: Mapping[str, Sensor], counts: Sequence[int], interval: float
+) -> tuple[Channel, ...]:
     """Return the places of sensors among the numbers of a measurement.
 
     Args:

@@ -12,7 +12,7 @@ without either. Where u is known with white noise of covariance N only, what is 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy
 
@@ -220,6 +220,22 @@ class Equations:
         )
         return product(scaled, transpose(G))
 
+    def sensor_noise(self, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None) -> Array:
+        """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
+
+        Args:
+            factor: a number, or ``(N,)``.
+            of_sensors: further ones of some sensors, by their names.
+        """
+        R = factor * self.R[:, :, None]
+        if not of_sensors:
+            return R
+        rows, none = [], 0.0 * sum(of_sensors.values())  # of their shape
+        for channel in self.channels:
+            own = of_sensors.get(channel.name, 1.0) + none
+            rows += [own * R[place] for place in range(channel.first, channel.first + channel.count)]
+        return self.xp.stack(rows)
+
     def measure(self, x: Array) -> Array:
         """Measurement without noise, ``(m, ...)``."""
         return self._value(self.model.h, x)
@@ -232,7 +248,11 @@ class Equations:
         rows = []
         for channel in self.channels:
             for place in range(channel.first, channel.first + channel.count):
-                turns = 0.0 if channel.period is None else channel.period * self.xp.round(nu[place] / channel.period)
+                turns = (
+                    0.0
+                    if channel.period is None
+                    else channel.period * self.xp.round(nu[place] / channel.period)
+                )
                 rows.append(nu[place] - turns)
         return self.xp.stack(rows)
 

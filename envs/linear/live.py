@@ -75,7 +75,9 @@ class StateSpaceInput(LiveInput):
         for channel in self.groups:
             given, own = self.read(values, channel.name, (channel.count,)), rows[channel.places]
             if (numpy.isfinite(given) & numpy.isfinite(own)).any():
-                raise ValueError(f"{channel.name} has {self.measured[channel.first]} already: give one of them")
+                raise ValueError(
+                    f"{channel.name} has {self.measured[channel.first]} already: give one of them"
+                )
             rows[channel.places] = numpy.where(numpy.isfinite(given), given, own)
         if "values" in named:
             raise ValueError(f"values has {named[1]} already: give one of them")

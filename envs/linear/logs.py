@@ -133,11 +133,18 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each."""
+    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each; angles
+    by whole turns near what was predicted.
+    """
     model = definition.filters[0]
     rows = [mean]
     rows += [measurement.interval[None]] if model.timed else []
     rows += [measurement.inputs] if definition.inputs else []
     given = numpy.concatenate([numpy.reshape(row, (len(row), -1)) for row in rows])
     predicted = model.h.value(model.f.value(given, numpy), numpy).reshape(-1, *mean.shape[1:])
-    return predicted, numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
+    measured = numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
+    for channel in definition.channels:
+        if channel.period is not None:
+            turns = numpy.round((measured - predicted)[channel.places] / channel.period)
+            measured[channel.places] -= channel.period * turns
+    return predicted, measured

@@ -56,7 +56,9 @@ class Sensor:
         if self.interval is not None and not 0.0 < self.interval < math.inf:
             raise ValueError(f"interval of a sensor must be above 0 s, or None, got {self.interval!r}")
         if not 0.0 < self.availability <= 1.0:
-            raise ValueError(f"availability of a sensor must be above 0 and at most 1, got {self.availability!r}")
+            raise ValueError(
+                f"availability of a sensor must be above 0 and at most 1, got {self.availability!r}"
+            )
         if self.gate is not None and not 0.0 < self.gate < math.inf:
             raise ValueError(f"gate of a sensor must be above 0, or None, got {self.gate!r}")
         if self.wraps not in (None, *PERIODS):

@@ -169,7 +169,9 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         here = None
         if self.loses:
             here = xp.where(uniforms[self.drawn - 1] < self.parameters.availability, 1.0, 0.0)
-        sensors, due = self.receptions.advance(truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :])
+        sensors, due = self.receptions.advance(
+            truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
+        )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
         return truth, Measurement(*self._receive(truth, values, (here, due)), interval, told)
 

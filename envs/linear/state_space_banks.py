@@ -352,16 +352,22 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         control: its name.
         process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
         measurement_noise: likewise on R.
+        **sensor_noises: factors on R of some sensors, by their names.
     """
 
     parameters: StateSpaceParameters
 
     def __init__(
-        self, task: StateSpace, control: str, process_noise: Any = 1.0, measurement_noise: Any = 1.0
+        self,
+        task: StateSpace,
+        control: str,
+        process_noise: Any = 1.0,
+        measurement_noise: Any = 1.0,
+        **sensor_noises: Any,
     ) -> None:
         super().__init__(task, control)
-        self.count = len(task.believed)
-        self.factors = process_noise, measurement_noise
+        self.count, self.factor = len(task.believed), process_noise
+        self.R = [one.sensor_noise(measurement_noise, sensor_noises) for one in task.believed]
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -430,8 +436,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         updates = []
         for j, equations in enumerate(self.task.believed):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
-            P = carried + self.factors[0] * equations.process_noise(mean, measurement)
-            received = equations.receive(measurement, mean, self.factors[1] * equations.R[:, :, None])
+            P = carried + self.factor * equations.process_noise(mean, measurement)
+            received = equations.receive(measurement, mean, self.R[j])
             updates.append(update_with_gain(mean, P, received, equations.gain(P, received)))
         return state._replace(
             means=xp.stack([u.mean for u in updates], axis=1),
