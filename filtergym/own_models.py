@@ -10,6 +10,7 @@ import numpy
 from . import register_task
 from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
+from .envs.contract.parameters import check_integer
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition
 from .envs.linear.inputs import Input
@@ -32,7 +33,7 @@ from .own_equations import (
 )
 from .own_sensors import check_columns, find_channels, replace_sensors, sensor_columns, stack_sensors
 
-EQUATIONS = ("f", "h", "Q", "R", "sensors")
+EQUATIONS = ("f", "Q", "drift", "diffusion", "h", "R", "sensors")
 TRIED = 32, 64
 """Episodes and measurements from which the unit of the reward is estimated."""
 
@@ -40,10 +41,13 @@ TRIED = 32, 64
 def state_space(
     id: str,
     *,
-    f: Function,
-    Q: Any,
     mean: Any,
     covariance: Any,
+    f: Function | None = None,
+    Q: Any = None,
+    drift: Function | None = None,
+    diffusion: Any = None,
+    integration_steps: int = 1,
     h: Function | None = None,
     R: Any = None,
     sensors: Mapping[str, Sensor] | None = None,
@@ -65,14 +69,18 @@ def state_space(
 
     Args:
         id: with your name and a version, such as ``"mine/Tracker-v0"``.
+        mean: of the initial state, ``(n,)``.
+        covariance: of the initial state, ``(n, n)``.
         f: the state at the next measurement, from the state ``(n,)`` to a list of n numbers, written with NumPy's
             functions and without branches on numbers; or a matrix ``(n, n)``. With a second argument called ``dt``
             it is the state that interval later, s: the model is timed, and measurements may come at any time. With an
             argument called ``u`` it is given the inputs ``(p,)`` that act until then.
         Q: covariance of the process noise, ``(n, n)``; of a timed model a function that returns that of an interval,
             ``Q(dt)``.
-        mean: of the initial state, ``(n,)``.
-        covariance: of the initial state, ``(n, n)``.
+        drift: in place of f and Q the derivative of the state, ``drift(x)`` or ``drift(x, u)``, or a matrix: the model
+            is timed, see :mod:`filtergym.filters.discretisation`.
+        diffusion: spectral density of the noise of that derivative, ``(n, n)``.
+        integration_steps: of the Runge-Kutta method between two measurements, of a drift that is not linear.
         h: as f what is measured, m numbers; or a matrix ``(m, n)``.
         R: covariance of the measurement noise, ``(m, m)``, positive definite.
         sensors: by their names, in place of h, R and ``measured``.
@@ -83,7 +91,7 @@ def state_space(
         inputs: known inputs, each with what a simulation draws for it and the noise with which it is told; or their
             names. They are columns of a table, too.
         weights: of their squared errors in the cost, ``(n,)``; default: 1 / n, for the mean squared error.
-        filter_model: what the filters believe in place of f, h, Q, R, or some of the sensors.
+        filter_model: what the filters believe in place of f, Q, drift, diffusion, h, R, or some of the sensors.
         hypotheses: further models between which the world switches, each by what differs from the first, likewise.
             Filters then are interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
@@ -105,17 +113,21 @@ def state_space(
     mean = check_array("mean", mean, (None,))
     n = len(mean)
     sensors = _sensors(sensors, (h, R, measured))
-    first = {"f": f, "h": h, "Q": Q, "R": R, "sensors": sensors}
+    first = {"f": f, "Q": Q, "drift": drift, "diffusion": diffusion, "h": h, "R": R, "sensors": sensors}
+    _check_motion(first)
     given = [first, *(_replace("hypotheses", first, one) for one in hypotheses)]
     rates = [one.interval for one in sensors.values() if one.interval is not None]
     if rates:
         parameters.setdefault("sampling_interval", min(rates))
     interval = float(parameters.get("sampling_interval", StateSpaceParameters.sampling_interval))
     inputs = _inputs(inputs)
-    around = Surroundings(mean, interval, inputs)
-    if inputs and not any("u" in further_arguments(one["f"]) for one in given):
+    steps = check_integer("integration_steps", integration_steps, 1)
+    around = Surroundings(mean, interval, inputs, steps)
+    motion = "drift" if f is None else "f"
+    if inputs and not any("u" in further_arguments(one[motion]) for one in given):
         raise ValueError(
-            f"there are inputs, {', '.join(inputs)}, and f does not take u: write f(x, u) or f(x, dt, u)"
+            f"there are inputs, {', '.join(inputs)}, and {motion} does not take u: write "
+            f"{'drift(x, u)' if f is None else 'f(x, u) or f(x, dt, u)'}"
         )
     world = tuple(make_model(_stack(one, n), around) for one in given)
     filters = world
@@ -187,10 +199,21 @@ def _sensors(
     return replace_sensors(None, sensors)
 
 
+def _check_motion(first: Mapping[str, Any]) -> None:
+    """Raise ValueError for neither f and Q, nor drift and diffusion, or parts of both."""
+    there = [name for name in EQUATIONS[:4] if first[name] is not None]
+    if there not in (["f", "Q"], ["drift", "diffusion"]):
+        raise ValueError(
+            f"motion is said by f and Q, or by drift and diffusion, got {', '.join(there) or 'neither'}"
+        )
+
+
 def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
     """Return equations with some in place of others, or raise ValueError for what is none of them."""
     own = first["sensors"]
-    known = [name for name in EQUATIONS if name not in (("h", "R") if own else ("sensors",))]
+    unused = {*(("h", "R") if own else ("sensors",))}
+    unused |= {"f", "Q"} if first["f"] is None else {"drift", "diffusion"}
+    known = [name for name in EQUATIONS if name not in unused]
     unknown = [name for name in part if name not in known]
     if unknown:
         raise ValueError(f"{what} says {', '.join(known[:-1])} or {known[-1]}, got {unknown[0]!r}")

@@ -511,9 +511,9 @@ def test_what_is_no_timed_model_is_refused(make, wrong, sentence):
 
 @pytest.mark.parametrize(
     ("block", "id", "lines"),
-    [(3, "mine/Irregular-v0", 4), (4, "mine/Cell-v0", 2), (5, "mine/Boat-v0", 1)],
+    [(3, "mine/Irregular-v0", 4), (4, "mine/Pendulum-v0", 0), (5, "mine/Cell-v0", 2), (6, "mine/Boat-v0", 1)],
 )
-def test_the_page_on_time_inputs_and_sensors_runs(capsys, block, id, lines):
+def test_the_pages_models_run(capsys, block, id, lines):
     try:
         exec(compile(BLOCKS[block][1], "page", "exec"), {})
     finally:
@@ -574,7 +574,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
     """Its commands, on a simulated drive whose odometer speaks at every second measurement."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "car.py").write_text(BLOCKS[6][1], encoding="utf-8")
+    (tmp_path / "car.py").write_text(BLOCKS[7][1], encoding="utf-8")
     try:
         made = filtergym.record(importlib.import_module("car").Car.id, episodes=1, horizon=150, jitter=0.9)
         gps, odometry = made.measurements["values"][0].T
@@ -586,7 +586,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
         ):
             text = "\n".join([header, *(",".join(map(str, row)).replace("nan", "") for row in rows.tolist())])
             (tmp_path / file).write_text(text, encoding="utf-8")
-        for line in BLOCKS[7][1].splitlines():
+        for line in BLOCKS[8][1].splitlines():
             code, shown, errors = command(*shlex.split(line)[1:])
             assert (code, bool(shown)) == (0, True), errors
     finally:
