@@ -41,22 +41,22 @@ static long number_of(const char *name) {{
 
 /* Answers every measurement of some tracks until there are no more. */
 static int serve(void) {{
-    const long tracks = number_of("\"tracks\": ");
+    const long tracks = number_of("\\"tracks\\": ");
     {own}_state *states;
     double *rows;
     long t;
     int i, j;
-    if (number_of("\"filtergym\": ") != 1 || number_of("\"initial\": ") != {initial} ||
-        number_of("\"measurement\": ") != COLUMNS - {initial} || number_of("\"answer\": ") != ANSWER || tracks < 1) {{
-        puts("{{\"error\": \"this filter was exported from another environment or scenario\"}}");
+    if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
+        number_of("\\"measurement\\": ") != COLUMNS - {initial} || number_of("\\"answer\\": ") != ANSWER || tracks < 1) {{
+        puts("{{\\"error\\": \\"this filter was exported from another environment or scenario\\"}}");
         return 2;
     }}
-    while (strchr(line, '\n') == NULL && fgets(line, (int)sizeof line, stdin) != NULL) {{
+    while (strchr(line, '\\n') == NULL && fgets(line, (int)sizeof line, stdin) != NULL) {{
     }}
     states = malloc((size_t)tracks * sizeof *states);
     rows = malloc((size_t)tracks * (COLUMNS + ANSWER) * sizeof *rows);
     if (states == NULL || rows == NULL) return 2;
-    puts("{{\"filtergym\": 1, \"format\": \"float64\"}}");
+    puts("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"}}");
     fflush(stdout);
     if (fread(rows, {initial} * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
     for (t = 0; t < tracks; ++t) {{
