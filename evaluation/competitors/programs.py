@@ -50,6 +50,7 @@ class Program:
     Args:
         command: the program and its arguments, one text as in a shell; nothing of it is given to one.
         limits: of its time for an answer and of its memory.
+        words: see below, likewise the others.
 
     Raises:
         ValueError: if there is no such program, or no system on which it could run.
@@ -57,16 +58,19 @@ class Program:
 
     command: str
     limits: Limits = field(default_factory=LIMITS.get)
-    words: tuple[str, ...] = field(init=False)
-    kind: ClassVar[Kind] = "estimator"
-    preface: ClassVar[bytes] = b""
-    """That is written before the hello."""
-    environment: ClassVar[dict[str, str] | None] = None
+    words: tuple[str, ...] = ()
+    """Of the command; default: what a shell would make of it."""
+    preface: bytes = field(default=b"", repr=False)
+    """What is written before the hello."""
+    environment: tuple[tuple[str, str], ...] | None = None
     """Variables of the process; None: ours."""
+    kind: ClassVar[Kind] = "estimator"
 
     def __post_init__(self) -> None:
         if os.name != "posix":
             raise ValueError("programs compete on Linux and macOS: here pipes cannot be waited for")
+        if self.words:
+            return
         try:
             words = tuple(shlex.split(self.command))
         except ValueError as error:
@@ -88,8 +92,8 @@ class Field(NamedTuple):
 
     name: str
     """The names that lead to it, with dots."""
-    shape: tuple[int, ...]
-    """Of one track."""
+    shape: tuple[int, ...] | None
+    """Of one track; None: it is there in other scenarios, or in recordings."""
     type: str
     """``float64``, ``int64`` or ``bool``; in a frame all are float64."""
     about: str
@@ -102,7 +106,9 @@ def fields_of(part: Any, prefix: str = "") -> Iterator[Field]:
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from fields_of(value, f"{prefix}{name}.")
-        elif value is not None:
+        elif value is None:
+            yield Field(prefix + name, None, "", about.get(name, ""))
+        else:
             array = numpy.asarray(value)
             kind = {"b": "bool", "f": "float64"}.get(array.dtype.kind, "int64")
             yield Field(prefix + name, array.shape[:-1], kind, about.get(name, ""))
@@ -171,7 +177,10 @@ class ProgramEstimator:
         self.count = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
         try:
-            self._process = ProgramProcess(self.program.words, self.program.limits, self.program.environment)
+            own = self.program.environment
+            self._process = ProgramProcess(
+                self.program.words, self.program.limits, None if own is None else dict(own)
+            )
         except OSError as error:
             raise ValueError(f"{self.program.command!r} cannot be started: {error.strerror}") from None
         return 0
@@ -243,6 +252,8 @@ class ProgramEstimator:
             raise Failure(
                 WRONG, f'it has not answered the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}'
             )
+        if isinstance(answer.get("warning"), str):
+            warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
         self._format = answer["format"]
         self._process.tell(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
@@ -252,6 +263,8 @@ class ProgramEstimator:
             return rows.tobytes()
         content, place = {}, 0
         for own in fields:
+            if own.shape is None:
+                continue
             size = _count([own])
             content[own.name] = as_lists(rows[:, place : place + size].reshape(-1, *own.shape))
             place += size
@@ -283,7 +296,7 @@ class ProgramEstimator:
 
 def _count(fields: Sequence[Field]) -> int:
     """Numbers of a track."""
-    return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields)
+    return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 
 
 def _read_object(line: bytes) -> dict[str, Any]:
