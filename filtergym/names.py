@@ -116,6 +116,15 @@ def assumed_parameters(env: str | None, names: Sequence[str]) -> dict[str, float
     return {}
 
 
+def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
+    """Return names of competitors, where each ``module:Class`` is one in a process of its own."""
+    known = (EXEC, ISOLATED)
+    return [
+        ISOLATED + name if ":" in name and name not in problem.names and not name.startswith(known) else name
+        for name in names
+    ]
+
+
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)

@@ -70,10 +70,8 @@ class ProgramProcess:
         )
         self._answers = selectors.DefaultSelector()
         self.end = weakref.finalize(self, _end, process, self._answers)
-        assert process.stdin and process.stdout and process.stderr
-        self._to, self._from, self._errors = (
-            stream.fileno() for stream in (process.stdin, process.stdout, process.stderr)
-        )
+        streams = (process.stdin, process.stdout, process.stderr)
+        self._to, self._from, self._errors = (stream.fileno() for stream in streams if stream is not None)
         for pipe in (self._to, self._from, self._errors):
             os.set_blocking(pipe, False)
             _widen(pipe)
@@ -189,7 +187,7 @@ class ProgramProcess:
 
     @property
     def processor_seconds(self) -> float:
-        """s of processor time that the process has taken, of all its threads; NaN where the system does not say."""
+        """Processor time of the process, s, of all its threads; NaN where the system does not say."""
         if sys.platform != "linux":
             return float("nan")
         try:

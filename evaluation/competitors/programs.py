@@ -2,7 +2,8 @@
 
 The protocol is version 1; docs/programs.md says the same to whoever writes a program.
 
-1. We write a line of JSON, the **hello**: what is estimated, the fields of what will come, and how many tracks there are.
+1. We write a line of JSON, the **hello**: what is estimated, the fields of what will come, and how many tracks
+   there are.
 2. The program answers with a line: the version, and in which format it wants the rest, ``json`` or ``float64``; or with
    an ``error``, one sentence, and then takes no part.
 3. We write the initial estimate, which has no answer, and then one measurement after another. Each is answered with
@@ -19,6 +20,7 @@ import shlex
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
@@ -39,8 +41,27 @@ LONGEST_HELLO = 10_000
 """Bytes of the answer to the hello."""
 BYTES_OF_NUMBER = 40
 """Of JSON, at most, with what stands around it."""
-LIMITS: ContextVar[Limits] = ContextVar("limits", default=Limits())
+USUAL = Limits()
+LIMITS: ContextVar[Limits] = ContextVar("limits", default=USUAL)
 """Of the programs that are named while it is in force."""
+
+
+@contextmanager
+def limit_programs(seconds: float, memory: float) -> Iterator[None]:
+    """Give limits to the programs that are named inside, see :class:`.program_process.Limits`.
+
+    Raises:
+        ValueError: for what is no limit.
+    """
+    if not seconds > 0.0 or not memory >= 0.0:
+        raise ValueError(
+            f"a time limit is above zero and a memory limit not below, got {seconds} and {memory}"
+        )
+    token = LIMITS.set(Limits(seconds, memory))
+    try:
+        yield
+    finally:
+        LIMITS.reset(token)
 
 
 @dataclass(frozen=True)
@@ -215,7 +236,7 @@ class ProgramEstimator:
         return answer[:C], answer[C:].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
-        """s of processor time that the program has taken; NaN where that is not known."""
+        """Processor time that the program has taken, s; NaN where that is not known."""
         return float("nan") if self._process is None else self._process.processor_seconds
 
     def end(self) -> None:
@@ -242,7 +263,8 @@ class ProgramEstimator:
 
     def _greet(self, measurement: Any) -> None:
         """Say hello, and hand over the initial estimate."""
-        assert self._process is not None and self._initial is not None
+        assert self._process is not None
+        assert self._initial is not None
         hello = self.program.preface + json.dumps(self.hello(measurement)).encode() + b"\n"
         answer = _read_object(self._process.exchange(hello, None, LONGEST_HELLO))
         if isinstance(answer.get("error"), str):
@@ -250,7 +272,8 @@ class ProgramEstimator:
             raise ValueError(f"{self.program.command!r} takes no part: {answer['error'][:500]}")
         if answer.get("filtergym") != VERSION or answer.get("format") not in ("json", "float64"):
             raise Failure(
-                WRONG, f'it has not answered the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}'
+                WRONG,
+                f'it has not answered the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}',
             )
         if isinstance(answer.get("warning"), str):
             warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
@@ -289,7 +312,7 @@ class ProgramEstimator:
                 values = numpy.empty(0)
             if values.shape != shape:
                 listed = " lists of ".join(map(str, shape))
-                raise Failure(WRONG, f"its {name!r} is not {listed} numbers, but has shape {values.shape}")
+                raise Failure(WRONG, f"its {name!r} is not {listed} numbers")
             found.append(values.reshape(self.count, -1))
         return numpy.concatenate(found, axis=1)
 

@@ -47,7 +47,8 @@ static int serve(void) {{
     long t;
     int i, j;
     if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
-        number_of("\\"measurement\\": ") != COLUMNS - {initial} || number_of("\\"answer\\": ") != ANSWER || tracks < 1) {{
+        number_of("\\"measurement\\": ") != COLUMNS - {initial} || number_of("\\"answer\\": ") != ANSWER ||
+        tracks < 1) {{
         puts("{{\\"error\\": \\"this filter was exported from another environment or scenario\\"}}");
         return 2;
     }}
