@@ -24,18 +24,24 @@ OPEN = "no wall here, this system has no Landlock: it could read any file, the p
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF, NO_NEW_PRIVILEGES = 444, 445, 446, 38
 
 
+def landlock_version() -> int:
+    """Return the version of Landlock that this system has; zero or less: none."""
+    if sys.platform != "linux":
+        return 0
+    version: int = ctypes.CDLL(None, use_errno=True).syscall(CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+    return version
+
+
 def wall(readable: list[str]) -> bool:
     """Close this process in, for good; returns whether the system can.
 
     Args:
         readable: files and folders that may be read, with all below them.
     """
-    if sys.platform != "linux":
-        return False
-    libc = ctypes.CDLL(None, use_errno=True)
-    version = libc.syscall(CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+    version = landlock_version()
     if version < 1:
         return False
+    libc = ctypes.CDLL(None, use_errno=True)
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
@@ -127,6 +133,8 @@ def load(request: dict[str, Any]) -> Any:
     found = getattr(module, request["name"], None)
     if not callable(getattr(found, "update", None)) or not callable(getattr(found, "start", None)):
         raise TypeError(f"{request['name']!r} is no estimator, which has the methods start and update")
+    if getattr(found, "kind", "estimator") != "estimator" or getattr(found, "task_keywords", None):
+        raise TypeError("only an estimator, in the environment as it is, runs in a process of its own")
     return found
 
 

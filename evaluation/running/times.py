@@ -30,7 +30,9 @@ TIME_NOTE = (
     "An asterisk marks the front, where no other ranked competitor costs less in as much time or less. "
     f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
 )
-OWN_NOTE = f"{OWN_MARK} marks programs: the processor time of their own process, without the world, which is on no front."
+OWN_NOTE = (
+    f"{OWN_MARK} marks programs: the time of their own process, without the world, which is on no front."
+)
 EQUAL_TIMES = 1.1
 """Ratio up to which two times are taken for the same: so much they differ from run to run."""
 
