@@ -20,7 +20,7 @@ import shlex
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
@@ -140,7 +140,10 @@ def parameters_of(task: Task) -> dict[str, Any]:
     own = task.parameters
     found = {}
     for name in getattr(own, "__dataclass_fields__", ()):
-        value = own.value(name) if hasattr(own, "value") else getattr(own, name)
+        value = getattr(own, name)
+        if value is None and hasattr(own, "value"):
+            with suppress(KeyError):  # what nothing else decides either
+                value = own.value(name)
         try:
             json.dumps(value, allow_nan=False)
         except (TypeError, ValueError):

@@ -39,6 +39,15 @@ static long number_of(const char *name) {{
     return place == NULL ? 0 : strtol(place + strlen(name), NULL, 10);
 }}
 
+/* What was not received comes as NaN; the filter weighs it by its availability, and any number will do. */
+static void clear_missing(double *row) {{
+    static const int available[] = {{{available}-1}};
+    int i, missing = 0;
+    for (i = 0; available[i] >= 0; ++i) missing |= !(row[available[i]] > 0.0);
+    for (i = 0; missing && i < COLUMNS - {initial}; ++i)
+        if (row[i] != row[i]) row[i] = 0.0;
+}}
+
 /* Answers every measurement of some tracks until there are no more. */
 static int serve(void) {{
     const long tracks = number_of("\\"tracks\\": ");
@@ -70,6 +79,7 @@ static int serve(void) {{
         for (t = 0; t < tracks; ++t) {{
             {own}_measurement measurement;
             {own}_estimate estimate;
+            clear_missing(rows + t * (COLUMNS - {initial}));
             set_measurement(&measurement, rows + t * (COLUMNS - {initial}));
             if ({own}_update(&states[t], &measurement, &estimate) >= {upper}_REJECTED) {{
                 for (i = 0; i < ANSWER; ++i) *answer++ = (double)NAN;

@@ -358,6 +358,9 @@ class Writer:
             C=C,
             digits=digits,
             upper=self.name.upper(),
+            available="".join(
+                f"{i}, " for i, column in enumerate(self.columns("measurement")) if column.startswith("available")
+            ),
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
             entry="" if C == 1 else "[i][j]",
