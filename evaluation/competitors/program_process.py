@@ -98,6 +98,7 @@ class ProgramProcess:
             Failure: if there is no such answer in time.
         """
         unsent, until = memoryview(question), time.monotonic() + self._seconds
+        self._read(self._from)
         if self._buffer:
             raise Failure(WRONG, "it has written more than an answer")
         while True:
