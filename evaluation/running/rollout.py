@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -327,7 +328,10 @@ def measure_time(
         if steers
         else _step_filter(looped, seeds, _report_estimate)
     )
-    spent = _time_steps(steps, decisions, task.decision_interval, clock)
+    with warnings.catch_warnings():
+        if own:
+            warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program
+        spent = _time_steps(steps, decisions, task.decision_interval, clock)
     if math.isnan(spent):
         return None
     return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False, own)
