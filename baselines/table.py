@@ -154,6 +154,9 @@ class Baselines:
     measurement_seconds: float = 5e-6
     """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
     full benchmark."""
+    headline_episodes: int = 0
+    """Episodes of the training distribution at least where a benchmark is asked for narrow intervals; of costs whose
+    tails are heavy many."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None

@@ -269,6 +269,7 @@ BASELINES = Baselines(
     bounds={"known-mode-bound": KnownModeBound},
     score_paper="multi-hypothesis",
     score_reference="known-mode",
+    headline_episodes=5000,
     tunable=TUNABLE,
     fallback="stuck-exclusion",
     alarm=SensorAlarm,

@@ -15,6 +15,7 @@ from records import BenchmarkRecords, ResultRecord
 
 from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
 from filtergym.reports.tables.terminal_tables import (
+    HEADLINE,
     INCONSISTENT,
     against_paper,
     consistency,
@@ -24,7 +25,6 @@ from filtergym.reports.tables.terminal_tables import (
 
 STRONGEST = 4
 """Classical competitors that the page shows."""
-DIFFERENCE = "relative_cost_difference"
 
 
 class Comparison(NamedTuple):
@@ -62,10 +62,10 @@ def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Cost against the paper's algorithm, median, wins, ANEES and time of a competitor in one scenario."""
+    """Cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
     values = _by_name(records)
     return [
-        with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
+        with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
         *against_paper(values, name),
         consistency(values.get((name, "anees", "state", "all"))),
         column_of_times(records).get(name, "-"),
@@ -96,7 +96,15 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
                     score_text(values.get((name, "score", "", "all"))),
                 ]
             )
-    header = ["environment", "name", "origin", "cost against the paper's, %", "median, %", "wins, %", "ANEES"]
+    header = [
+        "environment",
+        "name",
+        "origin",
+        "cost against the paper's, %",
+        "lost tracks, %",
+        "means, %",
+        "ANEES",
+    ]
     header.append(TIME_TITLE)
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
@@ -106,7 +114,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     rows = []
     for problem, records in found:
         for name in pretrained_agents(problem.id):
-            own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
+            own = [r for r in records if (r.policy, r.metric) == (name, HEADLINE) and r.value is not None]
             if not own:
                 continue
             worst = max(own, key=lambda record: record.value or 0.0)
@@ -120,9 +128,9 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
                     f"{sum((record.low or 0.0) > HARM for record in own)} of {len(own)}",
                 ]
             )
-    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "median, %"]
+    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "lost tracks, %"]
     last = f"scenarios more than {100.0 * HARM:g} % above the paper"
-    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", TIME_TITLE, last], rows)
+    return Grid("Where learned agents do worst", [*header, "means, %", "ANEES", TIME_TITLE, last], rows)
 
 
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
@@ -173,16 +181,16 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             ],
         )
 
-    def typical(scenario: str, name: str) -> str:
-        median, wins = against_paper(by_window, name, (scenario,))
-        return "-" if median == "-" else f"{median}<br>{wins}"
+    def tail(scenario: str, name: str) -> str:
+        lost, means = against_paper(by_window, name, (scenario,))
+        return "-" if means == "-" else f"{lost}<br>{means}"
 
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
     grids = [
         grid(
             f"Cost against `{paper}`, %",
             others,
-            lambda scenario, name: _two_lines(found.get((scenario, name, DIFFERENCE, "")), 100.0),
+            lambda scenario, name: _two_lines(found.get((scenario, name, HEADLINE, "")), 100.0),
             judged=True,
         ),
         grid(
@@ -191,10 +199,9 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             lambda scenario, name: _two_lines(found.get((scenario, name, metric, component)), 1.0),
         ),
         grid(
-            f"Episode by episode: median difference of the cost to `{paper}`, %, and share of episodes with a lower "
-            "cost, %",
+            f"The tail: share of lost tracks, %, and difference of the mean cost to that of `{paper}`, %",
             columns,
-            typical,
+            tail,
         ),
         grid(
             "Consistency: mean NEES over the dimension; 1 is consistent, "
@@ -215,7 +222,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             scenario + ("\n(training)" if cls.scenarios[scenario].training else ""), {}
         )
         for name in others:
-            record = found.get((scenario, name, DIFFERENCE, ""))
+            record = found.get((scenario, name, HEADLINE, ""))
             interval = () if record is None else (record.value, record.low, record.high)
             percent = tuple(100.0 * x for x in interval if x is not None)
             if len(percent) == 3:

@@ -13,6 +13,8 @@ from filtergym.evaluation.running.times import points_of_records, times_of_recor
 from filtergym.papers.grid import markdown_table
 from records import BenchmarkRecords
 
+from filtergym.reports.tables.terminal_tables import HEADLINE
+
 BUDGETS = (100, 300, 1000, 5000)
 """Nanoseconds that a measurement may take."""
 
@@ -58,11 +60,7 @@ def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
     for problem, records in found:
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         times, learned = times_of_records(own), pretrained_agents(problem.id)
-        costs = [
-            r
-            for r in own
-            if r.metric == "relative_cost_difference" and r.kind in RANKED and r.value is not None
-        ]
+        costs = [r for r in own if r.metric == HEADLINE and r.kind in RANKED and r.value is not None]
         best: list[list[Record | None]] = [[], []]
         for budget in BUDGETS:
             quick = [r for r in costs if r.policy in times and times[r.policy].nanoseconds <= budget]

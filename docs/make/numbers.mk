@@ -96,7 +96,7 @@ $(DONE)/seeds-%: $(DONE)/ship-%
 
 # The second command alone makes the records of all environments anew from a finished benchmark, wherever it lies.
 $(DONE)/benchmark: $(shipped)
-	$(BIN)/filtergym benchmark --full --jobs $(JOBS) --out results/full
+	$(BIN)/filtergym benchmark --full --half-width 2 --jobs $(JOBS) --out results/full
 	$(record) results/full/results.json
 	$(finish)
 

@@ -27,6 +27,10 @@ BENCHMARK, SEEDS = "benchmark", "seeds"
 METRICS = (
     *(
         "cost",
+        "geometric_cost",
+        "geometric_cost_difference",
+        "lost_tracks",
+        "best_share",
         "relative_cost_difference",
         "median_cost_ratio",
         "win_rate",
