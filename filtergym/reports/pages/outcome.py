@@ -41,7 +41,7 @@ def protocol_sentences(results: Sequence[Result]) -> list[str]:
     return [
         f"Every competitor met the same {each} episodes of an environment ({first.split} split, seed {first.seed}). "
         "Ranges hold 95 %; competitors are level where that of their ratio holds one. Error cost is the mean squared "
-        "error of the estimate, in a control loop the loop's quadratic cost, and its ratios are geometric means over the "
+        "error of the estimate, in a control loop the loop's quadratic cost; its ratios are geometric means over the "
         "episodes, which no single one owns; times are of one processor core."
     ]
 
