@@ -143,6 +143,9 @@ class Baselines:
     """Classes that keep the protocol :class:`.Smoother`: estimators that use later measurements."""
     score_paper: str = ""
     """The policy whose score is 0."""
+    stronger_paper: str = ""
+    """Another reading of the paper's algorithm, of less cost: where it takes part, costs are compared with it, and its
+    score is 0."""
     score_reference: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()

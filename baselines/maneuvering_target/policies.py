@@ -5,7 +5,7 @@ Equation numbers and readings are those of the task's paper (Bakulev, Sychev, Ng
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy
 
@@ -24,7 +24,11 @@ from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
 
 
 class InteractingMultipleModel(Policy):
-    """The paper's algorithm: weights by Bayes' rule, equations (12)-(14)."""
+    """The paper's algorithm: weights by Bayes' rule, equations (12)-(14).
+
+    Reading: S = P + R in the likelihood (11), P the covariance that belongs to the gains in use. Of five readings it is
+    the one that reproduces the paper's claim about the best gains, and not the strongest.
+    """
 
     control = "weights"
     traceable = True
@@ -42,6 +46,15 @@ class InteractingMultipleModel(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """State the posterior probabilities as weights."""
         return self.probabilities(observation), None
+
+
+class SteadyStateInteractingMultipleModel(InteractingMultipleModel):
+    """The paper's algorithm under the stronger reading: S = R / (1 - alpha) in the likelihood (11).
+
+    The paper does not print this covariance. It is that of a Kalman filter that has settled to the gain alpha.
+    """
+
+    task_keywords: ClassVar[dict[str, Any]] = {"likelihood_covariance": "steady-state"}
 
 
 class HardInteractingMultipleModel(InteractingMultipleModel):
@@ -179,6 +192,7 @@ BASELINES = Baselines(
     environment="filtergym/ManeuveringTarget-v0",
     policies={
         "imm": InteractingMultipleModel,
+        "imm-steady-state": SteadyStateInteractingMultipleModel,
         "zero": ZeroEvidence,
         "hard-imm": HardInteractingMultipleModel,
         "adaptive": AdaptiveGain,
@@ -193,6 +207,7 @@ BASELINES = Baselines(
     references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
+    stronger_paper="imm-steady-state",
     score_reference="known-turn",
     log_families=log_families,
     tunable=TUNABLE,
@@ -202,6 +217,7 @@ BASELINES = Baselines(
     best_constant="fixed-best",
     benchmark=(
         "imm",
+        "imm-steady-state",
         "adaptive",
         "adaptive-rearm",
         "fixed-low",

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import Problem
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
@@ -35,24 +34,28 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def compared_policies(problem: Problem, records: Sequence[Record]) -> list[str]:
+def compared_policies(measured: BenchmarkRecords) -> list[str]:
     """Names that the page shows, of those in the records, in the order of its columns.
 
     Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
-    algorithm; it and the best constant action, tuned; the reference whose score is 1. The others stand in the records.
-    On a narrow screen only the first columns are seen without scrolling.
+    algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
+    stand in the records. On a narrow screen only the first columns are seen without scrolling.
     """
-    known = problem.baselines
+    problem, records = measured
+    known, paper = problem.baselines, measured.paper
     of_default = [record for record in records if record.scenario == problem.task.default_scenario]
     classical = [
         place.name
         for place in ranking(of_default or records)
-        if place.role != "learned" and place.name != known.score_paper
+        if place.role != "learned" and place.name != paper
     ]
+    readings = [paper, known.score_paper]
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
-    strongest, paper = classical[:STRONGEST], known.score_paper
-    wanted = dict.fromkeys((*pretrained_agents(problem.id), *strongest, paper, *tuned, known.score_reference))
+    strongest = classical[:STRONGEST]
+    wanted = dict.fromkeys(
+        (*pretrained_agents(problem.id), *strongest, *readings, *tuned, known.score_reference)
+    )
     return [name for name in wanted if name in present]
 
 
@@ -145,7 +148,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     """
     problem, records = measured
     cls, known = problem.task, problem.baselines
-    paper, columns = problem.paper, compared_policies(problem, records)
+    paper, columns = measured.paper, compared_policies(measured)
     if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     others = [name for name in columns if name != paper]
@@ -263,7 +266,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
     """Sentences and tables of one environment, with the command that made the records."""
-    records, paper = measured.records, measured.problem.paper
+    records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"

@@ -22,12 +22,13 @@ BUDGETS = (100, 300, 1000, 5000)
 def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
     """Return what is drawn of each environment that the records have times of, in its training distribution."""
     panels = []
-    for problem, records in found:
+    for measured in found:
+        problem, records = measured
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
             panels.append(
-                Panel(bare_name(problem.id), points, known.score_paper, known.score_reference, learned)
+                Panel(bare_name(problem.id), points, measured.paper, known.score_reference, learned)
             )
     return panels
 

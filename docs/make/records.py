@@ -71,6 +71,11 @@ class BenchmarkRecords(NamedTuple):
     problem: Problem
     records: list[Record]
 
+    @property
+    def paper(self) -> str:
+        """Name of the paper's algorithm that costs are compared with."""
+        return self.problem.paper_among({record.policy for record in self.records})
+
 
 def environment_id(name: str) -> str:
     """Return the id of an environment that pages call by its short name.

@@ -97,7 +97,7 @@ def results_grid(
 
 def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
     """Return the whole table of one environment and scenario, who is best, and what the columns are, in Markdown."""
-    records, paper = scenario_records(found, scenario), found.problem.paper
+    records, paper = scenario_records(found, scenario), found.paper
     note = (
         f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
         f"{INCONSISTENT} marks a covariance that is off by more than a factor of two. {TIME_NOTE}\n\n{_where(records)} "
@@ -135,11 +135,10 @@ def chosen_markdown(
     for name, (own, record) in found.items():
         records = scenario_records(own, scenario, policies)
         # With everybody's records, so that the front and the best are those of the whole table.
-        titles, lines = results_grid(scenario_records(own, scenario), own.problem.paper, columns)
+        titles, lines = results_grid(scenario_records(own, scenario), own.paper, columns)
         wanted = {f"`{record.policy}`" for record in records}
         header = [
-            title if len(found) == 1 else title.replace(f"`{own.problem.paper}`", "the paper's")
-            for title in titles
+            title if len(found) == 1 else title.replace(f"`{own.paper}`", "the paper's") for title in titles
         ]
         first = [name] if len(found) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]
