@@ -122,7 +122,7 @@ class AdaptiveGain(Policy):
     alpha falls linearly from the larger gain to the smaller one over seven scans, at the start (scans 1 to
     8) and after every alarm. Reading: the paper does not describe the detector; here the normalised
     innovation squared of one scan, both axes, against the chi-square limit of ``false_alarm_probability``,
-    and no alarm while a ramp runs, which is what the one complete ramp of its figure 3 shows.
+    and no alarm while a ramp runs, the first one included, which is what the one complete ramp of its figure 3 shows.
     """
 
     control = "gain"
@@ -149,7 +149,11 @@ class AdaptiveGain(Policy):
 
 
 class RearmingAdaptiveGain(AdaptiveGain):
-    """The same with an alarm during the ramp starting it again: an equally ordinary detector."""
+    """The same with an alarm during the ramp starting it again: an equally ordinary detector.
+
+    Reading: the paper sets alpha to the larger gain "if a manoeuvre is detected" and makes no exception for the first
+    ramp, so an alarm restarts that one, too. At the first scan an alarm changes nothing: the ramp begins there.
+    """
 
     rearm = True
 
