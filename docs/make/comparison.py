@@ -136,6 +136,21 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "means, %", "ANEES", TIME_TITLE, last], rows)
 
 
+def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
+    """Whose covariance does not fit the errors on the training distribution, of all that is ranked but random actions."""
+    rows = []
+    for measured in found:
+        records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
+        values = _by_name(records)
+        for place in ranking(records) if records else ():
+            both = [values.get((place.name, metric, "state", "all")) for metric in ("anees", "median_anees")]
+            texts = [consistency(record) for record in both]
+            if place.name != "random" and any(INCONSISTENT in text for text in texts):
+                rows.append([bare_name(measured.problem.id), f"`{place.name}`", *texts])
+    title = "Covariances that do not fit the errors on the training distribution"
+    return Grid(title, ["environment", "name", "ANEES, mean", "ANEES, median episode"], rows)
+
+
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
     """Tables of one environment: cost against the paper's algorithm, and the physical error.
 
@@ -252,12 +267,12 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Table over all environments, in Markdown: "best" of every origin, or where agents do "harm".
+    """Table over all environments, in Markdown: "best" of every origin, where agents do "harm", or "covariances".
 
     Raises:
         ValueError: for another word.
     """
-    tables = {"best": summary, "harm": harm}
+    tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")
     grid = tables[which](found)

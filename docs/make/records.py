@@ -31,6 +31,7 @@ METRICS = (
         "geometric_cost_difference",
         "lost_tracks",
         "best_share",
+        "median_anees",
         "relative_cost_difference",
         "median_cost_ratio",
         "win_rate",

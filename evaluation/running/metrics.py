@@ -155,6 +155,9 @@ def record_statistics(
             yield from means("mean_error", component, unit, run["error"].sel(component=component).values)
     for metric in consistency_metrics(run):
         yield from _consistency(run, metric, episodes)
+        if metric == "nees":
+            nees = ratio(sums_of_present(_over_dimension(run, metric)[0]))
+            yield Statistic(("episodes", "anees"), nees, sample=ALL)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             yield from means(
@@ -442,7 +445,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
-    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
+    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
+    ``median_anees`` (of the middle one of the episodes, which a few lost tracks do not rule), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
     ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
@@ -492,6 +496,9 @@ def contender_of(
             metric, component, window, unit = words
             estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
             measures.append(Measure(metric, component, window, estimate, unit))
+    if (nees := results.get(("episodes", "anees"))) is not None:
+        middle = bootstrap.interval(bootstrap.quantiles(nees, chosen=~numpy.isnan(nees)))
+        measures.append(Measure("median_anees", "state", "all", middle, "1"))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
     causes = None

@@ -33,11 +33,12 @@ MEANINGS = {
     "log_likelihood": ("nat", "log-density of the measurement as it was predicted, in its units"),
     "mode_probability": ("1", "probability of each hypothesis"),
     "action": ("1", "action as the filter got it, normalised to its space"),
-    "charge": ("1", 'what the reward "cost" takes off, normalised to reward_unit'),
+    "charge": ("1", "minus the reward `cost`: normalised to reward_unit, and compressed"),
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }
-"""Unit and meaning of variables; a variable that an environment reports beside them is in the unit that its page says."""
+"""Unit and meaning of variables; what an environment reports beside them is in the unit that its page says."""
+MEASURED = ("that of the environment's table of measurements", "as the sensors report it, not normalised")
 
 
 def _attributes(key: str, cost: str) -> dict[str, str]:
@@ -45,9 +46,8 @@ def _attributes(key: str, cost: str) -> dict[str, str]:
     name = key.removeprefix(DRAWN_PREFIX)
     if name == "cost":
         return {"units": "1", "long_name": f"{cost}, normalised as it says"}
-    if name not in MEANINGS:
-        return {}
-    return dict(zip(("units", "long_name"), MEANINGS[name], strict=True))
+    found = MEASURED if name.startswith("measurement_") else MEANINGS.get(name, ())
+    return dict(zip(("units", "long_name"), found, strict=False))
 
 
 def recording_coords(
