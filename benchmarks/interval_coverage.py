@@ -1,6 +1,6 @@
 """How often nominal 95 % intervals hold the truth, for each statistic of a comparison and several numbers of episodes.
 
-    python benchmarks/interval_coverage.py --episodes 20000
+    python benchmarks/interval_coverage.py
 
 The mean costs of many episodes of each competitor are taken for all there are: their own statistics are the truth.
 Episodes are then drawn from them with replacement, again and again, and intervals are made of what was drawn as an
@@ -102,7 +102,7 @@ def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Coverage of intervals, by resampling many episodes.")
-    parser.add_argument("--episodes", type=int, default=20000)
+    parser.add_argument("--episodes", type=int, default=10000)
     parser.add_argument("--repetitions", type=int, default=1000)
     options = parser.parse_args()
     print("| environment | competitor | statistic | of all | " + " | ".join(f"{n:,}" for n in NUMBERS) + " |")
