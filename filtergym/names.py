@@ -1,6 +1,7 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -264,6 +265,7 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
+    experiment = replace(experiment, paper=problem.paper_among(makers))
     own, horizon = problem.baselines.metrics, experiment.make_task().horizon
     return [
         EvaluationRequest(experiment, name, maker, own, horizon, curves=curves)

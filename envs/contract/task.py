@@ -159,6 +159,8 @@ class Task(ABC):
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
+    lost_cost: float | None = None
+    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
     log_reward_unit: float | None = None
     """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below
     ``reward_unit``; None where it is the same."""
