@@ -5,7 +5,8 @@ chosen by its likelihood on these and on a quarter more, less one nat for each f
 19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. So is its
 rival chosen among what is shipped, which is not fitted: the paper's algorithm, unless another is likelier beyond
 chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its gain over the rival
-is beyond chance, or where it is as good and cheaper. The last quarter judges. Who is best there in hindsight is named
+is beyond chance, or where it is as good and cheaper. The last quarter judges: where the fitted one errs more there,
+beyond chance, the likelihood misleads, and the rival is advised. Who is best there in hindsight is named
 beside: the best of many looks better than it is. Intervals are of whole stretches of measurements, since neighbours are
 not independent.
 """
@@ -204,7 +205,7 @@ def advise(
         return Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
 
     progress(_first_verdict(fits, tunables, len(shipped)), 0.6)
-    judgement = judge(makers)
+    judgement = all_judged = judge(makers)
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.items() if name not in anchored}
     )
@@ -221,11 +222,7 @@ def advise(
             chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
     profiles = {}
-    dearer = None if tunable.anchored else likeliest_of(comparable)
-    brought = None
     takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
-    if dearer is not None and dearer.name != (name if takes_fitted else rival):
-        brought = dearer.name, judgement.difference(dearer.name, name if takes_fitted else rival)
     if share.apart:  # to all that does not judge
         begin = dataclasses.replace(tunable, start=fits[name].values)
         spans = [*share.fitted, *share.chosen]
@@ -237,10 +234,15 @@ def advise(
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
+    if not tunable.anchored and chosen.relative_error.low > 0.0:
+        takes_fitted = False  # the likelihood misleads
+    advised = chosen if takes_fitted else next(c for c in competitors if c.name == rival)
+    likeliest, brought = likeliest_of(comparable), None
+    if not tunable.anchored and likeliest.name != advised.name:
+        brought = likeliest.name, all_judged.difference(likeliest.name, advised.name)
     if name not in profiles:
         fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
-    advised = chosen if takes_fitted else next(c for c in competitors if c.name == rival)
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),

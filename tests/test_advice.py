@@ -12,7 +12,7 @@ from filtergym.baselines import fitting
 from filtergym.baselines.advice import advise, share_out
 from filtergym.baselines.fitted_filters import own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
-from filtergym.baselines.judgement import AS_GOOD
+from filtergym.baselines.judgement import AS_GOOD, Judgement
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
@@ -415,9 +415,24 @@ def test_the_best_in_hindsight_is_named_beside(advice):
 def test_a_likelihood_that_misleads_is_said(advice):
     """As where errors last longer than a measurement: what predicts best errs more."""
     worse = advice.fitted._replace(relative_error=Estimate(0.07, 0.02, 0.12))
-    line = next(advice_lines(advice._replace(fitted=worse, competitors=[worse, *advice.competitors[1:]]), []))
-    assert "7.0 % more error [2.0, 12.0]" in line
-    assert f"the likelihood misleads here, keep {advice.rival}." in line
+    kept = next(c for c in advice.competitors if c.name == advice.rival)
+    line = next(advice_lines(advice._replace(fitted=worse, competitors=[kept, worse]), []))
+    assert line.startswith(
+        f"Take {advice.rival}, as it is shipped: {worse.name}, fitted, predicts more likely and has "
+    )
+    assert "7.0 % more error [2.0, 12.0] than it" in line
+    assert line.endswith("The likelihood misleads here.")
+
+
+def test_where_the_likelihood_misleads_the_rival_is_advised(one_family, tmp_path, monkeypatch):
+    """Beyond chance; a difference that may be chance changes nothing."""
+    recording = read(write_log(tmp_path, count=240, acceleration=0.8, sigma=1.0, seed=5))
+    for low, kept in ((0.02, True), (-0.02, False)):
+        errors = Estimate(0.07, low, 0.12)
+        monkeypatch.setattr(Judgement, "relative_error", lambda self, name, other, errors=errors: errors)
+        found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})
+        assert found.fitted.gain.low > 0.0
+        assert (found.advised.name == "imm") == kept
 
 
 def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):

@@ -169,7 +169,9 @@ def _extent(recording: Recording) -> Iterator[str]:
         found.append(moved / numpy.diff(seconds[known][::step]))
     speeds = numpy.concatenate(found)
     if len(speeds):
-        width, height = (f"{x:,.0f}" if x >= 100.0 else f"{x:.3g}" for x in numpy.ptp(position[there], axis=0))
+        width, height = (
+            f"{x:,.0f}" if x >= 100.0 else f"{x:.3g}" for x in numpy.ptp(position[there], axis=0)
+        )
         yield f"Positions span {width} m by {height} m, at {numpy.median(speeds):.3g} m/s in the median."
 
 
@@ -264,6 +266,11 @@ def verdict(advice: Advice) -> str:
         if advice.share.apart
         else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
     )
+    if one is not advice.advised and one.relative_error.low > 0.0 and one.gain.value > 0.0:
+        return (
+            f"Take {rival}, as it is shipped: {one.name}, fitted, predicts more likely and has "
+            f"{_amount(advice, one.relative_error)} than it, {where}. The likelihood misleads here."
+        )
     if one is not advice.advised:
         what = _interval(one.gain, "+.3f")
         text = (
@@ -286,9 +293,7 @@ def verdict(advice: Advice) -> str:
         f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
         f"same measurements, {where}."
     )
-    if one.relative_error.low > 0.0:
-        text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
-    elif one.relative_error.low <= 0.0 <= one.relative_error.high:
+    if one.relative_error.low <= 0.0 <= one.relative_error.high:
         costs = [advice.prices[each] for each in (rival, one.name)]
         text += " The difference may be chance"
         if costs[0] and costs[1] and costs[0]["operations"] > costs[1]["operations"]:
