@@ -141,8 +141,8 @@ class Model:
         return self.filter.update(state, Input(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
-        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop or a recording."""
-        if self.task.recording is not None:
+        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        if not self.task.closes_loop:
             return None
         own = self.filter.feedback(state, measurement)
         if own is not None:

@@ -209,6 +209,8 @@ class Task(ABC):
         self.xp = xp
         self.device = device
         self.set_up()
+        self.closes_loop = recording is None and self.is_closed_loop()
+        """Whether an estimate decides what is measured next."""
         if recording is None:
             self.world = self.World(self)
         else:
@@ -291,9 +293,15 @@ class Task(ABC):
             return numpy.full(uniforms.shape[1], self.horizon)
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
+    def is_closed_loop(self) -> bool:
+        """Whether an estimate gives something back to the simulated world; by default where :meth:`feedback` is
+        written.
+        """
+        return type(self).feedback is not Task.feedback
+
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
-        """Report what an estimate gives back to the world; None in an open loop. A filter may give back something
-        else, see :meth:`.Filter.feedback`.
+        """Report what an estimate gives back to the world, in a closed loop. A filter may give back something else, see
+        :meth:`.Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.

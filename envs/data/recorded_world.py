@@ -45,9 +45,8 @@ class Tables(NamedTuple):
     last: numpy.ndarray
 
 
-def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, Any]:
-    """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
-    episodes side by side.
+def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
+    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
 
     Args:
         task: on NumPy arrays.
@@ -64,7 +63,7 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, A
     measurement = world.advance(truth, row, feedback)[1]
     whole = world.add_recorded_fields(measurement)
     further = {name for name, _ in named_arrays(whole)} - {name for name, _ in named_arrays(measurement)}
-    return initial, whole if further & {*names} else measurement, feedback
+    return initial, whole if further & {*names} else measurement
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
@@ -73,14 +72,13 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     Raises:
         ValueError: if what is measured depends on what is estimated.
     """
-    initial, measurement, feedback = measure_examples(task, names)
-    if feedback is not None:
+    if task.closes_loop:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
             "what the sensors said to one estimate is not what they would have said to another, and can be neither "
             "recorded nor replayed"
         )
-    return initial, measurement
+    return measure_examples(task, names)
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
@@ -259,7 +257,7 @@ class LiveWorld(_ForeignWorld):
 
     def __init__(self, task: Task, second_sensor: bool) -> None:
         super().__init__(task)
-        self.initial, measurement, _ = measure_examples(type(task)(task.parameters))
+        self.initial, measurement = measure_examples(type(task)(task.parameters))
         self.measurement = self.simulated.add_recorded_fields(measurement) if second_sensor else measurement
         self.initial_normals, self.normals = _count_numbers(self.initial), _count_numbers(self.measurement)
 

@@ -171,6 +171,7 @@ class Lanes:
         beside: what the reward is relative to, run beside it on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
+        report: that will be made of them, in whose code they then begin; default: not known.
 
     Attributes:
         decisions: actions taken in each lane's current episode, ``(count,)``.
@@ -184,6 +185,7 @@ class Lanes:
         beside: RewardBaseline | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
+        report: Report | None = None,
     ) -> None:
         self.model = model
         self.task = task = model.task
@@ -191,7 +193,7 @@ class Lanes:
         self.width = round_up_lanes(count)
         self.beside = beside
         self._models = [model] if beside is None else [model, beside.model]
-        self._on_start = on_start
+        self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
@@ -237,6 +239,8 @@ class Lanes:
         if self._on_start is not None:
             self._on_start(self.model.begin(*start))
         if everyone:
+            if not self._moving and self._report is not None:
+                self._reporting(self._report)
             self._moving = self._moving or self._by_functions()
             for stepper in self._moving:
                 stepper.begin(*start, noise)
@@ -354,7 +358,7 @@ class Lanes:
             for stepper in self._moving:
                 stepper.report_function = report
             return self._moving
-        for i, (old, new) in enumerate(zip(before, after, strict=True)):
+        for i, (old, new) in enumerate(zip(before, after, strict=bool(before))):
             new.load(old.episode(), old.observation_by_field() if i == 0 else None)
         self._moving = after
         return after

@@ -157,9 +157,13 @@ class ManeuveringTarget(Task):
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
-    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Track | None:
-        """Where there is clutter, the track about which the radar looks for plots."""
-        return Track(mean, covariance) if self.parameters.cluttered else None
+    def is_closed_loop(self) -> bool:
+        """Whether there is clutter."""
+        return self.parameters.cluttered
+
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Track:
+        """Track about which the radar looks for plots."""
+        return Track(mean, covariance)
 
     def _sampling_interval(self) -> float | None:
         """Return the time between scans, s; None where some miss the target, or come early."""

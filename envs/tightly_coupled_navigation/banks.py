@@ -219,9 +219,7 @@ class HypothesisBank(SatelliteBank):
         return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        if not self.parameters.aperture:
-            return None
+        """State that the tracking loops expect at the next measurement, ``(17, N)``."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = weighted_sum(chain.mixing, state.means[:, :, None])
