@@ -75,7 +75,7 @@ def nested(values: dict[str, Any], name: str) -> Any:
         else:
             parts[first] = value
     held = {key: nested(value, key) if isinstance(value, dict) else value for key, value in parts.items()}
-    return namedtuple(name.capitalize(), list(held))(**held)  # type: ignore[misc]
+    return namedtuple(name.capitalize(), list(held))(**held)
 
 
 class Parameters(SimpleNamespace):
@@ -111,7 +111,8 @@ class Frames:
             return None
         rows = numpy.frombuffer(content, dtype="<f8").reshape(self.tracks, -1)
         rows = rows[numpy.minimum(numpy.arange(self.lanes), self.tracks - 1)].T
-        values, place = {}, 0
+        values: dict[str, Any] = {}
+        place = 0
         for own in self.hello[name]:
             shape = own["shape"]
             if shape is None:  # it is there in other scenarios
@@ -163,7 +164,7 @@ def main() -> None:
     try:
         own = make(load(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
-        said = {"error": f"{type(error).__name__}: {error}"}
+        said: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:
         said = {"filtergym": 1, "format": "float64"} | ({} if closed else {"warning": OPEN})
     answers.write(json.dumps(said).encode() + b"\n")
