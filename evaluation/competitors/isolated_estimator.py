@@ -21,7 +21,10 @@ READ = (1 << 2) | (1 << 3)
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 """Rights over files, by the version of Landlock; later ones have as many as the last."""
 OPEN = "no wall here, this system has no Landlock: it could read any file, the package's among them"
-CREATE_RULESET, ADD_RULE, RESTRICT_SELF, NO_NEW_PRIVILEGES = 444, 445, 446, 38
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
+"""System calls."""
+END_WITH_PARENT, NO_NEW_PRIVILEGES = 1, 38
+"""Of prctl(2)."""
 
 
 def landlock_version() -> int:
@@ -42,6 +45,7 @@ def wall(readable: list[str]) -> bool:
     if version < 1:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(END_WITH_PARENT, 9, 0, 0, 0)  # whoever is killed cannot end this process
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
