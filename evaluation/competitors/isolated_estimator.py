@@ -21,7 +21,10 @@ READ = (1 << 2) | (1 << 3)
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 """Rights over files, by the version of Landlock; later ones have as many as the last."""
 OPEN = "no wall here, this system has no Landlock: it could read any file, the package's among them"
-CREATE_RULESET, ADD_RULE, RESTRICT_SELF, NO_NEW_PRIVILEGES = 444, 445, 446, 38
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
+"""System calls."""
+END_WITH_PARENT, NO_NEW_PRIVILEGES = 1, 38
+"""Of prctl(2)."""
 
 
 def landlock_version() -> int:
@@ -42,6 +45,7 @@ def wall(readable: list[str]) -> bool:
     if version < 1:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(END_WITH_PARENT, 9, 0, 0, 0)  # whoever is killed cannot end this process
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
@@ -75,7 +79,7 @@ def nested(values: dict[str, Any], name: str) -> Any:
         else:
             parts[first] = value
     held = {key: nested(value, key) if isinstance(value, dict) else value for key, value in parts.items()}
-    return namedtuple(name.capitalize(), list(held))(**held)  # type: ignore[misc]
+    return namedtuple(name.capitalize(), list(held))(**held)
 
 
 class Parameters(SimpleNamespace):
@@ -111,7 +115,8 @@ class Frames:
             return None
         rows = numpy.frombuffer(content, dtype="<f8").reshape(self.tracks, -1)
         rows = rows[numpy.minimum(numpy.arange(self.lanes), self.tracks - 1)].T
-        values, place = {}, 0
+        values: dict[str, Any] = {}
+        place = 0
         for own in self.hello[name]:
             shape = own["shape"]
             if shape is None:  # it is there in other scenarios
@@ -163,7 +168,7 @@ def main() -> None:
     try:
         own = make(load(request), make_task(hello, numpy))
     except Exception as error:  # a module is a program: it can raise anything
-        said = {"error": f"{type(error).__name__}: {error}"}
+        said: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:
         said = {"filtergym": 1, "format": "float64"} | ({} if closed else {"warning": OPEN})
     answers.write(json.dumps(said).encode() + b"\n")

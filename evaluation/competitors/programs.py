@@ -160,9 +160,9 @@ def rows_of(part: Any, count: int) -> numpy.ndarray:
 
 def as_lists(values: numpy.ndarray) -> Any:
     """Return nested lists of numbers, None where one is not finite."""
-    if numpy.isfinite(values).all():
-        return values.tolist()
-    return numpy.where(numpy.isfinite(values), values, None).tolist()
+    held = values.astype(object)
+    held[~numpy.isfinite(values)] = None
+    return held.tolist()
 
 
 class ProgramEstimator:
