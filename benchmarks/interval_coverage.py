@@ -72,12 +72,10 @@ def truths(pool: Pool) -> list[float]:
 
 def intervals(pool: Pool, bootstrap: Bootstrap) -> list[Estimate]:
     """Every statistic of some episodes with its interval, likewise."""
-    ratio = pool.own / pool.paper
-    columns = numpy.stack([numpy.log(ratio), pool.own, pool.paper], axis=1)
-    logs, own, paper = bootstrap.means(columns).T
+    own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [
-        bootstrap.interval(numpy.expm1(logs)),
-        share_interval(float((pool.own > pool.bound).mean()), len(ratio)),
+        bootstrap.geometric_difference(pool.own, pool.paper),
+        share_interval(float((pool.own > pool.bound).mean()), len(pool.own)),
         bootstrap.relative_difference(own, paper),
     ]
 

@@ -217,6 +217,10 @@ class Bootstrap:
         """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
         return self.interval(means / others - 1.0)
 
+    def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> Estimate:
+        """Geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less one."""
+        return self.estimate(numpy.log(costs / others), numpy.expm1)
+
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m
     ) -> Estimate:

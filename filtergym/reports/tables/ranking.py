@@ -54,7 +54,10 @@ def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None)
     It rests on the paired ratio between the best one and the best of the other origin: where its interval holds one,
     nobody is called best.
     """
-    best, *others = ranking(records, learned)
+    places = ranking(records, learned)
+    if not places:
+        return "nothing is ranked"
+    best, *others = places
     where = "learned" if best.role == "learned" else "classical"
     rival = next((place for place in others if (place.role == "learned") != (where == "learned")), None)
     if rival is None:

@@ -130,7 +130,7 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
         if paper is None or line.role == "paper":
             row += ["-", "-"]
         else:
-            difference = bootstrap.interval(numpy.expm1(bootstrap.means(numpy.log(own / paper))))
+            difference = bootstrap.geometric_difference(own, paper)
             row += [
                 with_interval(difference, 100.0, negligible=0.005),
                 f"{100.0 * (own.mean() / paper.mean() - 1.0):+.1f}",
