@@ -80,7 +80,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
         console.print(OWN)
         return
     write_advised(out, problem, name, found, fitted, intervals, command_line())
-    console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
+    console.print(f"saved in {out}; filtergym evaluate {problem.name} --policy {out} runs it", soft_wrap=True)
 
 
 def advise_on_log(
@@ -198,7 +198,7 @@ def advise_on_log(
             price=price,
         )
         console.print(
-            f"{name} is saved{price_words(price)}: filtergym evaluate {problem.id} --policy {out} runs it",
+            f"{name} is saved{price_words(price)}: filtergym evaluate {problem.name} --policy {out} runs it",
             soft_wrap=True,
         )
     if report is not None and make_page is not None:
