@@ -21,17 +21,15 @@ def correlated(rng, steps, dt, deviation, time):
 
 
 def gps_odometry(rng, seconds=120, dt=0.1):
-    """A car: speed and turn rate wander. GPS of 2.5 m each second, wheels of 0.15 m/s each 0.1 s, a tenth lost."""
+    """A drone in wind: GPS of 2.5 m each second, velocity by camera of 0.15 m/s each 0.1 s, of which a tenth is lost."""
     n = int(seconds / dt)
-    speed = 12.0 + correlated(rng, n, dt, 3.0, 10.0)
-    heading = 0.5 + np.cumsum(correlated(rng, n, dt, 0.1, 5.0)) * dt
-    v = speed * np.array([np.cos(heading), np.sin(heading)])
+    v = np.array([correlated(rng, n, dt, 3.0, 10.0) + correlated(rng, n, dt, 0.3, 0.5) for _ in range(2)])
     p = np.cumsum(v, axis=1) * dt
     fix = np.where(np.arange(1, n + 1) % 10 == 0, p + rng.normal(0.0, 2.5, (2, n)), np.nan)
-    wheels = np.where(rng.random(n) < 0.9, speed + rng.normal(0.0, 0.15, n), np.nan)
+    flow = np.where(rng.random(n) < 0.9, v + rng.normal(0.0, 0.15, (2, n)), np.nan)
     return {
-        "time": np.arange(1, n + 1) * dt, "gps_x": fix[0], "gps_y": fix[1], "odometry": wheels,
-        "truth_x": p[0], "truth_y": p[1], "truth_vx": v[0], "truth_vy": v[1],
+        "time": np.arange(1, n + 1) * dt, "gps_x": fix[0], "gps_y": fix[1], "odometry_x": flow[0],
+        "odometry_y": flow[1], "truth_x": p[0], "truth_y": p[1], "truth_vx": v[0], "truth_vy": v[1],
     }  # fmt: skip
 
 
