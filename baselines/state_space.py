@@ -250,6 +250,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         policies = {"imm": InteractingMultipleModel, **policies}
         estimators["kalman-imm"] = InteractingKalman
     paper = next(iter(policies))
+    families = {name: tunable(make, **_scales(task)) for name, make in estimators.items()}
     return Baselines(
         environment=task.id,
         policies=policies,
@@ -258,6 +259,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         score_paper=paper,
         score_reference="known-model",
         physical=("rmse", task.components[0].name),
-        tunable={name: tunable(make, **_scales(task)) for name, make in estimators.items()},
+        tunable=families,
+        log_families=lambda recording: families,  # their factors may be arrays: candidates run side by side
         benchmark=(*policies, *estimators, "known-model"),
     )

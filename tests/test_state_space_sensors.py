@@ -1,9 +1,12 @@
 """Sensors of a state-space model by name, against naive loops and known distributions."""
 
+import re
 import shutil
 
 import numpy as np
 import pytest
+from filtergym.baselines.advice import fit_all
+from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
 from filtergym.envs.engine.backend import make_model
@@ -16,6 +19,7 @@ import filtergym
 from filtergym import Sensor, read_recording
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
+from filtergym.reports.tables.advice import parameter_lines
 
 Q = np.diag([0.1, 0.2, 0.01])
 GATE = 2.0
@@ -264,3 +268,28 @@ def test_what_are_no_sensors_is_refused(make, wrong, sentence):
 def test_what_is_no_sensor_is_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} of a sensor must be"):
         Sensor([[1.0]], 1.0, **wrong)
+
+
+def test_a_noise_that_the_log_does_not_tell_is_not_identifiable(make, tmp_path):
+    """A compass that never speaks; the factors of the others are those of the simulation, 0.25 and 4."""
+    linear = {
+        "gps": Sensor([[1, 0, 0]], 4.0, interval=1.0),
+        "odometry": Sensor([[0, 1, 0]], 0.5),
+        "compass": Sensor([[0, 0, 1]], 0.25),
+    }
+    problem = problem_of(make(sensors=linear, sampling_interval=0.5).id)
+    made = filtergym.record(
+        problem.id, episodes=1, horizon=300, process_noise=(0.25, 0.25), measurement_noise=(4.0, 4.0)
+    )
+    values = np.where(made.measurements["available"][0] > 0.0, made.measurements["values"][0], np.nan)
+    values[:, 2] = np.nan
+    table = np.column_stack([made.seconds[0], values])
+    np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header="time,gps,odometry,compass", comments="")
+    log = read_recording(tmp_path / "log.csv", problem.id)
+    family = families_of(problem, log)["extended"]
+    tunable, fitted, intervals = fit_all(problem, log, family)
+    said = "\n".join(parameter_lines(tunable, fitted, intervals))
+    assert re.search(r"compass noise .*not identifiable, the likelihood is flat", said)
+    for name, factor in (("process_noise", 0.25), ("gps_noise", 4.0), ("odometry_noise", 4.0)):
+        interval = intervals[f"log10_{name}"]
+        assert interval.low - 0.1 < np.log10(factor) < interval.high + 0.1

@@ -81,7 +81,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
         console.print(OWN)
         return
     write_advised(out, problem, name, found, fitted, intervals, command_line())
-    console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
+    console.print(f"saved in {out}; filtergym evaluate {problem.name} --policy {out} runs it", soft_wrap=True)
 
 
 def advise_on_log(
@@ -206,7 +206,7 @@ def advise_on_log(
         )
         costs_words = price_words(advice.prices[name])
         console.print(
-            f"{name} is saved{costs_words}: filtergym evaluate {problem.id} --policy {out} runs it",
+            f"{name} is saved{costs_words}: filtergym evaluate {problem.name} --policy {out} runs it",
             soft_wrap=True,
         )
     if report is not None and make_page is not None:
