@@ -31,6 +31,7 @@ Commands = Mapping[str, Callable[..., None] | str]
 GROUPS: Mapping[str, Commands] = {
     "Use an environment": {
         "list": "listing:list_environments",
+        "doctor": "doctor:examine",
         "animate": "measure:animate",
         "record": "measure:record_scenario",
     },
@@ -57,7 +58,8 @@ GROUPS: Mapping[str, Commands] = {
 MARKUP: Any = "markdown"
 """Of help: in rich's own, the extra in filtergym[fast] would be taken for a style."""
 REPORT = (
-    "--debug shows where it happened: if that is not in code of your own, please report it with what it shows"
+    "--debug shows where it happened: if that is not in code of your own, please report it with what it shows and with "
+    "what filtergym doctor prints"
 )
 
 

@@ -1,12 +1,13 @@
 """The command line: what it prints, what it writes, and one clear sentence for every mistake."""
 
-import importlib.metadata
 import importlib.util
 import inspect
 import json
+import platform
 import re
 import subprocess
 import sys
+from importlib import metadata
 from types import SimpleNamespace
 
 import commands
@@ -50,7 +51,7 @@ def test_version_is_that_of_the_installed_package(monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 0
-    assert capsys.readouterr().out == f"filtergym {importlib.metadata.version('filtergym')}\n"
+    assert capsys.readouterr().out == f"filtergym {metadata.version('filtergym')}\n"
 
 
 COMMANDS = {name: import_command(own) for group in GROUPS.values() for name, own in group.items()}
@@ -243,6 +244,25 @@ def test_list_of_one_environment(run):
     result = run("list", "UavAutopilot")
     assert result.stdout.startswith("filtergym/UavAutopilot-v0\n")
     assert ENV not in result.stdout
+
+
+def test_doctor_says_what_an_issue_needs(run, monkeypatch):
+    lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
+    assert lines["filtergym"] == f"{metadata.version('filtergym')} on Python {platform.python_version()}"
+    for name in ("numpy", "msgspec"):
+        assert f"{name} {metadata.version(name)}" in lines["libraries"]
+    assert "[dev]" not in lines
+    known = metadata.version
+
+    def version(name):
+        if name == "llvmlite":
+            raise metadata.PackageNotFoundError(name)
+        return "0.1" if name == "numpy" else known(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
+    assert lines["[fast]"].startswith("llvmlite missing, platformdirs ")
+    assert "numpy 0.1, wants >=2.1" in lines["libraries"]
 
 
 def test_animate_draws_every_policy(tmp_path, run):
