@@ -31,7 +31,7 @@ EXTRAS := agents,fast,tensorboard,report,render,flights,logs,ins,adapters,onnx,o
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests core-test-names test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -57,6 +57,9 @@ core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch
 	$(PYTHON) -m venv build/$(ENVIRONMENT)
 	build/$(ENVIRONMENT)/bin/python -m pip install --quiet --constraint $(VERSIONS) --editable . pytest hypothesis
 	OMP_NUM_THREADS=1 build/$(ENVIRONMENT)/bin/python -m pytest $(CORE_TESTS)
+
+core-test-names:
+	@echo $(CORE_TESTS)
 
 test-lowest: $(VENV)/.dev  ## core tests with the lowest versions that pyproject.toml declares
 	mkdir -p build
