@@ -37,10 +37,15 @@ A closed loop adds one arrow back, from the estimate to the world, and names it:
 returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
 """
 
+import ast
 import importlib
+import inspect
+import re
+import textwrap
 from abc import ABC
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
@@ -154,6 +159,8 @@ class Task(ABC):
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
+    lost_cost: float | None = None
+    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
     log_reward_unit: float | None = None
     """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below
     ``reward_unit``; None where it is the same."""
@@ -335,3 +342,24 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
             yield from named_arrays(value, f"{prefix}{name}_")
         elif value is not None:
             yield prefix + name, value
+
+
+def field_words(cls: type) -> dict[str, str]:
+    """What a NamedTuple's text says below each of its fields; nothing where there is no text."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):
+        return {}
+    lines = tree.body if isinstance(tree, ast.ClassDef) else []
+    return {
+        field.target.id: _without_shapes(below.value.value)
+        for field, below in pairwise(lines)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        and isinstance(below.value.value, str)
+    }  # fmt: skip
+
+
+def _without_shapes(text: str) -> str:
+    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
+    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")

@@ -146,6 +146,8 @@ class LooselyCoupledNavigation(Task):
     causes = CAUSES
     start_measurements = 50
     cost_description = "squared error of position over the nominal variance of a measurement"
+    # No better than single measurements throughout; more axes cost more.
+    lost_cost = 1.0
     reward_unit = 0.16
     # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
     reward = "log-relative"
@@ -162,6 +164,7 @@ class LooselyCoupledNavigation(Task):
         self.groups = {} if p.axes == 1 else {"position": names}
         action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
+        self.lost_cost = float(p.axes)
 
 
 TASK = LooselyCoupledNavigation

@@ -247,7 +247,7 @@ def _positions(columns: Columns) -> numpy.ndarray:
     sigma = (
         float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
     )
-    check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
+    columns.notes += check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
     return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
 
 

@@ -136,6 +136,8 @@ class ManeuveringTarget(Task):
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
     causes = CAUSES
     cost_description = "squared position error over the squared range sigma"
+    # An error of a kilometre throughout: ten times that of a plot.
+    lost_cost = 100.0
     reward_unit = 8.0
     # What a turn costs rules the noise of the reward, and who does nothing pays for it too; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.

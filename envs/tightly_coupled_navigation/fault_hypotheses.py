@@ -267,8 +267,7 @@ class FaultHypotheses(Steerable["TightlyCoupledNavigation", Measurement, FaultSt
         mean, covariance = imm.combine(x[:, LINE:], P[:, :, LINE:], weights)
         x = xp.stack([x[:, REST], mean, x[:, SINGER]], axis=1)
         P = xp.stack([P[:, :, REST], covariance, P[:, :, SINGER]], axis=2)
-        kept = xp.where(between, 1.0, self.open_sky)
-        gained = xp.where(between, 0.0, self.gained)
+        kept, gained = self._error_process(between)
         mean, covariance = range_errors.predict(
             x, P, task.axis, common.T, common.decay, factors.motion * self.noise, kept, gained
         )
@@ -293,6 +292,11 @@ class FaultHypotheses(Steerable["TightlyCoupledNavigation", Measurement, FaultSt
         probabilities = xp.stack([(1.0 - ending) * rest, total, singer, factors.begun * begins])
         mean = xp.concat([mean, new[:, None]], axis=1)
         return mean, xp.concat([covariance, C[:, :, None]], axis=2), probabilities
+
+    def _error_process(self, between: Array) -> tuple[Any, Any]:
+        """What is left of a range error after a step, and the variance that it gains, m^2; one for all, or a list."""
+        xp = self.xp
+        return xp.where(between, 1.0, self.open_sky), xp.where(between, 0.0, self.gained)
 
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
         """How each range error may have been drawn anew."""

@@ -162,6 +162,8 @@ class TightlyCoupledNavigation(Task):
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix"
     )
+    # Five times the errors of a single-epoch fix throughout.
+    lost_cost = 25.0
     reward_unit = 10.0
     log_reward_unit = 0.1
     # A few lost tracks rule the mean, and who does nothing pays for them, too.

@@ -137,6 +137,8 @@ class UavAutopilot(Task):
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"
     )
+    # A loop that is off by ten times its sensor's error throughout.
+    lost_cost = 100.0
     reward_unit = 1.5
     # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
     reward = "relative"

@@ -29,6 +29,7 @@ from .terminal import (
     Trust,
     TruthOffset,
     TruthOption,
+    check_no_recording_options,
     complete_policy,
     console,
     pair,
@@ -81,6 +82,7 @@ def tune_policy(
         )
         fit_to_recording(problem, policy, found, out, seed)
         return
+    check_no_recording_options(truth, rename)
     tunable = problem.baselines.tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
