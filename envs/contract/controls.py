@@ -92,6 +92,8 @@ class SteeredBank(Bank[Any, Any, Any]):
 
     strong: ClassVar[type[Steerable[Any, Any, Any]]]
     """Class of the filter."""
+    own: Any
+    """The filter."""
 
     def __init__(self, task: Any, control: str) -> None:
         super().__init__(task, control)

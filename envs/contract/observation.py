@@ -270,6 +270,10 @@ class DecisionMeans:
         """Add these fields of an observation, ``(fields, N)``, to their sum since the last decision."""
         return total + observation[self.columns]
 
+    def write(self, observation: numpy.ndarray, total: numpy.ndarray) -> None:
+        """Put the means into an observation that may be changed; arguments as of :meth:`show`."""
+        observation[self.columns] = total / self.interval
+
     def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:
         """Return an observation, ``(fields, N)``, with the means of these fields in their places.
 
@@ -278,6 +282,10 @@ class DecisionMeans:
             total: sum over all measurements since the last decision.
             xp: array namespace.
         """
+        if isinstance(observation, numpy.ndarray):
+            shown = observation.copy()
+            self.write(shown, total)
+            return shown
         means = {column: total[i] / self.interval for i, column in enumerate(self.columns)}
         rows = range(observation.shape[0])
         return xp.stack([means.get(i, observation[i]) for i in rows]) if means else observation

@@ -146,9 +146,9 @@ class ModelStepper:
         """What is shown where it was computed, else None."""
         return self._shown
 
-    def show(self, observation: Array) -> None:
-        """Show something else, ``(fields, width)``."""
-        self._shown = observation
+    def show_means(self, means: DecisionMeans, total: Array) -> None:
+        """Show means over a decision, of which the sums are given."""
+        self._shown = means.show(self.observation_by_field(), total, self.model.task.xp)
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -292,7 +292,7 @@ class Lanes:
             if self._means.columns:
                 total = self._means.add(total, own.observation_by_field())
         if self._means.columns:
-            own.show(self._means.show(own.observation_by_field(), total, self.task.xp))
+            own.show_means(self._means, total)
         self.decisions += 1
         return answers
 

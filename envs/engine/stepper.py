@@ -19,7 +19,7 @@ from ...compiler.functions import (
 )
 from ...compiler.sequence import CallSequence, Moving, moving_array
 from ..contract.model import Episode
-from ..contract.observation import Array
+from ..contract.observation import Array, DecisionMeans
 from .episode_noise import EpisodeNoise
 from .programs import Report
 
@@ -298,9 +298,9 @@ class Stepper:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
 
-    def show(self, observation: numpy.ndarray) -> None:
-        """Show something else, ``(fields, width)``."""
-        self._shown[...] = observation.T
+    def show_means(self, means: DecisionMeans, total: numpy.ndarray) -> None:
+        """Show means over a decision, of which the sums are given."""
+        means.write(self._shown.T, total)
 
     def observation(self, count: int) -> numpy.ndarray:
         """Observation of the first lanes, batch first; the caller may keep it."""

@@ -31,7 +31,7 @@ a prediction with ``f5 Q`` and ``f6 W``, as these only add. Without a fix nothin
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -201,12 +201,11 @@ class FaultBank(Steerable[Task, Measurement, FaultState]):
         **changed: fields of the prior.
     """
 
-    settings: ClassVar[dict[str, float]] = {
-        "pull": 1.05, "modelled": 1.05, "level": 1.5, "receiver": 1.25, "inertial": 2.0, "wandering": 2.0
-    }  # fmt: skip
-
     def __init__(self, task: Task, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
+        self.settings = {
+            "pull": 1.05, "modelled": 1.05, "level": 1.5, "receiver": 1.25, "inertial": 2.0, "wandering": 2.0
+        }  # fmt: skip
         self.prior, p = prior._replace(**changed), task.parameters
         prior, self.interval = self.prior, p.sampling_interval
         self.eye = task.constant(numpy.eye(p.axes))[:, :, None]

@@ -18,7 +18,7 @@ missed the target is prediction only.
 import functools
 import itertools
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
 from ...filters.ordered_sums import ordered_sum, weighted_sum
@@ -123,12 +123,11 @@ class SemiMarkov(ConstantVelocityModel, Steerable["ManeuveringTarget", Measureme
     """Straight flights after different manoeuvres stay apart so long; with one, what has hardly been a manoeuvre
     spoils the long memory of straight flight in every scan."""
 
-    settings: ClassVar[dict[str, float]] = {
-        "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25
-    }  # fmt: skip
-
     def __init__(self, task: "ManeuveringTarget", prior: SemiMarkovPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
+        self.settings = {
+            "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25
+        }  # fmt: skip
         self.prior = prior = prior._replace(**changed)
         self.ages, self.hazard = len(prior.hazards), task.constant(prior.hazards)[:, None]
         self.turns = [side * size for size in prior.turns for side in (1.0, -1.0)]

@@ -33,7 +33,7 @@ their levels, of accelerometers. Where a rate is missing its levels stay what th
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
@@ -184,15 +184,14 @@ class FaultHypotheses(Steerable["TightlyCoupledNavigation", Measurement, FaultSt
         **changed: fields of the prior.
     """
 
-    settings: ClassVar[dict[str, float]] = {
-        "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,
-        "motion": 2.0, "pseudoranges": 2.0, "rates": 2.0, "accelerometers": 4.0,
-    }  # fmt: skip
-
     def __init__(
         self, task: "TightlyCoupledNavigation", prior: FaultPrior = TRAINING, **changed: Any
     ) -> None:
         super().__init__(task)
+        self.settings = {
+            "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,
+            "motion": 2.0, "pseudoranges": 2.0, "rates": 2.0, "accelerometers": 4.0,
+        }  # fmt: skip
         self.prior = prior = prior._replace(**changed)
         T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
         self.size = n
