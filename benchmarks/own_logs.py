@@ -34,8 +34,8 @@ from filtergym import read_recording
 ROOT = Path(__file__).parent.parent
 LATE = 0.15
 """Of the camera, s."""
-CANDIDATES = 120
-"""Factors that are tried for the limit, twice."""
+CANDIDATES = 40
+"""Factors that are tried for the limit, three times, each time closer to the best."""
 
 
 # --- filters of filterpy, of rows of a log by column
@@ -158,10 +158,10 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
 def limit(task: Any, recording: Any, names: list[str]) -> dict[str, float]:
     """Factors of the least error."""
     rng, best, width = np.random.default_rng(0), np.zeros(len(names)), 2.0
-    for _ in range(2):
+    for _ in range(3):
         tried = best + width * rng.uniform(-1.0, 1.0, (CANDIDATES, len(names)))
         factors = {name: 10.0**column for name, column in zip(names, tried.T, strict=True)}
-        best, width = tried[np.log(errors(task, recording, factors)).mean(axis=1).argmin()], width / 4.0
+        best, width = tried[np.log(errors(task, recording, factors)).mean(axis=1).argmin()], width / 3.0
     return dict(zip(names, (10.0**best).tolist(), strict=True))
 
 
