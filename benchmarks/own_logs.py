@@ -1,16 +1,14 @@
 """Five machines with a log each: our filters fitted to it, and a filter of filterpy with Q and R set by hand.
 
-python benchmarks/own_logs.py --out docs/records/own_logs.json
+python benchmarks/own_logs.py
 
 The machines and their models are docs/examples/own_logs. What is fitted to one log is judged on ten others. The limit
 is our filter with the factors on Q and R that have the least error on these ten: nobody knows them beforehand.
 """
 
 import argparse
-import datetime
 import functools
 import importlib
-import json
 import sys
 import tempfile
 from pathlib import Path
@@ -26,9 +24,9 @@ from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.likelihood import Span, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
+from filtergym.papers.grid import markdown_table
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 
-import filtergym
 from filtergym import read_recording
 
 ROOT = Path(__file__).parent.parent
@@ -218,13 +216,12 @@ def compare(name: str, folder: Path) -> list[list[str]]:
         shown = several.get(who, {})
         noises = ", ".join(f"{key.removesuffix('_noise')} {value:.3g}" for key, value in shown.items())
         rows.append([name.replace("_", " "), who, f"{np.sqrt(np.mean(each**2)):.4g}", less, noises])
-        print(" | ".join(rows[-1]), flush=True)
+        print(" ".join(rows[-1]), file=sys.stderr, flush=True)
     return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path)
     parser.add_argument("--only", choices=sorted(BY_HAND))
     options = parser.parse_args()
     sys.path.insert(0, str(ROOT / "docs" / "examples" / "own_logs"))
@@ -233,16 +230,7 @@ def main() -> None:
         names = [options.only] if options.only else list(BY_HAND)
         make_logs.write_logs(Path(folder), names)
         rows = [row for name in names for row in compare(name, Path(folder))]
-    if options.out is not None:
-        columns = ["machine", "filter", "RMSE", "of filterpy's", "factors"]
-        record = {
-            "command": "python benchmarks/own_logs.py",
-            "made": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
-            "versions": {"filtergym": filtergym.__version__, "numpy": np.__version__},
-            "note": "",
-            "data": {"columns": columns, "rows": rows},
-        }
-        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    print("\n".join(markdown_table(("machine", "filter", "RMSE", "of filterpy's", "factors"), rows)))
 
 
 if __name__ == "__main__":

@@ -99,6 +99,13 @@ class StateSpaceDefinition:
         """Means of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
+    @property
+    def measurement_words(self) -> str:
+        """What the numbers of a measurement are."""
+        words = f"Of a measurement, values and available are of {', '.join(self.measured)}, in this order"
+        inputs = ", ".join(self.inputs)
+        return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
+
     def usual_noise(self, interval: float) -> numpy.ndarray:
         """Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
         return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)

@@ -122,7 +122,9 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
         self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
         self.row_uniforms = self.drawn + self.receptions.row_uniforms
-        self.places = components_measured(own.world[0].h)
+        turning = {j for one in own.channels if one.period for j in range(one.first, one.first + one.count)}
+        # An angle is no reading of a component that turns on beyond it.
+        self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
 
     def _root(self, covariance: numpy.ndarray) -> Array:
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
@@ -369,6 +371,7 @@ def state_space_attributes(
     return {
         "definition": definition,
         **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
+        "measurement_words": definition.measurement_words,
         "log_format": state_space_log_format(definition, defaults),
         "components": tuple(map(Component, names, units)),
         "banks": banks,
