@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filtergym.baselines.advice import fit_all
 from filtergym.baselines.fitted_filters import families_of
+from filtergym.baselines.fitting import fit
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
 from filtergym.baselines.table import without_logarithms
 from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
-from filtergym.evaluation.competitors.likelihood import Span, cut_windows
+from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
@@ -115,7 +115,7 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
 def late_vision(log: dict[str, np.ndarray]) -> np.ndarray:
     """Data sheets: camera 2 cm, accelerometer 0.1 m/s^2; a fix is taken for one of the time at which it arrives."""
     kf, dt, late = KalmanFilter(3, 1, 1), 0.01, round(LATE / 0.01)
-    kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.01, 0.04]), []
+    kf.x, kf.P, found = np.zeros(3), np.diag([0.01, 0.1, 0.04]), []
     kf.F, kf.B = np.array([[1, dt, -(dt**2) / 2], [0, 1, -dt], [0, 0, 1]]), np.array([dt**2 / 2, dt, 0])
     kf.Q, kf.R, kf.H = np.diag([0, 2e-4, 1e-5]), np.array([[4e-4]]), np.array([[1.0, 0, 0]])
     camera = np.concatenate([np.full(late, np.nan), log["camera"][:-late]])
@@ -189,8 +189,11 @@ def compare(name: str, folder: Path) -> list[list[str]]:
     module = importlib.import_module(name)
     problem = problem_of(next(cls.id for cls in vars(module).values() if hasattr(cls, "definition")))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))
-    tunable, fitted, _ = fit_all(problem, log, families_of(problem, log)["extended"])
-    advised = without_logarithms(fitted.values)
+    tunable = families_of(problem, log)["extended"]
+    own = make_model(problem.task, backend="numpy", **log.parameters).task
+    windows = cut_windows(log, own, [Span(0, 0, int(log.rows[0]))], 0)
+    likelihood = WindowLikelihood(own, windows, tunable.start, tunable.apply, tunable.in_lanes)
+    fitted = without_logarithms(fit(likelihood, tunable, starts=1).values)
     names = [each.removeprefix("log10_") for each in tunable.limits]
     task = make_model(problem.task, backend="numpy", **judged.parameters).task
     logs = read_logs(folder / f"{name}_judged.csv")
@@ -200,7 +203,7 @@ def compare(name: str, folder: Path) -> list[list[str]]:
     found = {"filterpy, set by hand": np.sqrt([(each**2).sum(axis=1).mean() for each in by_hand])}
     several = {
         "as written": dict.fromkeys(names, 1.0),
-        "advised": advised,
+        "fitted": fitted,
         "limit": limit(task, judged, names),
     }
     for who, factors in several.items():

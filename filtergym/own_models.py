@@ -36,6 +36,9 @@ from .own_sensors import check_columns, find_channels, replace_sensors, sensor_c
 EQUATIONS = ("f", "Q", "drift", "diffusion", "h", "R", "sensors")
 TRIED = 32, 64
 """Episodes and measurements from which the unit of the reward is estimated."""
+SMALL, FEWEST = 12, 8
+"""States up to which all these measurements are tried, whose time grows with the cube of the state; and how many are
+tried of any."""
 
 
 def state_space(
@@ -256,8 +259,10 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
     """Median over some episodes of what the filter as written is charged, to two digits; 1 where that is no unit."""
-    episodes, measurements = TRIED
     model: Any = Model(cls(parameters), cls.paper_policy.control)
+    episodes, measurements = TRIED
+    share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3
+    measurements = max(int(measurements * share), FEWEST)
     generator = numpy.random.default_rng(episode_seeds("train", 0, 1))
     noise = model.task.noise
     action = numpy.zeros((*model.action_space.shape, episodes))

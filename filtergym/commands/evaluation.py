@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -304,7 +305,8 @@ def run(
             bar.update(line, advance=done)
 
         if task.flights or outputs.estimates is not None or whole:
-            dataset = run_experiment(experiment, competitors_of(problem, names, trust), tick, workers)
+            named = replace(experiment, paper=problem.paper_among(names))
+            dataset = run_experiment(named, competitors_of(problem, names, trust), tick, workers)
             records = tidy_records(dataset)
             if outputs.estimates is None:
                 tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]
