@@ -240,7 +240,7 @@ class Equations:
         rows, none = [], 0.0 * sum(of_sensors.values())  # of their shape
         for channel in self.channels:
             own = of_sensors.get(channel.name, 1.0) + none
-            rows += [own * R[place] for place in range(channel.first, channel.first + channel.count)]
+            rows += [own * R[place] for place in channel.numbers]
         return self.xp.stack(rows)
 
     def measure(self, x: Array) -> Array:
@@ -254,7 +254,7 @@ class Equations:
             return nu
         rows = []
         for channel in self.channels:
-            for place in range(channel.first, channel.first + channel.count):
+            for place in channel.numbers:
                 turns = (
                     0.0
                     if channel.period is None
@@ -295,7 +295,7 @@ class Equations:
             if channel.gate is not None:
                 _, squared = log_density(nu[channel.places], S[channel.places, channel.places])
                 within = xp.where(squared <= channel.gate**2, within, 0.0)
-            rows += [within] * channel.count
+            rows += [within] * channel.size
         return xp.stack(rows)
 
     def _value(self, function: VectorFunction, x: Array) -> Array:

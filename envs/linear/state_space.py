@@ -122,7 +122,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
         self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
         self.row_uniforms = self.drawn + self.receptions.row_uniforms
-        turning = {j for one in own.channels if one.period for j in range(one.first, one.first + one.count)}
+        turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
         self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
 
@@ -146,7 +146,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
         inputs = self.courses.begin(normals[self.states :])
         sensors = self.receptions.begin(draws, zero)
-        return Truth(state, first, *factors, inputs, sensors), Initial(mean, covariance)
+        return Truth(state, first, *factors, inputs=inputs, sensors=sensors), Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
         """Switch, move, measure."""
@@ -359,7 +359,7 @@ def state_space_attributes(
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]
-    held_out = {
+    held_out: dict[str, tuple[str, dict[str, Any]]] = {
         "rough": ("ten times the process noise", {"process_noise": (10.0, 10.0)}),
         "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
         "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
