@@ -7,7 +7,6 @@ is our filter with the factors on Q and R that have the least error on these ten
 """
 
 import argparse
-import functools
 import importlib
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.fitting import fit
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
-from filtergym.baselines.table import without_logarithms
+from filtergym.baselines.table import Variant, without_logarithms
 from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
@@ -170,7 +169,7 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
         seen = np.isfinite(log["camera"])
         fixes = zip(log["time"][seen], log["time"][seen] + LATE - 1e-6, log["camera"][seen], strict=True)
         imu = zip(log["time"], log["acceleration"], strict=True)
-        mean = module.follow(functools.partial(Extended, **factors), imu, fixes)
+        mean = module.follow(Variant(Extended, "", **factors), imu, fixes)
         found.append(np.sqrt(np.mean((mean[:, 0] - log["truth_position"]) ** 2)))
     return np.array(found)
 

@@ -57,7 +57,7 @@ def pitch_roll(rng, seconds=30, dt=0.02, fine=10):
     q = correlated(rng, n * fine, h, 0.4, 0.5)
     roll, pitch = rng.normal(0.0, 0.1, (2, 1)) + np.zeros((2, n * fine))
     for k in range(1, n * fine):
-        q[k] -= pitch[k - 1]  # its controller holds the pitch, rad/s per rad
+        q[k] -= pitch[k - 1] * np.cos(roll[k - 1])  # its controller holds the pitch, also upside down
         roll[k] = roll[k - 1] + h * (p[k] + q[k] * np.sin(roll[k - 1]) * np.tan(pitch[k - 1]))
         pitch[k] = pitch[k - 1] + h * q[k] * np.cos(roll[k - 1])
     mean = lambda rate: rate.reshape(n, fine).mean(axis=1)  # noqa: E731
