@@ -132,13 +132,13 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
-        factors = [
+        process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
             for name, limits in (
                 ("process noise", p.process_noise),
                 ("measurement noise", p.measurement_noise),
             )
-        ]
+        )
         count = len(own.world)
         first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
         mean = self.task.constant(own.mean)[:, None] + zero
@@ -146,7 +146,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
         inputs = self.courses.begin(normals[self.states :])
         sensors = self.receptions.begin(draws, zero)
-        return Truth(state, first, *factors, inputs=inputs, sensors=sensors), Initial(mean, covariance)
+        return Truth(state, first, process, measurement, inputs, sensors), Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
         """Switch, move, measure."""
