@@ -97,6 +97,8 @@ class Competitor(NamedTuple):
     """Mean normalised innovation squared of judged measurements over its dimension."""
     correlation: Estimate
     """Of successive judged prediction errors; zero where they are white."""
+    correlations: Mapping[str, Estimate]
+    """Likewise of each number that is measured, by its name; empty where all are of one kind."""
 
 
 class Judgement:
@@ -227,6 +229,7 @@ class Judgement:
             self.relative_error(name, rival),
             found.nis(name, judged),
             correlation(self._errors[name], judged) if name in self._errors else UNKNOWN,
+            found.correlations(name, judged) if name in self._errors else {},
         )
 
 

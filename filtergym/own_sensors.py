@@ -91,9 +91,9 @@ def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -
     Raises:
         ValueError: for names or units that do not fit.
     """
-    columns = {}
+    columns: dict[str, str] = {}
     for channel in channels:
-        one, count = sensors[channel.name], channel.count
+        one, count = sensors[channel.name], channel.size
         parts = tuple(one.names) or tuple(str(j + 1) for j in range(count))
         units = tuple(one.units) or (one.wraps or "",) * count
         if len(parts) != count or len(units) != count:

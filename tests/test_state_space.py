@@ -557,7 +557,7 @@ def test_another_interval_than_the_models_is_refused(make, time):
         ({"R": np.eye(2)}, r"R must be finite numbers of shape \(1, 1\)"),
         ({"names": ["one"]}, "names and units must be 2 each"),
         ({"weights": [0.0, 0.0]}, "weights must not be negative, nor all zero"),
-        ({"filter_model": {"F": F}}, "filter_model says f, h, Q or R, got 'F'"),
+        ({"filter_model": {"F": F}}, "filter_model says f, Q, h or R, got 'F'"),
         ({"hypotheses": [{"h": np.eye(2), "R": np.eye(2)}]}, "all models must measure as many numbers"),
         ({"hypotheses": [{"Q": Q}], "transition": [[0.9, 0.2], [0.5, 0.5]]}, "transition must hold probabilities"),
         ({"horizon": 0}, "horizon must be"),

@@ -187,7 +187,11 @@ def test_a_filter_with_inputs_is_exported(make, tmp_path):
     figures = export_c(request_export(problem_of(make().id), "extended"), tmp_path)
     assert figures.difference < 1e-9
     assert figures.test
-    assert any("inputs[2]" in path.read_text() for path in tmp_path.glob("*.h"))
+    header = (tmp_path / "extended.h").read_text()
+    assert "inputs[2]" in header
+    assert "values and available are of voltage, in this order; inputs" in " ".join(header.split()).replace(
+        " * ", " "
+    )
 
 
 @pytest.mark.parametrize(

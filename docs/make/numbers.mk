@@ -58,7 +58,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -157,6 +157,11 @@ $(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation
 $(DONE)/online: $(DONE)/ship-ManeuveringTarget
 	$(BIN)/python benchmarks/online.py > build/online.txt
 	$(table) build/online.txt --name online_time --command "python benchmarks/online.py"
+	$(finish)
+
+$(DONE)/own_logs:
+	$(BIN)/python benchmarks/own_logs.py > build/own_logs.txt
+	$(table) build/own_logs.txt --name own_logs --command "python benchmarks/own_logs.py"
 	$(finish)
 
 $(DONE)/cold:

@@ -142,6 +142,8 @@ class Task(ABC):
     recorded_decision_interval: ClassVar[int | None] = None
     """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
     measurement is lost."""
+    measurement_words: ClassVar[str] = ""
+    """What the numbers of a measurement are, in a sentence for those who fill in arrays; empty where names say it."""
     log_format: ClassVar[LogFormat | None] = None
     """Tables of real measurements that can be read; None where they cannot."""
     live_input: ClassVar[type[LiveInput]] = LiveInput

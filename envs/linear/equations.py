@@ -99,6 +99,13 @@ class StateSpaceDefinition:
         """Means of the inputs, ``(p,)``."""
         return numpy.array([one.mean for one in self.inputs.values()])
 
+    @property
+    def measurement_words(self) -> str:
+        """What the numbers of a measurement are."""
+        words = f"Of a measurement, values and available are of {', '.join(self.measured)}, in this order"
+        inputs = ", ".join(self.inputs)
+        return f"{words}; inputs, which acted since the one before, are {inputs}." if inputs else f"{words}."
+
     def usual_noise(self, interval: float) -> numpy.ndarray:
         """Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
         return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
@@ -233,7 +240,7 @@ class Equations:
         rows, none = [], 0.0 * sum(of_sensors.values())  # of their shape
         for channel in self.channels:
             own = of_sensors.get(channel.name, 1.0) + none
-            rows += [own * R[place] for place in range(channel.first, channel.first + channel.count)]
+            rows += [own * R[place] for place in channel.numbers]
         return self.xp.stack(rows)
 
     def measure(self, x: Array) -> Array:
@@ -247,7 +254,7 @@ class Equations:
             return nu
         rows = []
         for channel in self.channels:
-            for place in range(channel.first, channel.first + channel.count):
+            for place in channel.numbers:
                 turns = (
                     0.0
                     if channel.period is None
@@ -288,7 +295,7 @@ class Equations:
             if channel.gate is not None:
                 _, squared = log_density(nu[channel.places], S[channel.places, channel.places])
                 within = xp.where(squared <= channel.gate**2, within, 0.0)
-            rows += [within] * channel.count
+            rows += [within] * channel.size
         return xp.stack(rows)
 
     def _value(self, function: VectorFunction, x: Array) -> Array:

@@ -31,7 +31,7 @@ class StateSpaceInput(LiveInput):
         """Return what the sensors and inputs say; the interval follows from the times."""
         values, at_start = super().describe()
         found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
-        sensors = {channel.name: f"shape ({channel.count},)" for channel in self.groups}
+        sensors = {channel.name: f"shape ({channel.size},)" for channel in self.groups}
         names = {**sensors, **dict.fromkeys(self.measured, "a number")}
         held = dict.fromkeys(
             self.inputs, "an input that acted since the last measurement; the last one holds on"
@@ -73,7 +73,7 @@ class StateSpaceInput(LiveInput):
             return dict(values)
         rows = numpy.stack([self.read(values, name) for name in self.measured])
         for channel in self.groups:
-            given, own = self.read(values, channel.name, (channel.count,)), rows[channel.places]
+            given, own = self.read(values, channel.name, (channel.size,)), rows[channel.places]
             if (numpy.isfinite(given) & numpy.isfinite(own)).any():
                 raise ValueError(
                     f"{channel.name} has {self.measured[channel.first]} already: give one of them"

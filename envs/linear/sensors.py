@@ -70,7 +70,7 @@ class Channel(NamedTuple):
 
     name: str
     first: int
-    count: int
+    size: int
     interval: float | None = None
     availability: float = 1.0
     gate: float | None = None
@@ -79,13 +79,18 @@ class Channel(NamedTuple):
 
     @property
     def places(self) -> slice:
-        """Its numbers."""
-        return slice(self.first, self.first + self.count)
+        """Of its numbers."""
+        return slice(self.first, self.first + self.size)
+
+    @property
+    def numbers(self) -> range:
+        """Place of each of them."""
+        return range(self.first, self.first + self.size)
 
     def received(self, available: Array) -> Array:
         """Whether it said anything, ``(N,)``, from what was received, ``(m, N)``."""
         found = available[self.first] > 0.0
-        for place in range(self.first + 1, self.first + self.count):
+        for place in self.numbers[1:]:
             found = found | (available[place] > 0.0)
         return found
 
@@ -148,7 +153,7 @@ class Receptions:
         size, rows = (self.parameters.bias * self.deviations).tolist(), []
         for number, channel in enumerate(self.channels):
             one = self.xp.where(biased == float(number), sign, zero)
-            rows += [size[place] * one for place in range(channel.first, channel.first + channel.count)]
+            rows += [size[place] * one for place in channel.numbers]
         return self.xp.stack(rows)
 
     def advance(
@@ -186,5 +191,5 @@ class Receptions:
         states = states._replace(
             waited=xp.stack(waited) if waited else None, silent=xp.stack(silent) if silent else None
         )
-        rows = [here[channel.name] for channel in self.channels for _ in range(channel.count)]
+        rows = [here[channel.name] for channel in self.channels for _ in range(channel.size)]
         return (None if all(part is None for part in states) else states), xp.stack(rows)

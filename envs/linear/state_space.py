@@ -122,7 +122,9 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
         self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
         self.row_uniforms = self.drawn + self.receptions.row_uniforms
-        self.places = components_measured(own.world[0].h)
+        turning = {j for one in own.channels if one.period for j in one.numbers}
+        # An angle is no reading of a component that turns on beyond it.
+        self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
 
     def _root(self, covariance: numpy.ndarray) -> Array:
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
@@ -130,13 +132,13 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
-        factors = [
+        process, measurement = (
             draw_between(draws.log_uniform, name, limits) + zero
             for name, limits in (
                 ("process noise", p.process_noise),
                 ("measurement noise", p.measurement_noise),
             )
-        ]
+        )
         count = len(own.world)
         first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
         mean = self.task.constant(own.mean)[:, None] + zero
@@ -144,7 +146,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
         inputs = self.courses.begin(normals[self.states :])
         sensors = self.receptions.begin(draws, zero)
-        return Truth(state, first, *factors, inputs, sensors), Initial(mean, covariance)
+        return Truth(state, first, process, measurement, inputs, sensors), Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
         """Switch, move, measure."""
@@ -357,7 +359,7 @@ def state_space_attributes(
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]
-    held_out = {
+    held_out: dict[str, tuple[str, dict[str, Any]]] = {
         "rough": ("ten times the process noise", {"process_noise": (10.0, 10.0)}),
         "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
         "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
@@ -369,6 +371,7 @@ def state_space_attributes(
     return {
         "definition": definition,
         **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
+        "measurement_words": definition.measurement_words,
         "log_format": state_space_log_format(definition, defaults),
         "components": tuple(map(Component, names, units)),
         "banks": banks,

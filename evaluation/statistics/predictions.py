@@ -59,6 +59,26 @@ class Predictions:
         found: numpy.ndarray = numpy.moveaxis(values, -1, 0)
         return found
 
+    def correlations(self, name: str, mask: numpy.ndarray) -> dict[str, Estimate]:
+        """Correlation of the successive prediction errors of each number that is measured, each received one with the
+        last received before; empty where all are of one group.
+
+        Args:
+            name: of a competitor.
+            mask: of the measurements, ``(episodes, time)``.
+        """
+        if "prediction_error" not in self.dataset or len({*self.dataset["measured_group"].values}) < 2:
+            return {}
+        values = self.dataset["prediction_error"].sel(policy=name).values
+        found = {}
+        for number, errors in zip(
+            self.dataset["measured"].values, numpy.moveaxis(values, -1, 0), strict=True
+        ):
+            before = _last_before(errors)
+            pairs = numpy.stack([errors * before, 0.5 * (errors**2 + before**2)], axis=-1)
+            found[str(number)] = stretch_interval(mask, pairs, ratio)
+        return found
+
     def nis(self, name: str, mask: numpy.ndarray) -> float:
         """Mean normalised innovation squared of some measurements over its dimension; NaN where it is not known."""
         if "nis" not in self.dataset:
@@ -110,6 +130,14 @@ def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> Estimate:
     before[:, :, 0] = math.nan
     values = numpy.stack([(errors * before).sum(axis=0), 0.5 * (errors**2 + before**2).sum(axis=0)], axis=-1)
     return stretch_interval(mask, values, ratio)
+
+
+def _last_before(errors: numpy.ndarray) -> numpy.ndarray:
+    """Of each error ``(episodes, time)`` the last finite one before it; NaN where there is none."""
+    times = numpy.arange(errors.shape[1])
+    last = numpy.maximum.accumulate(numpy.where(numpy.isfinite(errors), times, -1), axis=1)
+    last = numpy.concatenate([numpy.full((len(errors), 1), -1), last[:, :-1]], axis=1)
+    return numpy.where(last >= 0, numpy.take_along_axis(errors, numpy.maximum(last, 0), axis=1), math.nan)
 
 
 def stretch_interval(

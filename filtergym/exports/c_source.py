@@ -541,6 +541,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
     return [
         f"{request.name} of {request.problem.id}, in {precision}, for one track. {first}".strip(),
         *([f"With parameters of the task: {parameters}."] if parameters else []),
+        *([request.problem.task.measurement_words] if request.problem.task.measurement_words else []),
         f"Made by: {command}" if command else "Made by filtergym.",
         "",
         "No allocation, nothing but math.h. Compare it with the filter that was judged:",

@@ -13,7 +13,7 @@ Rail = filtergym.state_space(
     inputs={"acceleration": Input(deviation=1.5, correlation_time=0.7, noise=0.1, unit="m/s^2")},
     sensors={"camera": Sensor([[1, 0, 0]], 0.02**2, interval=0.2)},
     mean=[0, 0, 0],
-    covariance=np.diag([0.01, 0.01, 0.04]),
+    covariance=np.diag([0.01, 0.1, 0.04]),
     names=["position", "velocity", "bias"],
     units=["m", "m/s", "m/s^2"],
     weights=[1, 0, 0],

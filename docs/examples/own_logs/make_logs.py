@@ -24,7 +24,7 @@ def gps_odometry(rng, seconds=120, dt=0.1):
     """A drone in wind: GPS of 2.5 m each second, velocity by camera of 0.15 m/s each 0.1 s, of which a tenth is lost."""
     n = int(seconds / dt)
     v = np.array([correlated(rng, n, dt, 3.0, 10.0) + correlated(rng, n, dt, 0.3, 0.5) for _ in range(2)])
-    p = np.cumsum(v, axis=1) * dt
+    p = rng.normal(0.0, 10.0, (2, 1)) + np.cumsum(v, axis=1) * dt
     fix = np.where(np.arange(1, n + 1) % 10 == 0, p + rng.normal(0.0, 2.5, (2, n)), np.nan)
     flow = np.where(rng.random(n) < 0.9, v + rng.normal(0.0, 0.15, (2, n)), np.nan)
     return {
@@ -37,8 +37,8 @@ def level_gauge(rng, days=10):
     """A reservoir: inflow wanders, the gauge drifts. It speaks about each 10 minutes, a dip stick twice a day."""
     dt, n = 60.0, days * 1440
     rate = correlated(rng, n, dt, 0.05 / 3600, 6 * 3600)
-    level = 10.0 + np.cumsum(rate) * dt
-    offset = np.cumsum(rng.normal(0.0, 0.03 / np.sqrt(1440), n))  # 3 cm after a day
+    level = rng.normal(10.0, 0.1) + np.cumsum(rate) * dt
+    offset = rng.normal(0.0, 0.05) + np.cumsum(rng.normal(0.0, 0.03 / np.sqrt(1440), n))  # 3 cm after a day
     times = np.cumsum(rng.exponential(600.0, 3 * n // 10).astype(int) // 60 + 1)
     times = times[times < n]
     dipped = np.array([(k // 720) != (k_before // 720) for k, k_before in zip(times[1:], times, strict=False)])
@@ -55,13 +55,13 @@ def pitch_roll(rng, seconds=30, dt=0.02, fine=10):
     h = dt / fine
     p = 1.0 + correlated(rng, n * fine, h, 0.8, 1.0)
     q = correlated(rng, n * fine, h, 0.4, 0.5)
-    roll, pitch = np.zeros(n * fine), np.zeros(n * fine)
+    roll, pitch = rng.normal(0.0, 0.1, (2, 1)) + np.zeros((2, n * fine))
     for k in range(1, n * fine):
-        q[k] -= pitch[k - 1]  # its controller holds the pitch, rad/s per rad
+        q[k] -= pitch[k - 1] * np.cos(roll[k - 1])  # its controller holds the pitch, also upside down
         roll[k] = roll[k - 1] + h * (p[k] + q[k] * np.sin(roll[k - 1]) * np.tan(pitch[k - 1]))
         pitch[k] = pitch[k - 1] + h * q[k] * np.cos(roll[k - 1])
     mean = lambda rate: rate.reshape(n, fine).mean(axis=1)  # noqa: E731
-    bias = [0.03 + np.cumsum(rng.normal(0.0, 0.002 * np.sqrt(dt), n)) for _ in range(2)]
+    bias = [rng.normal(0.0, 0.05) + np.cumsum(rng.normal(0.0, 0.002 * np.sqrt(dt), n)) for _ in range(2)]
     own = [correlated(rng, n, dt, 0.6, 0.2) for _ in range(3)]
     last = slice(fine - 1, None, fine)
     force = [
@@ -81,7 +81,7 @@ def battery(rng, seconds=3600, dt=2.0):
     """A cell of 2.5 Ah under a driving cycle: two RC pairs, a current sensor of 30 mA with an offset, voltage of 5 mV."""
     n = int(seconds / dt)
     current = np.maximum(-2.0, 1.8 + correlated(rng, n, dt, 1.5, 20.0))
-    charge = 0.9 + rng.normal(0.0, 0.02) - np.cumsum(current) * dt / (2.5 * 3600)
+    charge = rng.normal(0.8, 0.1) - np.cumsum(current) * dt / (2.5 * 3600)
     pairs = np.zeros((2, n))
     for k in range(1, n):
         for pair, (R, seconds_) in enumerate(((0.015, 20.0), (0.01, 300.0))):
@@ -103,7 +103,7 @@ def late_vision(rng, seconds=20, dt=0.01):
     v = np.cumsum(a) * dt
     v -= np.linspace(0.0, v[-1], n)  # it comes to rest
     a = np.gradient(v, dt)
-    p = np.cumsum(v) * dt
+    p = rng.normal(0.0, 0.1) + np.cumsum(v) * dt
     bias = rng.normal(0.0, 0.2) + np.cumsum(rng.normal(0.0, 0.01 * np.sqrt(dt), n))
     seen = np.where(np.arange(n) % 20 == 0, p + rng.normal(0.0, 0.01, n), np.nan)
     return {

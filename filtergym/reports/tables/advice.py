@@ -498,6 +498,10 @@ def _warnings(advice: Advice) -> Iterator[str]:
             f"Successive prediction errors are correlated ({correlation.value:+.2f}): the errors of measurements are "
             "not white, or the motion is none of the models'. The likelihood then misleads."
         )
+    each = {name: of for name, of in one.correlations.items() if not math.isnan(of.low)}
+    if each:
+        shown = ", ".join(f"{name} {_interval(of, '+.2f')}" for name, of in each.items())
+        yield f"Correlation of successive prediction errors, 0 where they are white, by sensor: {shown}."
     wide = [
         parameter_name(name)
         for name, interval in advice.intervals.items()
