@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +274,7 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
+    experiment = replace(experiment, paper=problem.paper_among(makers))
     own, horizon = problem.baselines.metrics, experiment.make_task().horizon
     return [
         EvaluationRequest(experiment, name, maker, own, horizon, curves=curves)

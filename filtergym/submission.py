@@ -48,7 +48,9 @@ OWN = "submission"
 """Name of a submission among the competitors of its evaluation."""
 TIME = "nanoseconds"
 """The metric that differs from run to run: it is told, and not compared."""
-RATIOS = ("relative_cost_difference", "median_cost_ratio", "win_rate", "anees", "lost_episodes")
+RATIOS = (
+    "geometric_cost_difference", "lost_tracks", "relative_cost_difference", "anees", "lost_episodes",
+)  # fmt: skip
 """Metrics whose scale is one."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""

@@ -31,7 +31,10 @@ Progress = Callable[[int], None]
 
 
 def start_lanes(
-    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+    model: Model,
+    seeds: Sequence[int],
+    on_start: Callable[[Episode], None] | None = None,
+    report: Report | None = None,
 ) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
@@ -39,8 +42,9 @@ def start_lanes(
         model: task with a bank.
         seeds: of the episodes.
         on_start: called with the episodes at the start of the track.
+        report: that will be made of them; default: not known.
     """
-    lanes = Lanes(model, len(seeds), on_start=on_start)
+    lanes = Lanes(model, len(seeds), on_start=on_start, report=report)
     lanes.begin(identities_of_seeds(seeds))
     return lanes
 
@@ -78,7 +82,7 @@ def rollout(
 
 def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
     """Step a filter that needs nobody who steers it."""
-    lanes, action = start_lanes(looped, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+    lanes, action = start_lanes(looped, seeds, report=report), numpy.zeros(len(seeds), dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for found, _ in lanes.decide(action, report):
             yield found, action
@@ -88,7 +92,7 @@ def _steer_by_python(
     model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
     """Step a bank, and ask its policy before every decision."""
-    lanes = start_lanes(model, seeds)
+    lanes = start_lanes(model, seeds, report=report)
     policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
@@ -200,7 +204,7 @@ def _run_compiled(
     looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
     """Run compiled episodes as one call of native code."""
-    lanes, count = start_lanes(looped, seeds), len(seeds)
+    lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     reports, actions = lanes.run(report, steering)
     tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
     found = {name: _episodes_first(values, count) for name, values in reports.items()}
@@ -345,7 +349,8 @@ def _time_compiled(
     looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
     """Seconds of a decision of all episodes, in the quickest run of optimised code."""
-    lanes, identities = start_lanes(looped, seeds), identities_of_seeds(seeds)
+    identities = identities_of_seeds(seeds)
+    lanes = start_lanes(looped, seeds, report=_report_estimate)
     interval = looped.task.decision_interval
 
     def run(count: int) -> float:

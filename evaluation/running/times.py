@@ -90,7 +90,7 @@ def points_of_records(records: Sequence[Any]) -> list[Point]:
     return [
         Point(r.policy, r.kind, times[r.policy], 100.0 * r.value)
         for r in records
-        if r.metric == "relative_cost_difference" and r.value is not None
+        if r.metric == "geometric_cost_difference" and r.value is not None
         if r.policy in times and not times[r.policy].own
     ]
 

@@ -311,6 +311,13 @@ def benchmark(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for results, report and figures.")] = Path("results"),
     seed: Experiment = 0,
+    half_width: Annotated[
+        float,
+        typer.Option(
+            help="Run more episodes of the training distributions, at most 20,000, until no interval of the headline "
+            "reaches further than this to either side, percentage points; 0: no more."
+        ),
+    ] = 0.0,
     environment: Annotated[
         list[str] | None,
         typer.Option(
@@ -340,7 +347,9 @@ def benchmark(
     """
     formats = check_formats(format or [])
     check_columns(columns)
-    options = BenchmarkOptions(full, seed, environment or (), split, backend, threads, command_line())
+    options = BenchmarkOptions(
+        full, seed, environment or (), split, backend, threads, command_line(), half_width
+    )
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
         def add_line(total: int) -> Progress:
