@@ -1,5 +1,6 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -118,12 +119,20 @@ def assumed_parameters(env: str | None, names: Sequence[str]) -> dict[str, float
 
 
 def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
-    """Return names of competitors, where each ``module:Class`` is one in a process of its own."""
-    known = (EXEC, ISOLATED)
-    return [
-        ISOLATED + name if ":" in name and name not in problem.names and not name.startswith(known) else name
-        for name in names
-    ]
+    """Return names of competitors, where each ``module:Class`` is one in a process of its own.
+
+    Raises:
+        ValueError: for one behind a gate, which acts in this process.
+    """
+
+    def is_module(name: str) -> bool:
+        return name not in problem.names and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
+
+    for name in names:
+        if name.startswith(GATED) and is_module(name.removeprefix(GATED)):
+            raise ValueError(f"{name!r} acts in this process, beside the truth: an estimator can be isolated")
+    prefixes = (EXEC, ISOLATED, GATED)
+    return [ISOLATED + name if is_module(name) and not name.startswith(prefixes) else name for name in names]
 
 
 def is_learned(problem: Problem, name: str) -> bool:

@@ -8,6 +8,7 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.isolated_estimator import landlock_version
 from filtergym.evaluation.competitors.isolation import isolate_source
+from filtergym.evaluation.competitors.program_process import ENDED
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from models import make_model
 
@@ -16,7 +17,7 @@ from filtergym.names import competitor, isolate_names
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
-EPISODES, HORIZON = 16, 10
+EPISODES, HORIZON = 16, 3
 
 # Each looks for the truth in another way, and where it finds none answers as the honest one does.
 CHEATS = '''
@@ -32,7 +33,7 @@ class Honest:
         return initial.mean, initial.covariance
 
     def update(self, m, memory):
-        self.k += 1
+        self.k, self.m = self.k + 1, m
         mean, P = memory
         seen = m.available > 0
         position = mean[:2] + m.interval * mean[2:]
@@ -88,12 +89,9 @@ class TwoWords(Honest):
     """Takes the two words from what runs the episodes to the truth, of all objects that there are."""
 
     def known(self, N):
-        for own in gc.get_objects():
-            if type(own).__name__ == "Lanes":
-                found = state(own.state.truth, N)
-                if found is not None:
-                    return found
-        return None
+        everywhere = [own.state.truth for own in gc.get_objects() if type(own).__name__ == "Lanes"]
+        found = [own for own in (state(truth, N) for truth in everywhere) if own is not None]
+        return min(found, key=lambda own: np.nansum(abs(own[:2] - self.m.position)), default=None)
 '''
 
 
@@ -206,8 +204,8 @@ class Echo:
         return initial
 
     def update(self, measurement, memory):
-        assert measurement._fields == tuple(FIELDS), measurement._fields
-        for name, (shape, kind) in FIELDS.items():
+        assert not FIELDS or measurement._fields == tuple(FIELDS), measurement._fields
+        for name, (shape, kind) in (FIELDS or {}).items():
             value = getattr(measurement, name)
             assert value is None if shape is None else value.shape == shape and value.dtype.kind == kind, name
         assert self.task.parameters.horizon == 2
@@ -232,9 +230,11 @@ def test_it_is_given_what_an_estimator_is_given(env_id):
 
 def test_names_are_isolated_where_they_are_modules():
     problem = problem_of(ID)
-    names = ["imm", "mine:Mine", "exec:./run:2", "isolated:a:B", "runs/ppo"]
+    names = ["imm", "mine:Mine", "exec:run", "isolated:a:B", "runs/ppo", "gated:bptt", "file:estimates.csv"]
     found = isolate_names(problem, names)
-    assert found == ["imm", "isolated:mine:Mine", "exec:./run:2", "isolated:a:B", "runs/ppo"]
+    assert found == ["imm", "isolated:mine:Mine", *names[2:]]
+    with pytest.raises(ValueError, match="acts in this process"):
+        isolate_names(problem, ["gated:mine:Policy"])
     for name, words in (("isolated:imm", "takes module:Class"), ("isolated:no_such:X", "no file no_such.py")):
         with pytest.raises(ValueError, match=words):
             competitor(ID, name)
@@ -255,3 +255,13 @@ def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command):
     assert "'isolated:spring:Spring' takes no part: OSError: no" in errors
     assert "spring" not in sys.modules
     assert "leave one of them out" in command(*words, "--trust")[2]
+
+
+def test_a_wrong_shape_is_no_answer():
+    """Also one that has as many numbers."""
+    text = ECHO.replace("memory.mean, memory.cov", "memory.mean.T, memory.cov")
+    model = make_model(ID, horizon=2)
+    apart = isolate_source(f"FIELDS = None\n{text}", "Echo", "echo")
+    with pytest.warns(UserWarning, match=r"ValueError: the mean must have shape \(4, 8\), got \(8, 4\)"):
+        faults = [episode.filter.fault[0] for episode, _ in rollout(model, apart, [0])]
+    assert faults == [ENDED, ENDED]

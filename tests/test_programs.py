@@ -19,6 +19,7 @@ from filtergym.envs.contract.task import Component, named_arrays
 from filtergym.evaluation.competitors.program_process import ENDED, LATE, WRONG, Limits, ProgramProcess
 from filtergym.evaluation.competitors.programs import (
     LIMITS,
+    Field,
     Program,
     ProgramEstimator,
     limit_programs,
@@ -305,6 +306,23 @@ def test_a_hello_names_every_number(env_id):
     assert all(own["about"] for own in hello["measurement"])
     C = len(model.task.components)
     assert hello["numbers"]["answer"] == C + C * C
+
+
+def test_a_line_has_whole_numbers_and_null_for_what_was_not_received():
+    estimator = ProgramEstimator(task_of(), Program("true"))
+    estimator._format = "json"
+    kinds = [
+        Field("scan", (), "int64", ""),
+        Field("seen", (2,), "bool", ""),
+        Field("none", None, "", ""),
+        Field("z", (), "float64", ""),
+    ]
+    rows = np.array([[3.0, 1.0, 0.0, np.nan], [4.0, 0.0, 0.0, 1.5]])
+    line = json.loads(estimator._message("measurement", kinds, rows))
+    assert line == {
+        "measurement": {"scan": [3, 4], "seen": [[True, False], [False, False]], "z": [None, 1.5]}
+    }
+    assert estimator._message("measurement", kinds, rows).count(b"4.0") == 0
 
 
 # --- clients

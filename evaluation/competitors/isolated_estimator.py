@@ -180,9 +180,11 @@ def main() -> None:
     while (measurement := frames.read("measurement")) is not None:
         mean, covariance, memory, *_ = own.update(measurement, memory)
         C = len(hello["components"])
-        mean = numpy.asarray(mean, dtype=float).reshape(C, frames.lanes)
-        covariance = numpy.asarray(covariance, dtype=float).reshape(C * C, frames.lanes)
-        answer = numpy.concatenate([mean, covariance])[:, : frames.tracks].T
+        mean, covariance = numpy.asarray(mean, dtype=float), numpy.asarray(covariance, dtype=float)
+        for name, values, shape in (("mean", mean, (C,)), ("covariance", covariance, (C, C))):
+            if values.shape != (*shape, frames.lanes):
+                raise ValueError(f"the {name} must have shape {(*shape, frames.lanes)}, got {values.shape}")
+        answer = numpy.concatenate([mean, covariance.reshape(C * C, -1)])[:, : frames.tracks].T
         answers.write(numpy.ascontiguousarray(answer, dtype="<f8").tobytes())
         answers.flush()
 

@@ -20,6 +20,8 @@ ENDED, LATE, WRONG = 6, 7, 8
 """Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
 START_SECONDS = 30.0
 """For the first answer, where the limit is shorter: an interpreter takes its time to start."""
+END_SECONDS = 1.0
+"""That a program has to end in peace."""
 PIPE_BYTES = 1 << 20
 """Of a pipe, where the system can be asked for it: a message of a thousand tracks is one piece then."""
 LAST_WORDS = 2000
@@ -213,7 +215,7 @@ def _end(process: "subprocess.Popen[bytes]", answers: selectors.BaseSelector) ->
         if stream is not None:
             stream.close()
     with suppress(subprocess.TimeoutExpired):
-        process.wait(0.1)  # a program ends when its standard input does
+        process.wait(END_SECONDS)  # a program ends when its standard input does
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -292,7 +292,8 @@ class ProgramEstimator:
             if own.shape is None:
                 continue
             size = _count([own])
-            content[own.name] = as_lists(rows[:, place : place + size].reshape(-1, *own.shape))
+            values = rows[:, place : place + size].reshape(-1, *own.shape)
+            content[own.name] = as_lists(values if own.type == "float64" else values.astype(own.type))
             place += size
         return json.dumps({name: content}).encode() + b"\n"
 

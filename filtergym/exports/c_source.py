@@ -359,7 +359,9 @@ class Writer:
             digits=digits,
             upper=self.name.upper(),
             available="".join(
-                f"{i}, " for i, column in enumerate(self.columns("measurement")) if column.startswith("available")
+                f"{i}, "
+                for i, column in enumerate(self.columns("measurement"))
+                if column.startswith("available")
             ),
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
