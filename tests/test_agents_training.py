@@ -127,6 +127,14 @@ def test_a_signal_leaves_a_checkpoint_to_resume_from(algorithm, number, tmp_path
     assert len(load_run(tmp_path).validation) == 2
 
 
+def test_signals_mean_again_what_they_meant_when_nothing_was_interrupted():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with training_session.interruption() as interrupted:
+        assert signal.getsignal(signal.SIGINT) is not before[0]
+        assert not interrupted()
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
 def contents(folder):
     return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 

@@ -158,6 +158,8 @@ def test_history_is_what_info_reports():
         )
         assert history["error.velocity_y"][-1] == info["error"][3]
         assert history["alpha"][-1] == info["alpha"]
+        for name, place in {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}.items():
+            assert history[f"covariance_{name}"][-1] == info["covariance"][place] / 1e6  # km^2
         assert history["action.0"][-2:] == [0.2 * decision] * 2
         # Both innovations are over their own sigma, so their squares add up to the NIS.
         squared = history["innovation_x"][-1] ** 2 + history["innovation_y"][-1] ** 2
