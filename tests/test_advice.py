@@ -364,6 +364,32 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
         assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
 
+class Sluggish:
+    """Constant velocity with less acceleration than there is."""
+
+    kind, parameters = "estimator", {"acceleration": (0.15, 0.2, 0.25)}
+
+    def __init__(self, task, acceleration):
+        self.own = Asked(ConstantVelocity(task, acceleration))
+
+    def start(self, initial, N):
+        return self.own.start(initial, N)
+
+    def update(self, measurement, memory):
+        return self.own.update(measurement, memory)
+
+
+def test_a_cheaper_family_that_predicts_worse_beyond_chance_is_not_chosen(monkeypatch, tmp_path):
+    def families(problem, recording):
+        name = "constant-velocity"
+        return {"sluggish": own_family("sluggish", Sluggish), name: log_families(recording)[name]}
+
+    monkeypatch.setattr(advice_module, "families_of", families)
+    found = advise(PROBLEM, read(write_log(tmp_path, count=240)), {"imm": PROBLEM.competitor("imm")})
+    assert found.diverging == ()
+    assert found.fitted.name == "constant-velocity"
+
+
 def test_the_best_in_hindsight_is_named_beside(advice):
     """It has the least judged error of the shipped ones; a rival may be another, and then both are said."""
     shipped = {c.name: c.error for c in advice.competitors if not c.fitted}

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -24,7 +25,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
-from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import Descent, NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_arrays, write_arrays
 from filtergym.agents.network_arrays import network_arrays
@@ -147,6 +148,8 @@ def test_resuming_a_finished_run_changes_nothing(algorithm, tmp_path):
         run = train(resume_run(tmp_path, small_run(algorithm, steps)), tmp_path, resume=True)
         assert len(run.validation) == 1
         assert contents(tmp_path) == before
+    # What computes the steps may be another.
+    assert resume_run(tmp_path, small_run(algorithm, 240, backend="numpy")).backend == "numpy"
 
 
 def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
@@ -293,6 +296,18 @@ def test_fields_of_the_largest_weights_are_kept_and_none_comes_back():
         answer = policy(shown, policy.new_memory(3))[0]
         shown[:, 0] += 5.0
         assert (policy(shown, policy.new_memory(3))[0] == answer).all()
+
+
+def test_a_descent_reads_geometrically_fewer_fields_until_half_of_its_run_is_done():
+    space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    policy, group = NetworkPolicy(8, space, 4, network="linear", fields_kept=2), {}
+    for done, used in ((0, 8), (25, 4), (50, 2), (100, 2)):
+        descent = SimpleNamespace(steps_done=done, run=SimpleNamespace(steps=100), policy=policy)
+        descent.optimiser = SimpleNamespace(param_groups=[group])
+        descent.learning_rate = lambda left: 0.1 * left
+        Descent.follow_schedule(descent)
+        assert int(policy.used.sum()) == used
+        assert group["lr"] == pytest.approx(0.1 * (1.0 - done / 100.0))
 
 
 def test_networks_that_there_are_not_are_refused():

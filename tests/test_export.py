@@ -106,6 +106,10 @@ def test_cells_are_those_of_the_terminal(tables, name):
     assert found == cells_of(table)
 
 
+def test_flights_are_told_with_their_episodes_and_measurements(tables):
+    assert [row[1:3] for row in cells_of(tables["flights"])] == [["1", "15"]] * 3
+
+
 def test_what_latex_takes_for_commands_is_escaped():
     assert latex_text("a_b & 50 %") == r"a\_b \& 50 \%"
     assert latex_text("-5.3 [-7, -.1] 1e-3 plain-white a-1") == "$-$5.3 [$-$7, $-$.1] 1e-3 plain-white a-1"

@@ -24,6 +24,7 @@ from filtergym.evaluation.running.times import Point, ProcessorTime
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pictures import draw_differences, draw_learning_curves
 
 from filtergym import evaluate, record
@@ -312,7 +313,7 @@ def test_little_to_draw_is_drawn(env, names, length):
 
 
 def test_names_leave_the_line_of_the_papers_cost_free():
-    figure = Figure(figsize=(3.4, 2.4))
+    figure = Figure(figsize=(3.4, 2.4), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.add_subplot(xscale="log", xlim=(10.0, 1e4), ylim=(-10.0, 30.0))
     costs = {33.0: 2.4, 878.0: 1.8}  # a name beneath either would lie on the line
@@ -322,7 +323,8 @@ def test_names_leave_the_line_of_the_papers_cost_free():
     ]
     name_points(figure, {axis: Panel("", points, "", "", ())})
     assert len(axis.texts) == 2
-    assert figure.get_layout_engine() is None  # a layout would move the axes under the names
+    # It would move the axes under the names.
+    assert not isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine)
     _, zero = axis.transData.transform((10.0, 0.0))
     for name in axis.texts:
         box = name.get_window_extent(figure.canvas.get_renderer())

@@ -303,6 +303,8 @@ def test_remarks_follow_from_the_numbers(result):
     harmed = changed("relative_cost_difference", value=0.5, low=0.4, high=0.6)
     assert harmed[0].startswith("1 of 1 results of learned agents is significantly worse")
     assert "`ppo`" in harmed[0]
+    unsure = changed("relative_cost_difference", value=0.5, low=None, high=None)
+    assert unsure[0].startswith("None of 1 results of learned agents")
     assert not any("learned agents" in sentence for sentence in remarks([result._replace(learned=[])]))
 
 
