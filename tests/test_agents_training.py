@@ -136,6 +136,25 @@ def test_signals_mean_again_what_they_meant_when_nothing_was_interrupted():
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
+def test_curves_are_written_at_once_and_what_a_logger_gathers_stays():
+    from stable_baselines3.common.logger import KVWriter, Logger
+
+    written = []
+
+    class Kept(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            written.append((dict(key_values), step))
+
+        def close(self):
+            pass
+
+    logger = Logger(None, [Kept()])
+    logger.record("loss", 1.0)
+    training_session.curves_beside(logger)(40, {"cost": 2.0})
+    assert written == [({"cost": 2.0, "time/total_timesteps": 40}, 40)]
+    assert dict(logger.name_to_value) == {"loss": 1.0}
+
+
 def contents(folder):
     return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
