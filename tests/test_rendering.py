@@ -158,8 +158,6 @@ def test_history_is_what_info_reports():
         )
         assert history["error.velocity_y"][-1] == info["error"][3]
         assert history["alpha"][-1] == info["alpha"]
-        for name, place in {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}.items():
-            assert history[f"covariance_{name}"][-1] == info["covariance"][place] / 1e6  # km^2
         assert history["action.0"][-2:] == [0.2 * decision] * 2
         # Both innovations are over their own sigma, so their squares add up to the NIS.
         squared = history["innovation_x"][-1] ** 2 + history["innovation_y"][-1] ** 2
@@ -169,6 +167,16 @@ def test_history_is_what_info_reports():
     env.reset(seed=2)
     assert "scan 0 of 100" in env.picture.title
     assert not env.picture.history
+
+
+def test_the_covariance_is_drawn_in_square_kilometres():
+    env = TaskEnv(ID, "weights", scenario="paper", render_mode="rgb_array", detailed_info=True)
+    env.reset(seed=2)
+    for _ in range(3):
+        info = env.step(env.action_space.high)[4]
+    assert info["covariance"][0, 1] != 0.0
+    for name, place in {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}.items():
+        assert env.picture.history[f"covariance_{name}"][-1] == info["covariance"][place] / 1e6
 
 
 def test_manoeuvres_are_marked_where_they_are_flown():
