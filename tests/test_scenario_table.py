@@ -49,7 +49,8 @@ def settings(maker):
     """Parameters that a competitor is made with: those that its class has by default, and those of its variant."""
     parameters = inspect.signature(maker.func if isinstance(maker, Variant) else maker).parameters.values()
     defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
-    return {**defaults, **(maker.keywords if isinstance(maker, Variant) else {})}
+    values = {**defaults, **(maker.keywords if isinstance(maker, Variant) else {})}
+    return {name: value._asdict() if hasattr(value, "_asdict") else value for name, value in values.items()}
 
 
 @pytest.mark.parametrize("part", ["defaults", "scenarios", "competitors", "tunable"])
