@@ -53,7 +53,9 @@ def pytest_xdist_make_scheduler(config, log):
     return Scheduling(config, log)
 
 
-gc.disable()  # until all is collected
+def pytest_collectstart(collector):
+    """Let the garbage collector wait until all tests are there."""
+    gc.disable()
 
 
 def pytest_collection_finish(session):

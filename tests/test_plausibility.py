@@ -241,9 +241,7 @@ def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
     assert any(line.startswith("Fewer than 30 measurements") for line in said)
     # Kilometres whose deviations are kilometres, too, are a slow target: who knows it sees that.
     (extent,) = (line for line in said if line.startswith("Positions span"))
-    assert re.fullmatch(
-        r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent
-    )
+    assert re.fullmatch(r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent)
     said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
     assert not any("guess" in line for line in said)
 
