@@ -53,26 +53,35 @@ def pytest_xdist_make_scheduler(config, log):
     return Scheduling(config, log)
 
 
+def pytest_collectstart(collector):
+    """Let the garbage collector wait until all tests are there."""
+    gc.disable()
+
+
 def pytest_collection_finish(session):
     """Spare the garbage collector what stays to the end, libraries and tests; it would look through it many times."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 
 
-LARGEST = 700
-"""Resident memory in MB beyond which a process forgets its traces before it takes the next file."""
+LARGEST, GROWN = 700, 100
+"""Resident memory in MB beyond which a process forgets its traces before it takes the next file, and by how much more
+it may grow then: what stays are libraries, and to look through everything takes half a second."""
+_remained = [0]
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
     """Forget what was traced for one file before the next, where that has grown large."""
-    if nextitem is None or nextitem.path == item.path or _resident() < LARGEST:
+    if nextitem is None or nextitem.path == item.path or _resident() < max(LARGEST, _remained[0] + GROWN):
         return
     compiled._trace_once.cache_clear()
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim:  # gives back to the system what the C library keeps
         trim(0)
+    _remained[0] = _resident()
 
 
 def _resident():
@@ -146,6 +155,13 @@ def command(monkeypatch, capsys):
         return ended.value.code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """Let `evaluate --out` draw no figures, which takes seconds, for tests that look at the other files."""
+    for name in ("evaluation_figures", "worst_figures"):
+        monkeypatch.setattr(f"filtergym.commands.evaluation.{name}", lambda *_, **__: ())
 
 
 @pytest.fixture

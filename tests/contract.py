@@ -1,4 +1,4 @@
-"""One pass over an environment, a control and a backend, in which many properties are checked by their names."""
+"""One pass over a subject, as an environment, a control and a backend, in which many properties are checked by name."""
 
 import importlib.util
 from collections.abc import Callable, Iterable
@@ -65,22 +65,25 @@ def continued(env: Any, actions: Iterable[Any]) -> list[np.ndarray]:
     return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
 
 
-Property = Callable[[Subject], None]
+Property = Callable[[Any], None]
 """Function that raises where its subject has not what the function's name says."""
 
 
-def assert_properties(subject: Subject, properties: Iterable[Property]) -> None:
-    """Check all properties, and tell of each that does not hold which one it is and of what.
+def assert_properties(subject: Any, properties: Iterable[Property]) -> None:
+    """Check all properties of a subject, or of each of a list, and tell of each that does not hold which one it is and
+    of what.
 
     Raises:
         ExceptionGroup: if there are some.
     """
-    failures = []
-    for has in properties:
-        try:
-            has(subject)
-        except Exception as error:
-            error.add_note(f"property {has.__name__!r} of {subject}")
-            failures.append(error)
+    properties, failures = list(properties), []
+    for one in subject if isinstance(subject, list) else [subject]:
+        for has in properties:
+            try:
+                has(one)
+            except Exception as error:
+                name = getattr(has, "func", has).__name__
+                error.add_note(f"property {name!r} of {one}")
+                failures.append(error)
     if failures:
-        raise ExceptionGroup(f"{len(failures)} properties of {subject}", failures)
+        raise ExceptionGroup(f"{len(failures)} properties do not hold", failures)

@@ -72,7 +72,10 @@ def move_roundings(env, repetition=0):
     beside = lanes.beside.model if lanes.beside else lanes.model
     for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
-        for owner, names in ((model, ("observe", "charge", "feedback")), *((part, PARTS[p]) for part, p in parts)):
+        for owner, names in (
+            (model, ("observe", "charge", "feedback")),
+            *((part, PARTS[p]) for part, p in parts),
+        ):
             for name in names:
                 setattr(owner, name, _that_moves(getattr(owner, name), pattern))
     return env

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -24,7 +25,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
-from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import Descent, NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_arrays, write_arrays
 from filtergym.agents.network_arrays import network_arrays
@@ -127,6 +128,33 @@ def test_a_signal_leaves_a_checkpoint_to_resume_from(algorithm, number, tmp_path
     assert len(load_run(tmp_path).validation) == 2
 
 
+def test_signals_mean_again_what_they_meant_when_nothing_was_interrupted():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with training_session.interruption() as interrupted:
+        assert signal.getsignal(signal.SIGINT) is not before[0]
+        assert not interrupted()
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_curves_are_written_at_once_and_what_a_logger_gathers_stays():
+    from stable_baselines3.common.logger import KVWriter, Logger
+
+    written = []
+
+    class Kept(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            written.append((dict(key_values), step))
+
+        def close(self):
+            pass
+
+    logger = Logger(None, [Kept()])
+    logger.record("loss", 1.0)
+    training_session.curves_beside(logger)(40, {"cost": 2.0})
+    assert written == [({"cost": 2.0, "time/total_timesteps": 40}, 40)]
+    assert dict(logger.name_to_value) == {"loss": 1.0}
+
+
 def contents(folder):
     return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
@@ -139,6 +167,8 @@ def test_resuming_a_finished_run_changes_nothing(algorithm, tmp_path):
         run = train(resume_run(tmp_path, small_run(algorithm, steps)), tmp_path, resume=True)
         assert len(run.validation) == 1
         assert contents(tmp_path) == before
+    # What computes the steps may be another.
+    assert resume_run(tmp_path, small_run(algorithm, 240, backend="numpy")).backend == "numpy"
 
 
 def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
@@ -285,6 +315,18 @@ def test_fields_of_the_largest_weights_are_kept_and_none_comes_back():
         answer = policy(shown, policy.new_memory(3))[0]
         shown[:, 0] += 5.0
         assert (policy(shown, policy.new_memory(3))[0] == answer).all()
+
+
+def test_a_descent_reads_geometrically_fewer_fields_until_half_of_its_run_is_done():
+    space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    policy, group = NetworkPolicy(8, space, 4, network="linear", fields_kept=2), {}
+    for done, used in ((0, 8), (25, 4), (50, 2), (100, 2)):
+        descent = SimpleNamespace(steps_done=done, run=SimpleNamespace(steps=100), policy=policy)
+        descent.optimiser = SimpleNamespace(param_groups=[group])
+        descent.learning_rate = lambda left: 0.1 * left
+        Descent.follow_schedule(descent)
+        assert int(policy.used.sum()) == used
+        assert group["lr"] == pytest.approx(0.1 * (1.0 - done / 100.0))
 
 
 def test_networks_that_there_are_not_are_refused():

@@ -104,7 +104,9 @@ def test_what_is_refused_leaves_nothing(name, run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results(run, tmp_path, monkeypatch):
+def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results(
+    run, without_figures, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "filtergym.reports.pages.html_report", None)
     result = run("evaluate", ENV, "--policy", "imm", "--episodes", "2", "--set", "horizon=10", "--out", "out")
     assert result.returncode == 0

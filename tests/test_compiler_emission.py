@@ -1,9 +1,11 @@
 """Every operation and every library function at ordinary, extreme and special numbers, for every processor's way."""
 
+import functools
 import platform
 
 import numpy as np
 import pytest
+from contract import assert_properties
 from filtergym.compiler import cache, native
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.library import BINARY, VARIANTS, Library, fastest, portable
@@ -160,16 +162,24 @@ def units_off(result, exact):
 
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 60, reason="needs longer numbers to compare with")
 @pytest.mark.parametrize("library", LIBRARIES, ids=lambda library: library.name)
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_are_exact_to_a_few_units_in_the_last_place(name, library):
+def test_functions_are_exact_to_a_few_units_in_the_last_place(library):
+    assert_properties(
+        list(FUNCTIONS), (functools.partial(is_exact_to_a_few_units_in_the_last_place, library),)
+    )
+
+
+def is_exact_to_a_few_units_in_the_last_place(library, name):
     for arguments in ORDINARY_PAIRS[name] if name in BINARY else [(numbers,) for numbers in ORDINARY[name]]:
         exact = FUNCTIONS[name](*(part.astype(np.longdouble) for part in arguments))
         assert units_off(computed(name, arguments, library), exact) <= UNITS
 
 
 @pytest.mark.parametrize("library", LIBRARIES, ids=lambda library: library.name)
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_are_numpys_at_special_numbers(name, library):
+def test_functions_are_numpys_at_special_numbers(library):
+    assert_properties(list(FUNCTIONS), (functools.partial(is_numpys_at_special_numbers, library),))
+
+
+def is_numpys_at_special_numbers(library, name):
     arguments = PAIRS if name in BINARY else (SPECIAL,)
     result, expected = computed(name, arguments, library), FUNCTIONS[name](*arguments)
     # NaN, infinities and zeros of either sign are where NumPy has them; the last bits of the others may differ.

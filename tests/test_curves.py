@@ -44,8 +44,7 @@ def flights() -> xarray.Dataset:
     )
 
 
-def naive_rmse(dataset, name, k, weights=None):
-    error = dataset["error"].sel(policy=name, component=POSITION).isel(time=k).values
+def naive_rmse(error, weights=None):
     total = weight = 0.0
     for episode, (x, y) in enumerate(error):
         if not math.isnan(x):
@@ -58,12 +57,13 @@ def naive_rmse(dataset, name, k, weights=None):
 def test_root_mean_square_error_with_its_band(dataset, curves):
     weights = Bootstrap(30, 200).weights
     for name in NAMES[:4]:
+        errors = dataset["error"].sel(policy=name, component=POSITION).values
+        here = curves.sel(policy=name, quantity="position")
         for k in (0, 31, 59):
-            here = {"policy": name, "quantity": "position"}
-            assert curves["rmse"].sel(here).values[k] == pytest.approx(naive_rmse(dataset, name, k))
-            resampled = [naive_rmse(dataset, name, k, row) for row in weights[1:]]
-            assert curves["rmse_low"].sel(here).values[k] == pytest.approx(np.percentile(resampled, 2.5))
-            assert curves["rmse_high"].sel(here).values[k] == pytest.approx(np.percentile(resampled, 97.5))
+            assert here["rmse"].values[k] == pytest.approx(naive_rmse(errors[:, k]))
+            resampled = [naive_rmse(errors[:, k], row) for row in weights[1:]]
+            assert here["rmse_low"].values[k] == pytest.approx(np.percentile(resampled, 2.5))
+            assert here["rmse_high"].values[k] == pytest.approx(np.percentile(resampled, 97.5))
     square = dataset["mean_square"].sel(policy="known-input-bound", component=POSITION).sum("component")
     np.testing.assert_allclose(
         curves["rmse"].sel(policy="known-input-bound", quantity="position"), np.sqrt(square.mean("episode"))
@@ -176,9 +176,10 @@ def test_names_of_actions(env, control, expected):
 def test_shorter_flights_are_left_out_where_they_are_over(flights):
     curves = curves_of(flights)
     assert flights.sizes["time"] == 30
+    errors = flights["error"].sel(policy="imm", component=POSITION).values
     for k in (5, 29):
         found = curves["rmse"].sel(policy="imm", quantity="position").values[k]
-        assert found == pytest.approx(naive_rmse(flights, "imm", k))
+        assert found == pytest.approx(naive_rmse(errors[:, k]))
     seen = flights["nis_degrees"].sel(policy="imm").values
     with np.errstate(invalid="ignore"):
         expected = np.nansum(flights["nis"].sel(policy="imm").values, axis=0) / np.nansum(seen, axis=0)

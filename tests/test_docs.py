@@ -11,6 +11,7 @@ from pathlib import Path
 
 import command_line
 import pytest
+from contract import assert_properties
 from environment_page import TABLES, environment_table
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
@@ -39,8 +40,13 @@ def page(id: str) -> str:
     return "\n".join([page_file(id).read_text(encoding="utf-8"), *tables])
 
 
-@pytest.mark.parametrize("id", catalogue())
-def test_page_has_the_usual_headings_and_tables(id):
+def test_pages_of_environments():
+    assert_properties(
+        list(catalogue()), (has_the_usual_headings_and_tables, names_everything, names_every_field)
+    )
+
+
+def has_the_usual_headings_and_tables(id):
     text = page_file(id).read_text(encoding="utf-8")
     name = bare_name(id)
     assert [h for h in HEADINGS if f"\n## {h}\n" not in text] == []
@@ -49,8 +55,7 @@ def test_page_has_the_usual_headings_and_tables(id):
         assert f"```{{environment-table}} {table}\n:environment: {name}\n```" in text
 
 
-@pytest.mark.parametrize("id", catalogue())
-def test_page_names_everything(id):
+def names_everything(id):
     text = page(id)
     cls = catalogue()[id]
     known = baselines_of(id)
@@ -58,8 +63,7 @@ def test_page_names_everything(id):
     assert sorted(name for name in names if f"`{name}`" not in text and f'`"{name}"`' not in text) == []
 
 
-@pytest.mark.parametrize("id", catalogue())
-def test_page_names_every_field(id):
+def names_every_field(id):
     words = set(re.findall(r"`([a-zA-Z0-9_-]+)`", page(id)))
     for control in catalogue()[id].controls:
         for field in make_model(id, control).fields:

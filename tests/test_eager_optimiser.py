@@ -29,13 +29,24 @@ def descend(eagerly):
 
 own = descend(True)
 print("torch._dynamo" in sys.modules)
-print(torch.equal(own, descend(False)))
+if "own" in sys.argv:
+    print(torch.equal(own, descend(False)))
 """
 
 
-def test_no_compiler_and_the_same_bits():
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), ["False"]),
+        # Importing the compiler takes seconds.
+        pytest.param(("own",), ["False", "True"], marks=pytest.mark.slow),
+    ],
+)
+def test_no_compiler_and_the_same_bits(words, said):
     """In a process of its own, where nothing else has imported the compiler; torch's own optimiser comes second."""
     if not hasattr(torch.optim.Adam.step, "__wrapped__"):
         pytest.skip("this version of torch names its parts otherwise, and imports its compiler")
-    said = subprocess.run([sys.executable, "-c", DESCENT], capture_output=True, text=True, check=True)
-    assert said.stdout.split() == ["False", "True"]
+    found = subprocess.run(
+        [sys.executable, "-c", DESCENT, *words], capture_output=True, text=True, check=True
+    )
+    assert found.stdout.split() == said

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from contract import assert_properties
 from filtergym.agents.envelope import EnvelopeAlarm, TrainingRange, departure, training_range
 from filtergym.agents.learned_policy import load_policy, pretrained_path, write_envelope
 from filtergym.baselines.problem import problem_of
@@ -171,8 +172,12 @@ def test_there_are_fifty_flights_that_no_training_holds():
     assert len({id for id, _ in STRESSED}) == 5
 
 
-@pytest.mark.parametrize(("id", "name"), STRESSED)
-def test_a_stress_lies_outside_of_training(id, name):
+def test_every_stress_lies_outside_of_training():
+    assert_properties(list(STRESSED), (lies_outside_of_training,))
+
+
+def lies_outside_of_training(stress):
+    id, name = stress
     known, task = stresses()[id], problem_of(id).task
     keywords = known.each[name]
     trained = make_task(task, None).parameters

@@ -45,7 +45,8 @@ def passes_gymnasiums_check(subject):
         warnings.simplefilter("always")
         # Where it is drawn without an option, as its users call it.
         check_env(subject.single().unwrapped, **({} if drawn else {"skip_render_check": True}))
-        check_env(subject.single(detailed_info=True).unwrapped, skip_render_check=True)
+        if subject.order == 0:
+            check_env(subject.single(detailed_info=True).unwrapped, skip_render_check=True)
     found = [str(warning.message) for warning in caught]
     assert [text for text in found if not any(allowed in text for allowed in ALLOWED_WARNINGS)] == []
 

@@ -236,7 +236,7 @@ class Losing:
 """
 
 
-def test_lost_episodes_stand_in_table_records_and_results(command, monkeypatch, tmp_path):
+def test_lost_episodes_stand_in_table_records_and_results(command, without_figures, monkeypatch, tmp_path):
     """Two of twenty, in two pieces of work; what others have finished is not lost."""
     monkeypatch.delitem(sys.modules, "losing", raising=False)
     monkeypatch.chdir(tmp_path)

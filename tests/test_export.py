@@ -1,6 +1,7 @@
 """Records as CSV, tables for LaTeX, and what an evaluation writes into its folder."""
 
 import csv
+import itertools
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from rich.text import Text
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
+from filtergym.commands import evaluation
 from filtergym.reports.tables.export import latex_table, latex_text, records_as_csv
 from filtergym.reports.tables.recording_tables import recording_tables
 from filtergym.reports.tables.terminal_tables import flights_table, results_tables
@@ -104,6 +106,10 @@ def test_cells_are_those_of_the_terminal(tables, name):
     assert found == cells_of(table)
 
 
+def test_flights_are_told_with_their_episodes_and_measurements(tables):
+    assert [row[1:3] for row in cells_of(tables["flights"])] == [["1", "15"]] * 3
+
+
 def test_what_latex_takes_for_commands_is_escaped():
     assert latex_text("a_b & 50 %") == r"a\_b \& 50 \%"
     assert latex_text("-5.3 [-7, -.1] 1e-3 plain-white a-1") == "$-$5.3 [$-$7, $-$.1] 1e-3 plain-white a-1"
@@ -157,9 +163,11 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
         4,
     )
     options = ("--format", "svg", "--format", "pdf", "--columns", 1)
+    # All figures are drawn by a test of the command line.
+    drawn = evaluation.evaluation_figures
+    monkeypatch.setattr(evaluation, "evaluation_figures", lambda *a, **k: itertools.islice(drawn(*a, **k), 1))
     assert run(monkeypatch, *words, "--set", "horizon=20", "--out", out, *options) == 0
-    figures = ["rmse_over_time", "error_distribution", "cost_difference", "consistency"]
-    figures += ["mode_probabilities", "worst_episodes", "cost_and_time"]
+    figures = ["rmse_over_time", "worst_episodes"]
     expected = {"records.json", "records.csv", "table.tex", "results.nc", "results.json", "report.html"}
     expected |= {f"{name}.{suffix}" for name in figures for suffix in ("svg", "pdf")}
     assert {path.name for path in out.iterdir()} == expected
@@ -184,7 +192,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
     assert "got 'gif'" in capsys.readouterr().err
 
 
-def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, monkeypatch, capsys):
+def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, without_figures, monkeypatch, capsys):
     monkeypatch.setattr("filtergym.commands.evaluation.MOST_BYTES", 1000)
     words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
     assert run(monkeypatch, *words) == 0

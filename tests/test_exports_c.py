@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
+from filtergym.compiler import c_source as compiler_source
 from filtergym.envs.contract.filter import Initial
 from filtergym.filters import kalman
 
@@ -144,6 +145,20 @@ def test_an_estimator_in_python_is_refused():
 
 
 # --- C
+
+
+def test_what_float_does_not_hold_normally_is_beyond_it():
+    tiny, largest = (float(getattr(np.finfo(np.float32), name)) for name in ("tiny", "max"))
+    for size, beyond in (
+        (0.0, False),
+        (tiny, False),
+        (0.5 * tiny, True),
+        (largest, False),
+        (1.1 * largest, True),
+    ):
+        for value in (size, -size):
+            assert compiler_source.is_beyond(value, c_source.FLOAT) == beyond, value
+            assert not compiler_source.is_beyond(value, c_source.DOUBLE), value
 
 
 def writer_of(environment, name, scalar=c_source.DOUBLE, **options):

@@ -119,6 +119,20 @@ def test_restored_lanes_go_on_as_they_did():
     same(*runs)
 
 
+def test_restored_lanes_draw_what_a_reset_names_from_the_generators_of_their_episodes():
+    """As if they had never been restored, also where the lanes of one task are left for another's."""
+    env = gymnasium.make_vec(ID, num_envs=4, **SHORT).unwrapped
+    env.reset(seed=3)
+    snapshot, runs = env.fleet.snapshot(), []
+    for restored in (False, True):
+        if restored:
+            env.fleet.restore(snapshot)
+        env.fleet.restart()
+        shown = np.array(env.fleet.observe())
+        runs.append([shown, env.reset(options={"parameters": {"range_sigma": 44.0}})[0]])
+    same(*runs)
+
+
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_backends_fly_the_same_mixture(backend):
     pytest.importorskip(NEEDED[backend])

@@ -206,7 +206,7 @@ def test_the_command_writes_and_refuses(minari, command, tmp_path):
     words = (*words, "--set", "dtype=float32", "--out", tmp_path / "out")
     code, shown, _ = command(*words)
     assert code == 0
-    assert "filtergym/maneuvering-target/imm-v0" in shown
+    assert f'"filtergym/maneuvering-target/imm-v0"), with MINARI_DATASETS_PATH={tmp_path / "out"}' in shown
     about = tmp_path / "out" / "filtergym" / "maneuvering-target" / "imm-v0" / "data" / "metadata.json"
     assert json.loads(about.read_text())["total_steps"] == 10
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

@@ -11,6 +11,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from contract import assert_properties
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
 
@@ -52,8 +53,13 @@ def commands(text):
                     yield words
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_commands_are_parsed(page):
+def test_pages():
+    assert_properties(
+        list(PAGES), (has_commands_that_are_parsed, has_python_that_compiles_and_imports_what_there_is)
+    )
+
+
+def has_commands_that_are_parsed(page):
     """Every option exists and every value has its type; nothing is executed."""
     program = application()
     for name, *words in commands(PAGES[page]):
@@ -95,8 +101,7 @@ def known(page, params):
         assert scenario in catalogue()[id].scenarios, (page, scenario)
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_python_compiles_and_finds_what_it_imports(page):
+def has_python_that_compiles_and_imports_what_there_is(page):
     for block in blocks(PAGES[page], "python", "py"):
         for node in ast.walk(ast.parse(block, page)):
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("filtergym"):

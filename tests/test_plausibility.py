@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filtergym.envs.data.plausibility import check_extents
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.storage.dataset import notes_of
 from test_recording import table
@@ -66,6 +67,18 @@ def _changed(columns, changes):
 def untold(columns):
     """Without the truth."""
     return {name: values for name, values in columns.items() if not name.startswith("truth_")}
+
+
+def test_extents_a_thousand_times_apart_are_refused():
+    """In either order; half and twice as much are not a slip of units, nor is NaN an extent."""
+    track = np.array([[0.0, np.nan], [3.0, 0.0], [np.nan, 4.0]])
+    for factor, refused in ((1000.0, True), (600.0, True), (1900.0, True), (400.0, False), (2500.0, False)):
+        for series in ((factor * track, track), (track, factor * track)):
+            if not refused:
+                check_extents(("ins", "fix"), *series)
+                continue
+            with pytest.raises(ValueError, match=r"extends over .* m: is \w+ kilometres"):
+                check_extents(("ins", "fix"), *series)
 
 
 def kilometres(values):
@@ -228,9 +241,7 @@ def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
     assert any(line.startswith("Fewer than 30 measurements") for line in said)
     # Kilometres whose deviations are kilometres, too, are a slow target: who knows it sees that.
     (extent,) = (line for line in said if line.startswith("Positions span"))
-    assert re.fullmatch(
-        r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent
-    )
+    assert re.fullmatch(r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent)
     said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
     assert not any("guess" in line for line in said)
 

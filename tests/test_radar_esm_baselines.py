@@ -185,6 +185,20 @@ def test_ideal_is_the_channel_of_the_true_class():
         assert numpy.moveaxis(covariance, -1, 0) == pytest.approx(reported, rel=1e-9)
 
 
+def test_ideal_starts_with_the_correlation_of_the_first_measurement():
+    model = make_model(ID, scenario="correlated-errors", decision_interval=1)
+    begun = []
+    start_lanes(model, range(8), begun.append)
+    track = Ideal(model.task).start(begun[0].measurement, begun[0].truth)
+    a, b = model.task.parameters.range_sigma, model.task.parameters.range_rate_sigma
+    variances, rho = model.task.design_models(model.task.parameters)[1], begun[0].truth.radar_correlation
+    assert (rho < -0.1).all()
+    for lane in range(8):
+        expected = numpy.diag(numpy.diag(variances[..., int(begun[0].truth.target_class[lane])]))
+        expected[:2, :2] = [[a * a, a * b * rho[lane]], [a * b * rho[lane], b * b]]
+        numpy.testing.assert_allclose(track.covariance[..., lane], expected, rtol=1e-12)
+
+
 def test_ideal_switches_its_model_at_the_change():
     """Against a Kalman filter written out for each lane, which keeps state and covariance at the change."""
     model = make_model(ID, scenario="class-change", decision_interval=1)
@@ -219,12 +233,13 @@ def test_ideal_does_not_depend_on_what_the_bank_does():
 
 
 def test_ideal_keeps_its_bound_where_the_class_changes():
-    dataset = evaluate(ID, ["ideal", "known-class-bound"], "class-change", 3000)
+    count = 400
+    dataset = evaluate(ID, ["ideal", "known-class-bound"], "class-change", count)
     squares = dataset["error"].sel(policy="ideal").values ** 2
     bound = dataset["mean_square"].sel(policy="known-class-bound").values
     for i in range(3):
         difference = (squares[..., i] - bound[..., i]).mean(axis=1)
-        assert abs(difference.mean()) < 4.0 * difference.std() / math.sqrt(3000)
+        assert abs(difference.mean()) < 4.0 * difference.std() / math.sqrt(count)
 
 
 # --- policies

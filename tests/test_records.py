@@ -9,6 +9,7 @@ import comparison
 import front
 import pytest
 from comparison import compared_policies
+from contract import assert_properties
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import RANKED
@@ -86,13 +87,15 @@ def test_numbers_of_an_appendix_name_a_command():
     assert unnamed_numbers(text) == ["4 %", "5 %"]
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_a_sentence_with_a_number_names_its_record(page):
+def test_pages():
+    assert_properties(list(PAGES), (names_the_record_of_every_number, names_what_is_there))
+
+
+def names_the_record_of_every_number(page):
     assert unnamed_numbers(PAGES[page], appendix=page.startswith("docs/appendix/")) == []
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_what_a_page_names_is_there(page):
+def names_what_is_there(page):
     for role, path in ROLE.findall(re.sub(r"``.*?``(?!`)", "", PAGES[page])):
         if role == "record":
             assert read_record(path).command

@@ -24,6 +24,8 @@ from filtergym.evaluation.running.parallel import Workers
 from models import make_model
 
 import filtergym
+from filtergym.reports.pages.outcome import outcome_sentences
+from filtergym.reports.tables.results import read_results
 
 MODULE = '''
 import filtergym
@@ -172,8 +174,12 @@ def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
     assert code == 0, errors
     assert listed.startswith(ID)
     assert "nobody's" in listed
-    code, _, errors = command("benchmark", "--environment", ID, "--out", "results")
+    code, shown, errors = command("benchmark", "--environment", ID, "--out", "results")
     assert code == 0, errors
+    sentences = list(outcome_sentences(read_results(package / "results")[0]))
+    assert sentences
+    for sentence in sentences:
+        assert sentence.replace("`", "") in " ".join(shown.split())
 
 
 @pytest.mark.slow

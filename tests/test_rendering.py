@@ -169,6 +169,16 @@ def test_history_is_what_info_reports():
     assert not env.picture.history
 
 
+def test_the_covariance_is_drawn_in_square_kilometres():
+    env = TaskEnv(ID, "weights", scenario="paper", render_mode="rgb_array", detailed_info=True)
+    env.reset(seed=2)
+    for _ in range(3):
+        info = env.step(env.action_space.high)[4]
+    assert info["covariance"][0, 1] != 0.0
+    for name, place in {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}.items():
+        assert env.picture.history[f"covariance_{name}"][-1] == info["covariance"][place] / 1e6
+
+
 def test_manoeuvres_are_marked_where_they_are_flown():
     env = played(0, scenario="paper")
     assert env.picture.picture.shading() == [(49.5, 55.5)]

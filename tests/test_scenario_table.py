@@ -1,8 +1,8 @@
 """Parameters of scenarios and of competitors, held as data: a number that changes has to be changed here, too.
 
 ``scenarios.json`` holds for every environment what its parameters are by default, for every scenario those that differ,
-its windows and whether it is for training, and for every competitor that ships the parameters that it is made with. To
-accept a change, run
+its windows and whether it is for training, for every competitor that ships the parameters that it is made with, and for
+what can be tuned its values and their limits. To accept a change, run
 
     python tests/test_scenario_table.py
 
@@ -40,7 +40,8 @@ def table(cls):
         for kind in (known.policies, known.estimators, known.smoothers, known.references, known.bounds)
         for name, maker in kind.items()
     }
-    parts = {"defaults": defaults, "scenarios": scenarios, "competitors": competitors}
+    tunable = {name: {"limits": each.limits, "start": each.start} for name, each in known.tunable.items()}
+    parts = {"defaults": defaults, "scenarios": scenarios, "competitors": competitors, "tunable": tunable}
     return json.loads(json.dumps(parts, default=repr))
 
 
@@ -48,10 +49,11 @@ def settings(maker):
     """Parameters that a competitor is made with: those that its class has by default, and those of its variant."""
     parameters = inspect.signature(maker.func if isinstance(maker, Variant) else maker).parameters.values()
     defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
-    return {**defaults, **(maker.keywords if isinstance(maker, Variant) else {})}
+    values = {**defaults, **(maker.keywords if isinstance(maker, Variant) else {})}
+    return {name: value._asdict() if hasattr(value, "_asdict") else value for name, value in values.items()}
 
 
-@pytest.mark.parametrize("part", ["defaults", "scenarios", "competitors"])
+@pytest.mark.parametrize("part", ["defaults", "scenarios", "competitors", "tunable"])
 def test_scenarios_are_the_stored_ones(env_id, part):
     stored, found = json.loads(FILE.read_text())[env_id][part], table(catalogue()[env_id])[part]
     assert list(found) == list(stored)

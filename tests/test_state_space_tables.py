@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import registration
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.statistics.innovations import with_innovations
 
@@ -83,6 +85,13 @@ def test_a_table_of_any_times_is_what_a_naive_filter_makes_of_it(make, tmp_path,
         own = run.sel(policy=name).isel(episode=0, time=-1)
         np.testing.assert_allclose(own["estimate"].values.ravel(), mean, rtol=1e-12)
         np.testing.assert_allclose(own["covariance"].values.reshape(2, 2), P, rtol=1e-12, atol=1e-12)
+    # What is predicted of every sensor, and NaN where none was received.
+    second = {name: values[0, 1][..., None] for name, values in recording.measurements.items()}
+    predicted, received = task_class(ID).log_format.predict(
+        np.array([[0.0], [10.0]]), SimpleNamespace(**second), None
+    )
+    np.testing.assert_allclose(predicted, [[4.0], [10.0]], rtol=1e-9)
+    np.testing.assert_array_equal(received, [[np.nan], [9.8]])
 
 
 @pytest.mark.parametrize("kind", [TIMED, FIXED])

@@ -690,6 +690,22 @@ def test_the_innovation_test_sums_the_last_steps():
         assert alarm[1, k] == (window.sum() > limit)
 
 
+def test_tracks_that_were_lost_are_told_with_their_median_time():
+    """Of lost episodes alone; and no time where none was lost."""
+    lost = numpy.array([True, False, True, True, False])
+    each = {
+        "switches": numpy.zeros((5, 3, 3, 3)),
+        "lost": lost,
+        "lost_after": numpy.array([0.3, 9.0, 0.5, 0.1, 9.0]),
+    }
+    found = {m.metric: m for m in metrics._of_bank(each, Bootstrap(5, 20))}
+    assert found["track_loss_rate"].estimate.value == pytest.approx(0.6)
+    assert (found["track_loss_time"].estimate.value, found["track_loss_time"].unit) == (0.3, "s")
+    assert [m.metric for m in metrics._of_bank({**each, "lost": lost & ~lost}, Bootstrap(5, 20))] == [
+        "track_loss_rate"
+    ]
+
+
 def test_detection_counts_the_first_fault():
     alarm = numpy.zeros((3, 50), dtype=bool)
     fails = numpy.zeros((3, 50), dtype=bool)

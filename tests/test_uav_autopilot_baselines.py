@@ -125,6 +125,21 @@ def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
     assert theory("raw-sensors", plant="P", sensors=("position",)) is None
 
 
+def test_records_hold_the_theory_in_the_steady_window_alone() -> None:
+    found = {
+        (r.metric, r.window): r.value
+        for r in tidy_records(run("U", "paper-noise", 2, ("kalman",)))
+        if not r.component
+    }
+    expected = stationary(make_model(ID, "gain", "paper-noise", plant="U").task, "kalman")
+    assert expected is not None
+    assert {key: value for key, value in found.items() if key[0].endswith("_theory")} == {
+        ("output_variance_theory", "steady"): expected.output_variance,
+        ("control_variance_theory", "steady"): expected.control_variance,
+        ("cost_theory", "steady"): expected.cost,
+    }
+
+
 # ---------------------------------------------------------------- references and the bound
 
 
