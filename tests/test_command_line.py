@@ -83,7 +83,6 @@ REFUSED = {
     "advise": ("missing.csv", "--out", "new/mine.filter.json"),
     "animate": (ENV, "--policy", "known-input-bound", "--out", "new"),
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
-    "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
     "submit": (ENV, "nobody", "--out", "new/mine.json"),
 }

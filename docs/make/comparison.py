@@ -137,7 +137,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
 
 
 def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
-    """Whose covariance does not fit the errors on the training distribution, of all that is ranked but random actions."""
+    """Whose covariance does not fit the errors on the training distribution, of all ranked but random actions."""
     rows = []
     for measured in found:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]

@@ -11,9 +11,6 @@ it with white noise, and where the scenario says so with a coloured error e besi
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
 """
 
-from typing import Any
-
-from ..contract.model import Model
 from ..contract.task import Component, PaperPolicy, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
@@ -168,12 +165,6 @@ class LooselyCoupledNavigation(Task):
         action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
         self.lost_cost = float(p.axes)
-
-    def picture(self, model: Model) -> Any:
-        """Return what draws an episode; imported here, because it brings matplotlib."""
-        from .picture import PICTURE
-
-        return PICTURE(model)
 
 
 TASK = LooselyCoupledNavigation

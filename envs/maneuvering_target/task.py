@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 
 from ..contract.model import Model
+from ..contract.observation import Array
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..data.flights import Flights, flight_of
@@ -156,11 +157,13 @@ class ManeuveringTarget(Task):
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
-    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Track | None:
-        """Where there is clutter, the track about which the radar looks for plots."""
-        if not self.parameters.cluttered:
-            return None
-        return Track(filter.mean(state), filter.covariance(state))
+    def is_closed_loop(self) -> bool:
+        """Whether there is clutter."""
+        return self.parameters.cluttered
+
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Track:
+        """Track about which the radar looks for plots."""
+        return Track(mean, covariance)
 
     def _sampling_interval(self) -> float | None:
         """Return the time between scans, s; None where some miss the target, or come early."""

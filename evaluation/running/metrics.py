@@ -28,7 +28,7 @@ from ..storage.dataset import (
     with_windows,
 )
 from .threads import one_thread
-from .times import COMPILED, IN_PYTHON, METRIC, time_of
+from .times import METRIC, time_of, way_of
 
 if TYPE_CHECKING:
     import xarray
@@ -507,7 +507,7 @@ def contender_of(
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
         estimate = Estimate(time.nanoseconds, math.nan, math.nan)
-        measures.append(Measure(METRIC, COMPILED if time.compiled else IN_PYTHON, "all", estimate, "ns"))
+        measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
     return Contender(
         name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
     )

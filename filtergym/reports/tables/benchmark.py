@@ -13,10 +13,9 @@ import xarray
 
 from ...agents.named_policies import pretrained_agents
 from ...baselines.problem import Problem, problem_of
-from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import catalogue
+from ...envs.engine.scenario_choice import make_task
 from ...evaluation.competitors.kinds import RandomPolicy
-from ...evaluation.competitors.smoothers import is_open_loop
 from ...evaluation.running.metrics import Record
 from ...evaluation.running.parallel import Workers, check_workers
 from ...evaluation.running.rollout import Progress
@@ -132,7 +131,7 @@ def without_smoothers_of_closed_loops(
 ) -> tuple[str, ...]:
     """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
     smoothers = {*names} & {*problem.baselines.smoothers}
-    if not smoothers or is_open_loop(make_model(problem.task, None, scenario, backend="numpy")):
+    if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
     return tuple(name for name in names if name not in smoothers)
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from ...baselines.tuned_values import Tuned
 from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
-from ...evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
+from ...evaluation.running.times import OWN_MARK, OWN_NOTE, TIME_NOTE, TIME_TITLE, column_of_times
 from ...offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
@@ -202,6 +202,8 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
     if times := column_of_times(records):
         columns[TIME_TITLE] = lambda name: times.get(name, "-")
         notes.append(TIME_NOTE)
+        if any(time.endswith(OWN_MARK) for time in times.values()):
+            notes.append(OWN_NOTE)
     lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
     if lost:
         columns["failed"] = lambda name: f"{lost.get(name, 0)}"
