@@ -100,8 +100,8 @@ def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Coverage of intervals, by resampling many episodes.")
-    parser.add_argument("--episodes", type=int, default=10000)
-    parser.add_argument("--repetitions", type=int, default=1000)
+    parser.add_argument("--episodes", type=int, default=5000)
+    parser.add_argument("--repetitions", type=int, default=500)
     options = parser.parse_args()
     print("| environment | competitor | statistic | of all | " + " | ".join(f"{n:,}" for n in NUMBERS) + " |")
     print("|---" * (4 + len(NUMBERS)) + "|")

@@ -675,11 +675,11 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
         np.testing.assert_array_equal(line.means["cost"], costs[line.name])
         assert line.means["anees"].mean() == pytest.approx(records[line.name, "anees"].value, rel=1e-9)
     table = standing.standing_table(lines[:1], opponents, "random")
-    difference = records["mine", "relative_cost_difference"]
+    difference = records["mine", "geometric_cost_difference"]
     cells = {column.header: list(column.cells) for column in table.columns}
     assert cells["cost vs paper, %"][0] == with_interval(difference, 100.0, negligible=0.005)
-    median = records["mine", "median_cost_ratio"].value
-    assert cells["median,\n%"][0] == f"{100.0 * (median - 1.0):+.1f}"
+    means = records["mine", "relative_cost_difference"].value
+    assert cells["means,\n%"][0] == f"{100.0 * means:+.1f}"
 
 
 def test_a_run_begins_at_the_first_action():

@@ -33,8 +33,6 @@ METRICS = (
         "best_share",
         "median_anees",
         "relative_cost_difference",
-        "median_cost_ratio",
-        "win_rate",
         "behind_best",
         "score",
         "nanoseconds",

@@ -29,7 +29,6 @@ QUANTITIES = {
     "means": ("relative_cost_difference", 100.0, "%"),
     "lost": ("lost_tracks", 100.0, "%"),
     "behind": ("behind_best", 100.0, "%"),
-    "wins": ("win_rate", 100.0, "%"),
     "cost": ("cost", 1.0, ""),
     "anees": ("anees state", 1.0, ""),
     "score": ("score", 1.0, ""),

@@ -156,8 +156,8 @@ def record_statistics(
     for metric in consistency_metrics(run):
         yield from _consistency(run, metric, episodes)
         if metric == "nees":
-            nees = ratio(sums_of_present(_over_dimension(run, metric)[0]))
-            yield Statistic(("episodes", "anees"), nees, sample=ALL)
+            of_episodes = ratio(sums_of_present(_over_dimension(run, metric)[0]))
+            yield Statistic(("episodes", "anees"), of_episodes, sample=ALL)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             yield from means(
@@ -379,8 +379,8 @@ class _Against:
         }
         # A share of the room that a causal competitor has says nothing of one that uses later measurements.
         if self.reference in self.costs and name not in self.smoothers:
-            logs = (self.logs[other] for other in (name, self.paper, self.reference))
-            found["score"] = score(*logs, bootstrap)
+            own, none, best = (self.logs[other] for other in (name, self.paper, self.reference))
+            found["score"] = score(own, none, best, bootstrap)
         for metric, estimate in found.items():
             yield Measure(metric, "", "all", estimate, "1")
 
