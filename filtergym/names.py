@@ -17,6 +17,7 @@ from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
 from .envs.interface.environment import TaskEnv
 from .envs.interface.vector_environment import TaskVectorEnv
+from .evaluation.competitors.file_estimates import FileEstimates
 from .evaluation.competitors.kinds import check_competitor, kind_of, make_competitor
 from .evaluation.competitors.stepping import SteppingPolicy
 from .evaluation.running import metrics
@@ -28,6 +29,8 @@ from .evaluation.running.summary import EvaluationRequest
 
 GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
+FILE = "file:"
+"""Before a path: estimates that another program has made, see :mod:`.evaluation.competitors.file_estimates`."""
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
@@ -38,7 +41,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
             ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
-            a classical filter. A path is that of a file or folder, whatever else has its name.
+            a classical filter, or ``file:PATH`` of estimates that another program has made. A path is that of a file or
+            folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
@@ -60,6 +64,8 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return found
     if name.endswith(SUFFIX):
         return _find_advised(problem, Path(name))
+    if name.startswith(FILE):
+        return FileEstimates(Path(name.removeprefix(FILE)).absolute())
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))

@@ -28,8 +28,11 @@ FAULTS = (
     "the covariance is not positive definite",
     "the covariance is not symmetric",
     "the estimate is not finite after a missed measurement (what is not received is NaN: predict without it)",
+    "the file holds no more estimates of the track",
 )
 """Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
+UNRECEIVED, NO_ROW = 5.0, 6.0
+"""Numbers of the last two."""
 
 
 class Losses(NamedTuple):
