@@ -36,6 +36,7 @@ GROUPS: Mapping[str, Commands] = {
     },
     "Compare": {
         "evaluate": "measure:evaluate_policies",
+        "stress": "stress:stress",
         "benchmark": "measure:benchmark",
         "reproduce": "report:reproduce",
     },

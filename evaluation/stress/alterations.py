@@ -20,8 +20,6 @@ AFTERWARDS = 100
 """Measurements after what passes."""
 LASTING = 200
 """Measurements of a stream in which it does not."""
-LONGEST = 1000
-"""Scans of the longest gap."""
 EVERY = 10
 """Of so many measurements one is delivered twice or late."""
 
@@ -34,6 +32,8 @@ class Alteration(NamedTuple):
     name: str
     description: str
     function: Function
+    length: int = SETTLED + LASTING
+    """Measurements that a stream must have for it."""
 
 
 def _cut(stream: Stream, begin: int, end: int | None) -> Stream:
@@ -161,7 +161,10 @@ def _frozen(stream: Stream, generator: numpy.random.Generator) -> Stream:
     return _cut(stream.with_readings(readings), SETTLED, SETTLED + 20)
 
 
-def _not_a_number(stream: Stream, generator: numpy.random.Generator) -> Stream:
+def _not_a_number(stream: Stream, generator: numpy.random.Generator) -> Stream | None:
+    """What cannot be said to be missing is refused at the door."""
+    if not type(stream.task.world).received_field:
+        return None
     readings = stream.readings.copy()
     readings[SETTLED] = numpy.nan
     return _cut(stream.with_readings(readings), SETTLED, SETTLED + 1)
@@ -187,7 +190,7 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
             told[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
     begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **told)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
-    return _cut(replace(later, initial=begun).renumbered(), 0, 1)
+    return _cut(replace(later, initial=begun).renumbered(), stream.task.start_measurements, 1)
 
 
 def _single(stream: Stream, generator: numpy.random.Generator) -> Stream:
@@ -204,8 +207,13 @@ def _single(stream: Stream, generator: numpy.random.Generator) -> Stream:
 ALTERATIONS: tuple[Alteration, ...] = (
     Alteration("as-measured", "nothing is altered", _unaltered),
     *(
-        Alteration(f"gap-{scans}", f"nothing is received for {scans:,} scans", _gap(scans))
-        for scans in (10, 100, LONGEST)
+        Alteration(
+            f"gap-{scans}",
+            f"nothing is received for {scans:,} scans",
+            _gap(scans),
+            SETTLED + scans + AFTERWARDS,
+        )
+        for scans in (10, 100, 1000)
     ),
     Alteration("jitter", "time stamps are off by up to 30 % of the interval", _jitter),
     Alteration(
