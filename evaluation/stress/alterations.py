@@ -63,9 +63,7 @@ def _gap(scans: int) -> Function:
         available[here] = 0
         readings = stream.readings.copy()
         readings[here] = 0.0
-        return _cut(
-            stream.with_fields(**{field: readings, "available": available}), SETTLED, SETTLED + scans
-        )
+        return _cut(stream.with_fields(**{field: readings, "available": available}), SETTLED, SETTLED + scans)
 
     return alter
 
@@ -239,8 +237,12 @@ ALTERATIONS: tuple[Alteration, ...] = (
     Alteration("bias", "readings are off by 3 sigma, always", _bias),
     Alteration("frozen", "readings stand still for 20 measurements", _frozen),
     Alteration("nan", "one measurement is NaN", _not_a_number),
-    Alteration("tight-start", "the initial covariance is 1e-6 of what it should be", _initial_covariance(1e-6)),
-    Alteration("vague-start", "the initial covariance is 1e6 times what it should be", _initial_covariance(1e6)),
+    Alteration(
+        "tight-start", "the initial covariance is 1e-6 of what it should be", _initial_covariance(1e-6)
+    ),
+    Alteration(
+        "vague-start", "the initial covariance is 1e6 times what it should be", _initial_covariance(1e6)
+    ),
     Alteration("restart", "the track begins anew in the middle", _restart),
     Alteration("single-precision", "readings and start are in single precision", _single),
 )

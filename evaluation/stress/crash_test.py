@@ -67,7 +67,7 @@ class Finding(NamedTuple):
     verdict: str
     """"passed", "degraded", "failed", or "does not apply"."""
     reason: str
-    """One sentence; empty where it passed."""
+    """One sentence; of what passed empty, or what is remarkable."""
     error: float | None
     """Error over that on unaltered measurements, of the unaltered over that of the reference; geometric mean over
     episodes."""
@@ -152,7 +152,9 @@ class CrashTest:
             errors = self._errors(filter, self._stream(UNALTERED))
             self.scale = numpy.sqrt((errors[SETTLED:] ** 2).mean(axis=(0, 2)))
             self.scale[self.scale == 0.0] = 1.0
-            self._reference = {name: self._run(filter, s) for name, s in self.streams.items() if s is not None}
+            self._reference = {
+                name: self._run(filter, s) for name, s in self.streams.items() if s is not None
+            }
 
     def _record(self, seeds: Sequence[int], length: int, chunk: int) -> Iterator[Stream]:
         """Streams of episodes of the simulation that are as long as it takes."""
@@ -210,8 +212,8 @@ class CrashTest:
         except Exception as raised:  # whatever a filter of anybody's stumbles over
             error = textwrap.shorten(str(raised) or type(raised).__name__, MOST_WORDS, placeholder=" ...")
         if not found:
-            none = numpy.full((1, stream.episodes), numpy.nan)
-            return Run(none, none, 0.0 * none, 0.0, 0.0, error or "it answered nothing")
+            none = numpy.empty((0, stream.episodes))
+            return Run(none, none, none, 0.0, 0.0, error)
         mean, covariance = (numpy.stack([one[name] for one in found]) for name in ("mean", "covariance"))
         deviation = mean - stream.truth[: len(found)]
         with numpy.errstate(all="ignore"):
@@ -261,16 +263,19 @@ class CrashTest:
             yield self._long_run(name, maker)
         tick(1)
 
-    def _finding(
-        self, name: str, alteration: str, verdict: str, reason: str = "", **fields: Any
-    ) -> Finding:
+    def _finding(self, name: str, alteration: str, verdict: str, reason: str = "", **fields: Any) -> Finding:
         known = {
             key: value if isinstance(value, int) or math.isfinite(value) else None
             for key, value in fields.items()
         }
         empty = dict.fromkeys(("error", "reference_error", "anees", "anees_low", "anees_high"))
         return Finding(
-            name, alteration, verdict, reason, **{**empty, "lost": 0, **known}, episodes=self.experiment.episodes
+            name,
+            alteration,
+            verdict,
+            reason,
+            **{**empty, "lost": 0, **known},
+            episodes=self.experiment.episodes,
         )
 
     def _judge(self, name: str, alteration: str, stream: Stream, run: Run, plain: Run) -> Finding:
@@ -281,11 +286,9 @@ class CrashTest:
             others = math.nan
         else:
             ratio = self._ratio(run, plain, stream, slice(stream.begin, None))
-            others = self._ratio(
-                reference, self._reference.get(UNALTERED), stream, slice(stream.begin, None)
-            )
+            others = self._ratio(reference, self._reference.get(UNALTERED), stream, slice(stream.begin, None))
         lost = (run.fault > 0.0).any(axis=0)
-        begin = SETTLED if alteration == UNALTERED else stream.begin
+        begin = stream.begin
         if stream.end is not None:  # of what passes nobody can know; afterwards they can
             begin = stream.end + RECOVERY
         anees = self._mean(run.nees[begin:])
@@ -301,6 +304,9 @@ class CrashTest:
         if failed:
             return self._finding(name, alteration, FAILED, failed, **fields)
         words = [*self._harm(alteration, fields), *self._inconsistency(alteration, anees, plain)]
+        if not words and alteration == UNALTERED and not anees.low <= 1.0 <= anees.high:
+            remark = f"slightly {'overconfident' if anees.value > 1.0 else 'cautious'}, {_anees_text(anees)}"
+            return self._finding(name, alteration, PASSED, remark, **fields)
         if run.slow > max(SLOW_SECONDS, SLOW * run.median):
             words.append(f"updates take up to {run.slow:.2g} s, the median one {run.median:.2g} s")
         return self._finding(name, alteration, DEGRADED if words else PASSED, "; ".join(words), **fields)
@@ -309,7 +315,7 @@ class CrashTest:
         """Say how it failed; empty where it has not."""
         count = stream.episodes
         if run.error:
-            return f"stops after {len(run.size)} measurements: {run.error}"
+            return f"stops at measurement {len(run.size) + 1}: {run.error}"
         if lost.any():
             first = int((run.fault > 0.0).any(axis=1).argmax())
             reason = FAULTS[int(run.fault[first].max()) - 1]
@@ -343,9 +349,9 @@ class CrashTest:
         """Say where the covariance does not tell how large the errors are."""
         usual = 1.0 if alteration == UNALTERED else max(1.0, float(numpy.nanmean(plain.nees[SETTLED:])))
         if anees.low > INCONSISTENT * usual:
-            yield f"overconfident, ANEES {_text(anees.value)} [{_text(anees.low)}, {_text(anees.high)}]"
+            yield f"overconfident, {_anees_text(anees)}"
         elif alteration == UNALTERED and anees.high < 1.0 / INCONSISTENT:
-            yield f"cautious, ANEES {_text(anees.value)} [{_text(anees.low)}, {_text(anees.high)}]"
+            yield f"cautious, {_anees_text(anees)}"
 
     def _ratio(self, run: Run | None, other: Run | None, stream: Stream, part: slice) -> numpy.ndarray:
         """Error of each episode over that of another run at the same measurements of the recorded stream, ``(N,)``."""
@@ -379,12 +385,15 @@ class CrashTest:
             for k in range(SETTLED):
                 first.take(stream.at(k))
             second.restore(first.save())
-            for k in range(SETTLED, 2 * SETTLED):
+            for k in range(SETTLED, min(2 * SETTLED, len(stream))):
                 one, other = first.take(stream.at(k)), second.take(stream.at(k))
                 if any(not numpy.array_equal(one[part], other[part]) for part in ("mean", "covariance")):
                     after = k - SETTLED + 1
                     return self._finding(
-                        name, RESTORE, FAILED, f"another estimate {after} measurements after it was restored"
+                        name,
+                        RESTORE,
+                        FAILED,
+                        f"another estimate {after} measurement{'s' * (after > 1)} after it was restored",
                     )
         except Exception as raised:  # whatever a filter of anybody's stumbles over
             return self._finding(name, RESTORE, FAILED, f"cannot be saved and restored: {raised}")
@@ -422,6 +431,10 @@ def _geometric_mean(ratio: Any) -> float:
         logs = numpy.log(numpy.atleast_1d(ratio))
     logs = logs[numpy.isfinite(logs)]
     return float(numpy.exp(logs.mean())) if len(logs) else math.nan
+
+
+def _anees_text(anees: Estimate) -> str:
+    return f"ANEES {_text(anees.value)} [{_text(anees.low)}, {_text(anees.high)}]"
 
 
 def _text(value: float) -> str:

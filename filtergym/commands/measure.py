@@ -218,8 +218,8 @@ def record_scenario(
         bool,
         typer.Option(
             "--blind",
-            help="Without the truth, for programs outside Python: measurements.csv, start.csv and measurements.nc. What "
-            "they estimate is judged by filtergym evaluate --policy file:ESTIMATES.",
+            help="Without the truth, for programs outside Python: measurements.csv, start.csv and measurements.nc. "
+            "What they estimate is judged by filtergym evaluate --policy file:ESTIMATES.",
         ),
     ] = False,
     backend: Backend = "auto",

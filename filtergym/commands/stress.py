@@ -99,4 +99,3 @@ def stress(
         console.print(f"page in {html}", soft_wrap=True)
     if any(finding.verdict == "failed" for finding in findings):
         raise typer.Exit(1)
-

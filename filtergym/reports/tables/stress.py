@@ -29,9 +29,16 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
         described: whether each line says what happens.
     """
     left_out = [finding.alteration for finding in findings if finding.verdict == NOTHING]
-    notes = f"Does not apply, as a measurement has nothing that says it: {', '.join(left_out)}." if left_out else ""
+    notes = (
+        f"Does not apply, as a measurement has nothing that says it: {', '.join(left_out)}."
+        if left_out
+        else ""
+    )
     table = Table(
-        title=f"{findings[0].competitor}: {count_verdicts(findings)}", caption=notes or None, box=None, pad_edge=False
+        title=f"{findings[0].competitor}: {count_verdicts(findings)}",
+        caption=notes or None,
+        box=None,
+        pad_edge=False,
     )
     for name in ("alteration", *["what happens"] * described, "verdict", "how"):
         table.add_column(name)
