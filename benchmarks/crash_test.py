@@ -2,8 +2,8 @@
 
     python benchmarks/crash_test.py [--environment ID] [--episodes N] [--steps N] [--record]
 
-One row for each policy, estimator, tuned one and agent: how many alterations it passed, under which it is degraded, and
-under which it failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out.
+One row for each policy, estimator, tuned one and agent: how many alterations it passed, and under which it is degraded
+or failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out.
 """
 
 import argparse
@@ -56,8 +56,8 @@ def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) 
         "command": f"python benchmarks/crash_test.py --environment {problem.id} --record",
         "made": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "versions": versions,
-        "note": f"{options.episodes} tracks, long runs of {options.steps:,} measurements; {len(ALTERATIONS)} alterations, of "
-        "which some do not apply.",
+        "note": f"{options.episodes} tracks, long runs of {options.steps:,} measurements; {len(ALTERATIONS)} "
+        "alterations, of which some do not apply.",
         "data": {"columns": COLUMNS, "rows": list(map(list, rows))},
     }
     FOLDER.mkdir(exist_ok=True)

@@ -21,9 +21,10 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
-from ..storage.dataset import UNRECEIVED
 from .kinds import Kind, check_competitor, compilation_key, make_competitor
 
+AFTER_MISSED = 5.0
+"""Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
 """What starts and updates with nothing but the initial estimate and the measurements."""
 
@@ -325,7 +326,7 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
         xp: array namespace.
 
     Returns:
-        Numbers of :data:`.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
+        Numbers of :data:`..storage.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
     """
     finite = xp.all(xp.isfinite(mean), axis=0), xp.all(xp.isfinite(covariance), axis=(0, 1))
     identity = xp.eye(len(mean), dtype=xp.float64)[:, :, None]
@@ -343,7 +344,7 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     fault = xp.where(finite[1], fault, 2.0)
     fault = xp.where(finite[0], fault, 1.0)
     unreceived = (missed > 0.0) & ((fault == 1.0) | (fault == 2.0))
-    fault = xp.where(unreceived, UNRECEIVED, fault)
+    fault = xp.where(unreceived, AFTER_MISSED, fault)
     return xp.where(before > 0.0, before, fault)
 
 

@@ -31,8 +31,8 @@ FAULTS = (
     "the file holds no more estimates of the track",
 )
 """Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
-UNRECEIVED, NO_ROW = 5.0, 6.0
-"""Numbers of the last two."""
+NO_ROW = 1.0 + FAULTS.index("the file holds no more estimates of the track")
+"""Number of that reason."""
 
 
 class Losses(NamedTuple):

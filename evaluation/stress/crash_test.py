@@ -12,7 +12,7 @@ import dataclasses
 import math
 import textwrap
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -50,6 +50,8 @@ MOST_WORDS = 160
 CHUNK = 1000
 """Measurements of a long run that are held at a time."""
 LONG_EPISODES = 8
+MOST_KEPT = 20_000
+"""Measurements of a long run that are recorded once for all filters."""
 UNALTERED, RESTORE, LONG = ALTERATIONS[0].name, "restore", "long-run"
 DESCRIPTIONS: Mapping[str, str] = {
     **{one.name: one.description for one in ALTERATIONS},
@@ -146,6 +148,7 @@ class CrashTest:
             self.streams[one.name] = None if altered is None else altered.received_as_live()
         self.scale = numpy.ones(len(whole.task.components))
         self._bootstrap = Bootstrap(experiment.episodes)
+        self._kept: list[Stream] = []
         self._reference: dict[str, Run] = {}
         if reference is not None:
             filter = self.filter_of(*reference, experiment.episodes)
@@ -399,13 +402,21 @@ class CrashTest:
             return self._finding(name, RESTORE, FAILED, f"cannot be saved and restored: {raised}")
         return self._finding(name, RESTORE, PASSED)
 
+    def _long_streams(self) -> Iterable[Stream]:
+        """Streams of the long run; all but very long ones are kept for the next filter."""
+        streams = self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK)
+        if self.steps > MOST_KEPT:
+            return streams
+        self._kept = self._kept or list(streams)
+        return self._kept
+
     def _long_run(self, name: str, maker: Any) -> Finding:
         """Go on for many measurements."""
         filter = self.filter_of(name, maker, LONG_EPISODES)
         first: Run | None = None
         run: Run | None = None
         done = 0
-        for stream in self._record(self._seeds[:LONG_EPISODES], self.steps, CHUNK):
+        for stream in self._long_streams():
             run = self._run(filter, stream, begin=done == 0)
             done += len(run.size)
             lost = (run.fault > 0.0).any(axis=0)
