@@ -58,6 +58,7 @@ DESCRIPTIONS: Mapping[str, str] = {
     RESTORE: "the state is saved, and restored in another filter",
     LONG: "many measurements, one after another",
 }
+UNSAID = "the measurement has nothing that says it"
 PASSED, DEGRADED, FAILED, NOTHING = "passed", "degraded", "failed", "does not apply"
 
 
@@ -125,6 +126,9 @@ class CrashTest:
         reference: name of the reference filter, and what makes it; none in an environment without one.
         alterations: that are tried, beginning with that which alters nothing.
 
+    Raises:
+        ValueError: if the environment does not say what its sensors read.
+
     Attributes:
         streams: by the names of the alterations; None where one does not apply.
     """
@@ -140,6 +144,12 @@ class CrashTest:
         self.reference_name = "" if reference is None else reference[0]
         self._seeds = episode_seeds(experiment.split, experiment.seed, experiment.episodes)
         length = max(one.length for one in alterations)
+        world = experiment.task.World
+        if not world.reading_field and not world.received_field:
+            raise ValueError(
+                f"{experiment.task.id} does not say what its sensors read: give its World reading_field, and "
+                "stated_field or reading_deviations"
+            )
         (whole,) = self._record(self._seeds, length, length)
         self.streams: dict[str, Stream | None] = {}
         for one in alterations:
@@ -213,7 +223,7 @@ class CrashTest:
                     found.append(filter.take(measurement))
                 spent.append(time.perf_counter() - began)
         except Exception as raised:  # whatever a filter of anybody's stumbles over
-            error = textwrap.shorten(str(raised) or type(raised).__name__, MOST_WORDS, placeholder=" ...")
+            error = _shortened(raised)
         if not found:
             none = numpy.empty((0, stream.episodes))
             return Run(none, none, none, 0.0, 0.0, error)
@@ -255,7 +265,7 @@ class CrashTest:
         plain = self._run(filter, self._stream(UNALTERED))
         for alteration, stream in self.streams.items():
             if stream is None:
-                yield self._finding(name, alteration, NOTHING, "the measurement has nothing that says it")
+                yield self._finding(name, alteration, NOTHING, UNSAID)
             else:
                 run = plain if alteration == UNALTERED else self._run(filter, stream)
                 yield self._judge(name, alteration, stream, run, plain)
@@ -399,7 +409,9 @@ class CrashTest:
                         f"another estimate {after} measurement{'s' * (after > 1)} after it was restored",
                     )
         except Exception as raised:  # whatever a filter of anybody's stumbles over
-            return self._finding(name, RESTORE, FAILED, f"cannot be saved and restored: {raised}")
+            return self._finding(
+                name, RESTORE, NOTHING, f"cannot be saved and restored: {_shortened(raised)}"
+            )
         return self._finding(name, RESTORE, PASSED)
 
     def _long_streams(self) -> Iterable[Stream]:
@@ -446,6 +458,10 @@ def _geometric_mean(ratio: Any) -> float:
 
 def _anees_text(anees: Estimate) -> str:
     return f"ANEES {_text(anees.value)} [{_text(anees.low)}, {_text(anees.high)}]"
+
+
+def _shortened(raised: Exception) -> str:
+    return textwrap.shorten(str(raised) or type(raised).__name__, MOST_WORDS, placeholder=" ...")
 
 
 def _text(value: float) -> str:

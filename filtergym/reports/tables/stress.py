@@ -8,7 +8,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ...evaluation.stress.crash_test import DEGRADED, DESCRIPTIONS, FAILED, NOTHING, PASSED, Finding
+from ...evaluation.stress.crash_test import (
+    DEGRADED,
+    DESCRIPTIONS,
+    FAILED,
+    NOTHING,
+    PASSED,
+    UNSAID,
+    Finding,
+)
 
 STYLES = {PASSED: "green", DEGRADED: "yellow", FAILED: "red", NOTHING: "dim"}
 PAGE_WIDTH = 150
@@ -28,12 +36,8 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
         findings: of the competitor, in the order of the catalogue.
         described: whether each line says what happens.
     """
-    left_out = [finding.alteration for finding in findings if finding.verdict == NOTHING]
-    notes = (
-        f"Does not apply, as a measurement has nothing that says it: {', '.join(left_out)}."
-        if left_out
-        else ""
-    )
+    left_out = [finding.alteration for finding in findings if finding.reason == UNSAID]
+    notes = f"Does not apply, as {UNSAID}: {', '.join(left_out)}." if left_out else ""
     table = Table(
         title=f"{findings[0].competitor}: {count_verdicts(findings)}",
         caption=notes or None,
@@ -43,7 +47,7 @@ def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
     for name in ("alteration", *["what happens"] * described, "verdict", "how"):
         table.add_column(name)
     for finding in findings:
-        if finding.verdict != NOTHING:
+        if finding.reason != UNSAID:
             what = [DESCRIPTIONS[finding.alteration]] * described
             verdict = Text(finding.verdict, STYLES[finding.verdict])
             table.add_row(finding.alteration, *what, verdict, Text(finding.reason))
