@@ -128,8 +128,8 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
 class FileState(NamedTuple):
     """Where the episodes are."""
 
-    count: int
-    """Measurements so far."""
+    measurements: int
+    """So far."""
     seconds: numpy.ndarray
     """Time of the last, ``(N,)``."""
     row: numpy.ndarray
@@ -191,7 +191,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         row = numpy.where(there, self._order[numpy.maximum(found, 0)], -1) if len(self._order) else state.row
         fresh = there & (self.given.table.time[row] >= seconds - self._tolerance)
         over = seconds > numpy.array(self._last)[lane] + (ENDED - 0.5) * self._interval
-        return FileState(state.count + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
+        return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
 
     def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
         """Times of the measurements, s by the clock of the file."""
@@ -200,7 +200,7 @@ class FileTrack(Filter[Task, Any, FileState]):
             interval = getattr(measurement, "interval", None)
             return state.seconds + (self._interval if interval is None else interval)
         each = [self.given.times[name] for name in self.names]
-        now = [times[min(state.count, len(times) - 1)] for times in each]
+        now = [times[min(state.measurements, len(times) - 1)] for times in each]
         # Beyond the end of a shorter recording its last measurement is repeated.
         now = [
             times[numpy.isfinite(times)][-1] if numpy.isnan(t) else t

@@ -418,7 +418,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    if chosen.recording is None:
+    if chosen.recording is None or flown is None:
         tracks = {seed: str(i) for i, seed in enumerate(seeds)}
     else:
         tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}

@@ -110,7 +110,7 @@ class Stream:
         fields = {"interval": interval}
         elapsed = type(self.task.world).elapsed_field
         if elapsed:
-            fields[elapsed] = _since_received(seconds, self.received.any(axis=1))
+            fields[elapsed] = _since_received(seconds, numpy.asarray(self.received.any(axis=1)))
         return self.with_fields(**fields)
 
     def received_as_live(self) -> "Stream":
@@ -160,7 +160,7 @@ def record_streams(model: Model, seeds: Sequence[int], length: int, chunk: int) 
     if isinstance(model.action_space, gymnasium.spaces.Discrete):
         actions = numpy.full(count, int(action.ravel()[0]))
     else:
-        actions = numpy.tile(numpy.reshape(action, model.action_space.shape), (count, 1))
+        actions = numpy.tile(numpy.reshape(action, model.action_space.shape or ()), (count, 1))
     initial = map_arrays(lambda values: values[..., :count].copy(), began[0].measurement)
     measurements: list[Any] = []
     truth: list[numpy.ndarray] = []
