@@ -12,8 +12,8 @@ from ..evaluation.storage.files import writable_file, write_text
 from ..evaluation.stress.alterations import ALTERATIONS
 from ..evaluation.stress.crash_test import CrashTest, Finding
 from ..names import FILE, find_competitor
+from ..reports.pages.crash_report import crash_page, crash_table
 from ..reports.tables.records import write_records
-from ..reports.tables.stress import crash_page, crash_table
 from .terminal import (
     Backend,
     Environment,
