@@ -1,6 +1,6 @@
 """Crash tests of all shipped competitors, as tables for the pages: docs/records/stress/ENVIRONMENT.json.
 
-    python benchmarks/crash_test.py [--environment ID] [--episodes N] [--steps N] [--record]
+    python benchmarks/crash_test.py [--environment ID] [--policy NAME ...] [--episodes N] [--steps N] [--record]
 
 One row for each policy, estimator, tuned one and agent: how many alterations it passed, and under which it is degraded
 or failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out.
@@ -12,6 +12,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -53,7 +54,7 @@ def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) 
     versions = {"Python": platform.python_version()}
     versions |= {name: importlib.metadata.version(name) for name in LIBRARIES}
     record: dict[str, Any] = {
-        "command": f"python benchmarks/crash_test.py --environment {problem.id} --record",
+        "command": shlex.join(["python", "benchmarks/crash_test.py", *sys.argv[1:]]),
         "made": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "versions": versions,
         "note": f"{options.episodes} tracks, long runs of {options.steps:,} measurements; {len(ALTERATIONS)} "
@@ -71,6 +72,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--environment", choices=sorted(catalogue()), help="default: all of them")
+    parser.add_argument("--policy", action="append", help="only this competitor; repeatable")
     parser.add_argument("--episodes", type=int, default=32)
     parser.add_argument("--steps", type=int, default=10_000, help="of the long run")
     parser.add_argument("--record", action="store_true", help="write the records")
@@ -86,15 +88,15 @@ def main() -> None:
         experiment = problem.experiment(None, options.episodes)
         test = CrashTest(experiment, options.steps, (paper, find_competitor(problem, paper)))
         rows = []
-        for name in names_of(problem):
+        for name in options.policy or names_of(problem):
             findings = list(test.findings(name, find_competitor(problem, name)))
             everything += findings
             rows.append(row(name, findings))
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-        if options.record:
-            write_record(problem, rows, options)
-        if options.json is not None:
-            options.json.write_text(json.dumps([one._asdict() for one in everything]), encoding="utf-8")
+            if options.record:
+                write_record(problem, rows, options)
+            if options.json is not None:
+                options.json.write_text(json.dumps([one._asdict() for one in everything]), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -311,7 +311,7 @@ class GainBank(RadarBank):
         after = f._replace(mean=xp.concat(updated), covariance=covariance, alpha=alpha)
         if self.regular:
             return after
-        after = after._replace(grown=measurement.elapsed, since=xp.zeros_like(measurement.elapsed))
+        after = after._replace(grown=elapsed, since=xp.zeros_like(measurement.elapsed))
         missed = f._replace(mean=xp.concat([f.predicted, f.mean[2:]]), since=measurement.elapsed)
         return self.where_detected(measurement, after, missed)
 
