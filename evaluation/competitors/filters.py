@@ -22,6 +22,7 @@ from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
 from .kinds import Kind, check_competitor, compilation_key, make_competitor
+from .programs import ProgramEstimator
 
 AFTER_MISSED = 5.0
 """Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
@@ -86,6 +87,11 @@ class Adapter(Filter[Task, Any, Adapted]):
             self.tells, likelihood = True, Likelihood.of(*reported)
             likelihood = likelihood if self.in_python else likelihood.fill_unknown(mean[0])
         return Adapted(mean, covariance, memory, likelihood)
+
+    @property
+    def fault(self) -> int:
+        """Number of the reason among ``FAULTS`` for which it has no answer at all, as a program may have; 0: none."""
+        return getattr(self.own, "fault", 0)
 
     def ask(self, given: Input, memory: Any) -> Any:
         """Its answer to a measurement."""
@@ -162,6 +168,11 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         self.told: Mapping[str, Array] = {}
         """What it has said beside its last estimate."""
         self.knows = getattr(own, "knows", "")
+
+    @property
+    def fault(self) -> int:
+        """Number of the reason among ``FAULTS`` for which a program has no answer at all; 0: it has."""
+        return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, given: Input) -> Input:
         """Copies, which may be changed in place."""
@@ -275,7 +286,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         before, missing = state.fault, None
         if isinstance(self.own, HeldInPython):
-            before = numpy.where(before > 0.0, before, self.own.told.get("lost", 0.0))
+            before = numpy.where(before > 0.0, before, self.own.told.get("lost", float(self.own.fault)))
             missing = self.own.told.get("missing")
         fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
@@ -471,6 +482,8 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
+    if isinstance(own, ProgramEstimator):
+        own.tracks = count
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:

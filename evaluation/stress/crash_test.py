@@ -17,14 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.live_input import Feed
 from ...envs.contract.model import Model
+from ...envs.data.recorded_world import Feed
 from ...envs.engine.backend import make_model
 from ...envs.engine.scenario_choice import find_scenario
 from ...filters.gaussian import log_density
 from ..competitors.filters import find_fault
 from ..competitors.kinds import kind_of
-from ..competitors.online import OnlineFilter, OnlineState
+from ..competitors.online import OnlineFilter
+from ..competitors.online_state import OnlineState
 from ..running.evaluate import Experiment, control_of
 from ..running.seeds import episode_seeds
 from ..statistics.bootstrap import Bootstrap, Estimate
