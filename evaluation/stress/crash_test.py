@@ -237,10 +237,11 @@ class CrashTest:
         if "lost" in found[0]:
             fault = numpy.stack([one["lost"] for one in found])
         else:
-            none = numpy.zeros(len(found) * stream.episodes)
-            sizes = [values.reshape(*values.shape[:-2], -1) for values in flat]
-            nowhere = numpy.moveaxis(mean, 1, 0).reshape(sizes[0].shape)
-            fault = find_fault(nowhere, sizes[1], none, none, numpy).reshape(size.shape)
+            nothing = numpy.zeros(len(found) * stream.episodes)
+            means, covariances = (
+                values.reshape(*values.shape[:-2], -1) for values in (numpy.moveaxis(mean, 1, 0), flat[1])
+            )
+            fault = find_fault(means, covariances, nothing, nothing, numpy).reshape(size.shape)
         slow = sorted(spent)[max(len(spent) - HICCUPS, 0)]
         return Run(size, normalised, fault, slow, float(numpy.median(spent)), error)
 
@@ -278,30 +279,23 @@ class CrashTest:
         tick(1)
 
     def _finding(self, name: str, alteration: str, verdict: str, reason: str = "", **fields: Any) -> Finding:
-        known = {
-            key: value if isinstance(value, int) or math.isfinite(value) else None
-            for key, value in fields.items()
-        }
-        empty = dict.fromkeys(("error", "reference_error", "anees", "anees_low", "anees_high"))
-        return Finding(
-            name,
-            alteration,
-            verdict,
-            reason,
-            **{**empty, "lost": 0, **known},
-            episodes=self.experiment.episodes,
+        numbers: dict[str, Any] = dict.fromkeys(
+            ("error", "reference_error", "anees", "anees_low", "anees_high")
         )
+        numbers["lost"] = 0
+        numbers |= {key: value if math.isfinite(value) else None for key, value in fields.items()}
+        return Finding(name, alteration, verdict, reason, **numbers, episodes=self.experiment.episodes)
 
     def _judge(self, name: str, alteration: str, stream: Stream, run: Run, plain: Run) -> Finding:
         """Say what became of a filter under one alteration."""
         reference = self._reference.get(alteration)
         if alteration == UNALTERED:
             ratio = self._ratio(run, reference, stream, slice(SETTLED, None))
-            others = math.nan
+            others = numpy.full(stream.episodes, math.nan)
         else:
             ratio = self._ratio(run, plain, stream, slice(stream.begin, None))
             others = self._ratio(reference, self._reference.get(UNALTERED), stream, slice(stream.begin, None))
-        lost = (run.fault > 0.0).any(axis=0)
+        lost = numpy.asarray((run.fault > 0.0).any(axis=0))
         begin = stream.begin
         if stream.end is not None:  # of what passes nobody can know; afterwards they can
             begin = stream.end + RECOVERY
@@ -442,7 +436,7 @@ class CrashTest:
         assert first is not None
         assert run is not None
         early, late = (float(numpy.nanmean(one.nees[SETTLED:])) for one in (first, run))
-        fields = {"anees": late}
+        fields: dict[str, Any] = {"anees": late}
         if late > INCONSISTENT * INCONSISTENT * max(1.0, early):
             words = f"overconfident after {done:,} measurements, ANEES {_text(late)}, at first {_text(early)}"
             return self._finding(name, LONG, DEGRADED, words, **fields)
