@@ -37,6 +37,7 @@ GROUPS: Mapping[str, Commands] = {
     },
     "Compare": {
         "evaluate": "measure:evaluate_policies",
+        "stress": "stress:stress",
         "benchmark": "measure:benchmark",
         "reproduce": "report:reproduce",
     },

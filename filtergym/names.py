@@ -19,6 +19,7 @@ from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
 from .envs.interface.environment import TaskEnv
 from .envs.interface.vector_environment import TaskVectorEnv
+from .evaluation.competitors.file_estimates import FileEstimates
 from .evaluation.competitors.isolation import ISOLATED, isolate_estimator
 from .evaluation.competitors.kinds import check_competitor, kind_of, make_competitor
 from .evaluation.competitors.programs import EXEC, Program
@@ -32,6 +33,8 @@ from .evaluation.running.summary import EvaluationRequest
 
 GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
+FILE = "file:"
+"""Before a path: estimates that another program has made, see :mod:`.evaluation.competitors.file_estimates`."""
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
@@ -43,7 +46,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's,
             ``isolated:module:Class`` of an estimator in a process of its own, ``exec:COMMAND`` of any program, or
             ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
-            a classical filter. A path is that of a file or folder, whatever else has its name.
+            a classical filter, or ``file:PATH`` of estimates that another program has made. A path is that of a file or
+            folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
@@ -69,6 +73,8 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return found
     if name.endswith(SUFFIX):
         return _find_advised(problem, Path(name))
+    if name.startswith(FILE):
+        return FileEstimates(Path(name.removeprefix(FILE)).absolute())
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))

@@ -25,7 +25,7 @@ ROOMS = (
 """The last two are not installed, so nothing in the package may import them."""
 INNER_ROOMS = {
     "envs": ("contract", "data", "drawing", "engine", "interface", "linear", *folders().values()),
-    "evaluation": ("storage", "statistics", "competitors", "running", "figures"),
+    "evaluation": ("storage", "statistics", "competitors", "running", "stress", "figures"),
     "filtergym/reports": ("tables", "pages"),
 }
 """Rooms inside a room, in the same order; the environments come last and know nothing of each other."""

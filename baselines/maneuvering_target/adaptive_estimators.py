@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from ...envs.contract.filter import Initial, Input, Likelihood, Track
 from ...envs.contract.observation import Array
+from ...envs.maneuvering_target.banks import SHORTEST
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...filters import kalman, noise_adaptation, predicted_covariance
 from .estimators import KalmanModel
@@ -50,11 +51,14 @@ class SageHusa(KalmanModel):
         mean, carried = kalman.predict(state.mean, state.covariance, F, 0.0 * unit)
         predicted = carried + unit * state.level.value
         result = self.update_estimate((mean, predicted), measurement)
+        # In no time there is no noise, and a correction says nothing of it.
+        passed = measurement.interval >= SHORTEST * self.task.parameters.sampling_interval
         sample = noise_adaptation.process_noise_factor(
             result.mean - mean,
-            *(self.diagonal(P) for P in (result.covariance, carried, unit)),
+            *(self.diagonal(P) for P in (result.covariance, carried, self.xp.where(passed, unit, 1.0))),
         )
-        level = noise_adaptation.fading_mean(state.level, sample, self.forgetting, measurement.available)
+        available = self.xp.where(passed, measurement.available, 0.0)
+        level = noise_adaptation.fading_mean(state.level, sample, self.forgetting, available)
         level = level._replace(value=self.xp.clip(level.value, self.least, None))
         return ProcessNoiseTrack(*self.track(measurement, result), level)
 

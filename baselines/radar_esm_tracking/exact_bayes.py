@@ -37,6 +37,10 @@ from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import LEAST_PROBABILITY
 from ...filters.small_matrices import mirror_lower
 
+LEAST_NUMBER = 1e-200
+"""Of a probability, before all are normalised: an outlier of many sigma leaves more than one hypothesis at zero, whose
+share among themselves would be none."""
+
 
 class ClassPrior(NamedTuple):
     """What the filter expects before it has seen anything; times in s."""
@@ -277,8 +281,8 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
             mean=radar.mean,
             covariance=packed_covariance.pack(radar.covariance),
             weights=weights / seen,
-            unchanged=memory.unchanged * factor[:, 0] / seen,
-            changed=memory.changed * (factor[:, 1:] / seen)[:, :, None],
+            unchanged=xp.clip(memory.unchanged * factor[:, 0] / seen, LEAST_NUMBER, None),
+            changed=xp.clip(memory.changed * (factor[:, 1:] / seen)[:, :, None], LEAST_NUMBER, None),
         )
         moved = self.change(moved, measurement.scan)
         looked = measurement.looked

@@ -71,6 +71,15 @@ class Likelihood(NamedTuple):
         return Likelihood(*(none if values is None else values for values in self))
 
 
+class Stated(NamedTuple):
+    """What is stated by a filter that does not always state everything; the rest is NaN."""
+
+    components: tuple[bool, ...]
+    """Which components it estimates, ``(C,)``."""
+    deviations: tuple[bool, ...]
+    """Of which it says how large its errors are, ``(C,)``."""
+
+
 class Track(NamedTuple):
     """State of a filter that remembers its estimate alone."""
 
@@ -94,6 +103,8 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     """Whether it runs as Python code, whatever computes the rest: it cannot be traced."""
     adapts_covariance: bool = False
     """Whether the covariance that is reported grows with the innovations."""
+    stated: Stated | None = None
+    """What it states; None: mean and covariance of all components at every measurement."""
     least_interval: ClassVar[float] = 0.0
     """Share of the sampling interval from which on its gains are good for the time between two measurements."""
 

@@ -35,6 +35,13 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     received_field: ClassVar[str] = ""
     """Field of the measurement whose values are received only where its field ``available`` is above zero, of the same
     shape or ``(N,)``; empty where everything is received."""
+    reading_field: ClassVar[str] = ""
+    """Field of the measurement that sensors read with errors; empty: the received field."""
+    stated_field: ClassVar[str] = ""
+    """Field that states how large these errors are, variances where its name says so, else deviations; empty where a
+    measurement does not say."""
+    elapsed_field: ClassVar[str] = ""
+    """Field with the s since the last measurement that was received; empty where there is none."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
@@ -106,6 +113,17 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         where that is None.
         """
         return None
+
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """Standard deviations of the errors of what sensors read, stated or nominal, in the shape of the readings; here
+        the square roots of ``stated_field``.
+
+        Args:
+            measurement: of :meth:`advance`.
+        """
+        if not self.stated_field:
+            raise NotImplementedError(f"{type(self).__name__} needs reading_deviations, or a stated_field of variances")
+        return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:
         """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be

@@ -242,14 +242,18 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
 
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """Those of the R that the filters believe."""
+        sigma = self.task.constant(numpy.sqrt(numpy.diag(self.task.definition.filters[0].R)))
+        return sigma[:, None] + 0.0 * measurement.values
+
     def component_readings(self, measurement: Measurement) -> Array | None:
         """Readings of components that are measured as they are; None where none is."""
         return self._of_components(measurement.values, measurement.available)
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
         """Deviations that the model states for them."""
-        sigma = self.task.constant(numpy.sqrt(numpy.diag(self.task.definition.filters[0].R)))
-        return self._of_components(sigma[:, None] + 0.0 * measurement.values, measurement.available)
+        return self._of_components(self.reading_deviations(measurement), measurement.available)
 
     def _of_components(self, values: Array, available: Array) -> Array | None:
         if all(place is None for place in self.places):

@@ -96,7 +96,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
 
     own_parameters = ("duration",)
     parameters: LooselyCoupledNavigationParameters
-    received_field = "fix"
+    received_field, stated_field = "fix", "reported_deviation"
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
@@ -109,6 +109,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         self.row_uniforms = self.outliers.row_uniforms
         self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
         self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
+
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """What the receiver reports."""
+        return measurement.reported_deviation + 0.0 * measurement.fix
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw noise levels, disturbances and rate errors; at the start INS and reference agree."""

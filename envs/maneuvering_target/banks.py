@@ -44,6 +44,9 @@ LARGEST_SHARE = 1e8
 
 LEAST_INTERVAL = 0.1
 """Of the sampling interval: beta over the time is what turns position noise into speed, ten times too large here."""
+SHORTEST = 0.05
+"""Of the sampling interval: measurements that are closer are taken for so far apart, where beta is divided by the time.
+No simulated scans are closer."""
 
 
 class AlphaBeta(NamedTuple):
@@ -123,8 +126,11 @@ class RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
         return self.T if self.regular else measurement.interval
 
     def time_since_last(self, measurement: Measurement) -> float | Array:
-        """Seconds since the last measurement."""
-        return self.T if self.regular else measurement.elapsed
+        """Seconds since the last measurement, no fewer than :data:`SHORTEST`; a late one comes after negative ones."""
+        if self.regular:
+            return self.T
+        least = SHORTEST * self.T
+        return self.xp.where(self.xp.abs(measurement.elapsed) < least, least, measurement.elapsed)
 
     def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
         """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
@@ -305,7 +311,7 @@ class GainBank(RadarBank):
         after = f._replace(mean=xp.concat(updated), covariance=covariance, alpha=alpha)
         if self.regular:
             return after
-        after = after._replace(grown=measurement.elapsed, since=xp.zeros_like(measurement.elapsed))
+        after = after._replace(grown=elapsed, since=xp.zeros_like(measurement.elapsed))
         missed = f._replace(mean=xp.concat([f.predicted, f.mean[2:]]), since=measurement.elapsed)
         return self.where_detected(measurement, after, missed)
 

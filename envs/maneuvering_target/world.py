@@ -82,7 +82,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
 
     own_parameters = ("flight", "track", "track_scans")
     parameters: ManeuveringTargetParameters
-    received_field = "position"
+    received_field, stated_field, elapsed_field = "position", "variance", "elapsed"
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)

@@ -98,6 +98,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     """A target of one class on one range channel, seen by a radar and heard by an ESM station."""
 
     parameters: RadarEsmTrackingParameters
+    reading_field = "radar"
 
     def __init__(self, task: "RadarEsmTracking") -> None:
         super().__init__(task)
@@ -305,6 +306,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
+
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """Those of range and range rate."""
+        p = self.parameters
+        return self.task.constant([[p.range_sigma], [p.range_rate_sigma]]) + 0.0 * measurement.radar
 
     def mask_missing(self, measurement: Measurement) -> Measurement:
         """Difference of bearings NaN where the ESM decided nothing."""

@@ -156,6 +156,10 @@ class NavigationWorld(World[Task, Truth, Measurement]):
 
     # --- the episode
 
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """The nominal ones."""
+        return self.task.sensor_sigma + 0.0 * measurement.readings
+
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw legs and faults; what is known of the start has errors."""
         xp, p, S = self.xp, self.parameters, self.task.satellites

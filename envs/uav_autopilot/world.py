@@ -124,6 +124,10 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         self.manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
         self.dropouts = -(-p.horizon // p.dropout_period) if p.dropout_period else 0
 
+    def reading_deviations(self, measurement: Measurement) -> Array:
+        """The nominal ones."""
+        return self.task.constant(self.parameters.value("sensor_sigmas"))[:, None] + 0.0 * measurement.reading
+
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
         """Draw what the episode will be like, and the state at its start."""
         xp, p, m = self.xp, self.parameters, len(self.task.sensors)

@@ -5,7 +5,7 @@ that it is ``traceable``. The rest runs as Python code between compiled steps of
 itself: it may be anything.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ import numpy
 from ...compiler.functions import map_arrays
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, Input, Likelihood, State
+from ...envs.contract.filter import Filter, Input, Likelihood, State, Stated
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
@@ -148,14 +148,25 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         own: the filter; None beside traced steps.
         name: what it is and its name, in errors.
         count: number of episodes; lanes beyond are given the last of them. None: all lanes as they are.
+        stated: what it states, where ``own`` is None.
     """
 
     in_python = True
 
-    def __init__(self, task: Task, own: Any = None, name: str = "", count: int | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        own: Any = None,
+        name: str = "",
+        count: int | None = None,
+        stated: Stated | None = None,
+    ) -> None:
         super().__init__(task)
         self.own, self.name, self.count = own, name, count
+        self.stated = getattr(own, "stated", stated)
         self.memory, self.step_number = None, 0
+        self.told: Mapping[str, Array] = {}
+        """What it has said beside its last estimate."""
         self.knows = getattr(own, "knows", "")
 
     @property
@@ -193,7 +204,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         with explain_errors(f"{self.name} failed at measurement {self.step_number}"):
             self.memory = after = self.own.step(self.memory, given)
             mean, covariance = self.own.mean(after), self.own.covariance(after)
-            told = self.own.records(after, given.measurement)
+            self.told = self.own.records(after, given.measurement)
         C, width = len(self.task.components), given.measurement[0].shape[-1]
         # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
@@ -203,7 +214,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
             covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         known = (
             None if values is None else self._numbers(name, values, (width,))
-            for name, values in Likelihood.told(told)._asdict().items()
+            for name, values in Likelihood.told(self.told)._asdict().items()
         )
         return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
@@ -241,6 +252,8 @@ class Checked(NamedTuple):
     """Number of the reason among ``FAULTS`` why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
     missed: Array
     """One where a measurement was not received in full so far, ``(N,)``."""
+    missing: Array = None
+    """One where it has no estimate of this measurement and holds its last one, ``(N,)``; None of what always has."""
 
 
 class CheckedFilter(Filter[Task, Any, Checked]):
@@ -253,12 +266,13 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def __init__(self, task: Task, own: Filter) -> None:
         super().__init__(task)
-        self.own, self.in_python = own, own.in_python
+        self.own, self.in_python, self.stated = own, own.in_python, own.stated
 
     def start(self, initial: Any) -> Checked:
         """Start where everyone starts."""
         zero = 0.0 * initial.mean[0]
-        return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero)
+        missing = None if self.stated is None else zero
+        return Checked(self.own.start(initial), initial.mean, initial.covariance, zero, zero, missing)
 
     def predict(self, state: Checked, measurement: Any) -> Checked:
         """Let it predict."""
@@ -270,12 +284,23 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         own = self.own.update(state.own, Input(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
-        fault = find_fault(mean, covariance, state.fault, missed, self.xp)
-        if isinstance(self.own, HeldInPython) and self.own.fault:
-            fault = numpy.where(state.fault > 0.0, state.fault, float(self.own.fault))
+        before, missing = state.fault, None
+        if isinstance(self.own, HeldInPython):
+            before = numpy.where(before > 0.0, before, self.own.told.get("lost", float(self.own.fault)))
+            missing = self.own.told.get("missing")
+        fault = find_fault(*self._stated(mean, covariance), before, missed, self.xp)
         lost = fault > 0.0
         mean = self._held(lost, state.mean, mean)
-        return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed)
+        return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed, missing)
+
+    def _stated(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Mean and covariance with valid numbers in place of what is never stated."""
+        if self.stated is None:
+            return mean, covariance
+        known, deviations = map(numpy.array, self.stated)
+        both = numpy.logical_and.outer(deviations, deviations)[:, :, None]
+        apart = numpy.eye(len(known))[:, :, None]
+        return numpy.where(known[:, None], mean, 0.0), numpy.where(both, covariance, apart)
 
     def _held(self, lost: Array, last: Array, answer: Array) -> Array:
         """The last valid answer where the episode is lost."""
@@ -287,7 +312,8 @@ class CheckedFilter(Filter[Task, Any, Checked]):
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was, and why the episode is lost."""
         told = Likelihood.told(self.own.records(state.own, measurement)).fill_unknown(state.fault)
-        return {**told._asdict(), "lost": state.fault}
+        missing = {} if state.missing is None else {"missing": state.missing}
+        return {**told._asdict(), "lost": state.fault, **missing}
 
 
 def is_lacking(received: Any, xp: Any) -> Array:
@@ -311,7 +337,7 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
         xp: array namespace.
 
     Returns:
-        Numbers of :data:`.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
+        Numbers of :data:`..storage.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
     """
     finite = xp.all(xp.isfinite(mean), axis=0), xp.all(xp.isfinite(covariance), axis=(0, 1))
     identity = xp.eye(len(mean), dtype=xp.float64)[:, :, None]
@@ -417,11 +443,17 @@ class _Maker:
     kind: Kind
     maker: Any
     """Of a competitor that can be traced; None of one that runs in Python."""
+    stated: Stated | None = None
+    """Of one that runs in Python."""
 
     def __call__(self, model: Model) -> Filter:
         """Make it, on any arrays."""
         task = model.task
-        own = HeldInPython(task) if self.maker is None else make_competitor(self.maker, task)
+        own = (
+            HeldInPython(task, stated=self.stated)
+            if self.maker is None
+            else make_competitor(self.maker, task)
+        )
         return surround(self.kind, model, as_filter(task, own, self.kind))
 
 
@@ -458,7 +490,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
             return model.with_filter(_Maker(kind, compilation_key(competitor)))
         except NotTraceable as error:
             warn_of(f"{name!r} of {model.task.id}", error)
-    looped = model.with_filter(_Maker(kind, None))
+    looped = model.with_filter(_Maker(kind, None, own.stated))
     held = HeldInPython(model.task, own, f"{kind} {name!r}", count if kind in UNTOLD else None)
     looped.filter = surround(kind, model, held)
     return looped

@@ -65,6 +65,14 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
     return maker(problem) if takes_problem else maker()
 
 
+def answers_by_track(competitor: Any) -> bool:
+    """Whether a competitor, such as one from a file, must be told which episodes it runs in.
+
+    It has ``of_episodes(task, seeds)``, which makes the competitor in the episodes of these seeds.
+    """
+    return _has(competitor, "of_episodes")
+
+
 def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
     """Return what a user has named or made, if it can compete; it is not called yet.
 

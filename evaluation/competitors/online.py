@@ -269,8 +269,12 @@ class OnlineFilter:
 
     def _step(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
         """Advance to a time and take in what came."""
+        measurement, memory = self.input.measure(self._running().input, at, values)
+        return self._estimate(at, self._advance(measurement, memory))
+
+    def _advance(self, measurement: Any, memory: Any) -> dict[str, numpy.ndarray]:
+        """Take in a measurement of the task, and report on it in arrays ``(..., width)``."""
         before = self._running()
-        measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
         stepper = self._stepper
         self._measured.put(self._padded(measurement))
@@ -280,7 +284,8 @@ class OnlineFilter:
             stepper.take(after.action[self._pad])
         stepper.answer()
         self._state = after
-        return self._estimate(at, stepper.report())
+        report: dict[str, numpy.ndarray] = stepper.report()
+        return report
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
         """Estimate of a time at which nothing is received; the filter stays where it is.

@@ -48,15 +48,16 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
 
 def check_open_loop(model: Model, name: str) -> None:
-    """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed.
+    """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed, or to be
+    answered from a file.
 
     Args:
-        model: in which a smoother is to run.
-        name: of the smoother.
+        model: in which a smoother, or what answers from a file, is to run.
+        name: what it is, and its name.
     """
     if model.task.closes_loop:
         raise ValueError(
-            f"smoother {name!r} cannot run in {model.task.id}, a closed loop with these parameters, in which the "
+            f"{name} cannot run in {model.task.id}, a closed loop with these parameters, in which the "
             "estimate steers what is measured later: leave it out"
         )
 

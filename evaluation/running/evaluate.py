@@ -19,6 +19,7 @@ from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
+from ..competitors.file_estimates import bind_tracks
 from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
@@ -405,7 +406,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     for name, model in models.items():
         check_observation(model, competitors[name], name)
         if kinds[name] == "smoother":
-            check_open_loop(model, name)
+            check_open_loop(model, f"smoother {name!r}")
     first = next(iter(models.values()))
     group_of_each(
         [c.name for c in first.task.components], first.task.groups
@@ -419,6 +420,11 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
+    if chosen.recording is None or flown is None:
+        tracks = {seed: str(i) for i, seed in enumerate(seeds)}
+    else:
+        tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}
+    competitors = {name: bind_tracks(name, one, models[name], tracks) for name, one in competitors.items()}
     return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
 
 

@@ -30,17 +30,20 @@ def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, An
 
     Args:
         model: task with a filter.
-        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known.
+        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known, or nothing is estimated.
         covariance: reported for it, ``(C, C, N)``.
 
     Returns:
         ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
         known, ``nees_degrees``.
     """
-    if model.task.has_whole_truth:
+    if model.task.has_whole_truth and model.filter.stated is None:
         return {"nees": log_density(error, covariance)[1]}
     xp = model.task.xp
     known = error == error  # no number differs from itself
+    if model.filter.stated is not None:
+        variance = xp.stack([covariance[i, i] for i in range(len(error))])
+        known = known & (variance == variance)
     # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
     pairs = known[:, None] & known[None]
     apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]

@@ -184,6 +184,8 @@ def record_statistics(
         share = (losses[:, 1] > 0.0).astype(float)
         yield Statistic(("record", "lost_episodes", "", "all", "1"), share)
         yield Statistic(("losses",), losses, count_losses, sample=ALL)
+    if "missing" in run and not numpy.isnan(run["missing"].values).all():
+        yield _mean_of_present("missing", "", "all", "1", run["missing"].values)
     if metrics is not None:
         yield from metrics.statistics(run)
 
@@ -249,9 +251,11 @@ def consistency_metrics(run: "xarray.Dataset") -> list[str]:
 
 def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
     """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
-    if metric == "nees" and "nees_degrees" not in run:
-        return numpy.full(run["nees"].shape, float(run.sizes["component"]))
-    return numpy.nan_to_num(run[f"{metric}_degrees"].values)
+    if metric == "nis":
+        return numpy.nan_to_num(run["nis_degrees"].values)
+    # Of whoever states everything there are no degrees, though there may be of others in the same evaluation.
+    degrees = run["nees_degrees"].values if "nees_degrees" in run else math.nan + run["nees"].values
+    return numpy.nan_to_num(degrees, nan=float(run.sizes["component"]))
 
 
 def chi_square_quantile(probability: float, degrees: Any) -> numpy.ndarray:
@@ -450,7 +454,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
     ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
-    ``lost_episodes`` of estimators (share). Where the evaluation was timed ``nanoseconds``, processor time of a
+    ``lost_episodes`` of estimators (share), and of estimates from a file ``missing``, the share of the measurements of
+    which it has no row. Where the evaluation was timed ``nanoseconds``, processor time of a
     measurement, whose component says whether it is ``compiled`` code's or ``python``'s. Without truth what needs it is
     left out. Of a recording with tracks ``prediction_error`` and ``innovation_correlation``, whose intervals are over
     stretches of measurements.

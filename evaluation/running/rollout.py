@@ -20,7 +20,14 @@ from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
 from ..competitors.filters import put_in_loop
-from ..competitors.kinds import Kind, check_competitor, compilation_key, kind_of, make_competitor
+from ..competitors.kinds import (
+    Kind,
+    answers_by_track,
+    check_competitor,
+    compilation_key,
+    kind_of,
+    make_competitor,
+)
 from ..competitors.programs import Program
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
@@ -104,11 +111,13 @@ def _steer_by_python(
 def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
     """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
     if kind == "smoother":
-        check_open_loop(model, name)
+        check_open_loop(model, f"smoother {name!r}")
         competitor, kind = (
             SmoothedTrack(model.task, *_smoothed_estimates(model, competitor, seeds, name)),
             "estimator",
         )
+    if answers_by_track(competitor):
+        competitor = competitor.of_episodes(model.task, seeds)
     return put_in_loop(model, competitor, kind, name, len(seeds))
 
 
@@ -309,11 +318,12 @@ def measure_time(
     Args:
         model: as in :func:`rollout`, likewise what follows.
         competitor: likewise.
-        kind: likewise. A smoother answers when all is measured, and a bound estimates nothing: None.
+        kind: likewise. A smoother answers when all is measured, a bound estimates nothing, and the time of what has
+            answered before is not known: None.
         seeds: of some episodes, which are repeated where they are fewer.
         name: of the competitor, in errors.
     """
-    if kind in ("smoother", "bound"):
+    if kind in ("smoother", "bound") or answers_by_track(competitor):
         return None
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, steers = model.task, kind == "policy"

@@ -31,8 +31,11 @@ FAULTS = (
     "the program ended",
     "the program did not answer in time",
     "the program answered with what is no estimate",
+    "the file holds no more estimates of the track",
 )
 """Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
+NO_ROW = 1.0 + FAULTS.index("the file holds no more estimates of the track")
+"""Number of that reason."""
 
 
 class Losses(NamedTuple):

@@ -6,14 +6,11 @@ from pathlib import Path
 import numpy
 import xarray
 
+from .estimate_tables import AXES
 from .files import whole_file, whole_files
 
 SERIES = ("seconds", "nis", "nis_degrees", "log_likelihood")
 """Written beside the estimates, where they are known."""
-
-
-AXES = ("position_x", "position_y", "position_z")
-"""Components of a position, of which a trajectory has two or three."""
 
 
 def check_estimates(path: Path) -> None:
@@ -28,8 +25,8 @@ def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return estimates of an evaluation with tracks: ``estimate`` and ``sigma`` over policy, recording, time and
     component, ``seconds``, and where they are known ``nis``, ``nis_degrees``, ``log_likelihood`` and ``truth``.
 
-    Of a recording ``seconds`` count from the first measurement of the log, and ``log_time`` is the time as it stands
-    there, so that rows can be joined with those of the log.
+    ``seconds`` count from the start of the track; of a recording from the first measurement of the log, and
+    ``log_time`` is the time as it stands there, so that rows can be joined with those of the log.
     """
     variance = numpy.diagonal(dataset["covariance"].values, axis1=-2, axis2=-1)
     sigma = dataset["estimate"].copy(data=numpy.sqrt(numpy.maximum(variance, 0.0)))
@@ -37,6 +34,11 @@ def estimates_of(dataset: xarray.Dataset) -> xarray.Dataset:
     if "seconds" in dataset and "started" in dataset.coords:
         # Of the log's own clock, from its first measurement on: some of them make the start of the track.
         dataset = dataset.assign(seconds=dataset["seconds"] + dataset["started"])
+    if "seconds" not in dataset and "measurement_interval" in dataset:
+        dataset = dataset.assign(seconds=dataset["measurement_interval"].cumsum("time"))
+    elif "seconds" not in dataset and "elapsed" in dataset.coords:
+        shape = dataset["estimate"].isel(component=0, drop=True)
+        dataset = dataset.assign(seconds=dataset["elapsed"].broadcast_like(shape).transpose(*shape.dims))
     kept = [name for name in (*SERIES, "estimate", "truth") if name in dataset]
     unused = ["episode_seed", "flight", "mode", "started", "truth_known"]
     found = dataset[kept].assign(sigma=sigma).drop_vars(unused, errors="ignore")
@@ -99,11 +101,11 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
     """
     components = dataset["component"].values.tolist()
     axes = [components.index(name) for name in AXES if name in components]
-    if len(axes) < 2 or "seconds" not in dataset:
+    found = estimates_of(dataset)
+    if len(axes) < 2 or "seconds" not in found:
         raise ValueError(
             "a trajectory needs estimates of position_x and position_y, and the time of each in seconds"
         )
-    found = estimates_of(dataset)
     with whole_files(folder) as waiting:
         for policy in found["policy"].values.tolist():
             for episode in found["episode"].values.tolist():

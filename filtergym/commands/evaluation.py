@@ -403,7 +403,7 @@ def write(
     for name in explained:
         for sentence in reason_sentences(outcome.records, phrases, name):
             print_sentence(sentence)
-    for note in notes_of(outcome.dataset):
+    for note in [*notes_of(outcome.dataset), *missing_rows(outcome.records)]:
         print_sentence(note)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
@@ -414,6 +414,16 @@ def write(
             console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
     if outputs.estimates is not None:
         console.print(f"estimates in {outputs.estimates}", soft_wrap=True)
+
+
+def missing_rows(records: Sequence[Any]) -> Iterator[str]:
+    """Say in a sentence how much of what was measured a file of estimates says nothing of."""
+    for record in records:
+        if record.metric == "missing" and record.value:
+            yield (
+                f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; the last "
+                "estimate before each, or the initial one, is held"
+            )
 
 
 def say_departures(

@@ -17,6 +17,7 @@ from ..evaluation.running.parallel import Workers
 from ..evaluation.running.recording import record_experiment
 from ..evaluation.running.rollout import Progress
 from ..evaluation.running.threads import one_thread
+from ..evaluation.storage.blind import write_blind
 from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..names import assumed_parameters, find_competitor, is_learned, isolate_names
 from ..offline import plan_datasets
@@ -226,30 +227,45 @@ def evaluate_policies(
 
 def record_scenario(
     environment: Environment,
-    out: Annotated[Path, typer.Option(help="NetCDF file for the recording.")],
+    out: Annotated[Path, typer.Option(help="NetCDF file for the recording; with --blind a folder.")],
     scenario: ScenarioName = None,
     episodes: Annotated[int, typer.Option(help="Episodes to record.")] = 10,
     seed: Experiment = 0,
     split: Split = "test",
     settings: Parameters = None,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind",
+            help="Without the truth, for programs outside Python: measurements.csv, start.csv and measurements.nc. "
+            "What they estimate is judged by filtergym evaluate --policy file:ESTIMATES.",
+        ),
+    ] = False,
     backend: Backend = "auto",
 ) -> None:
-    """Record what the sensors say in episodes of the simulation, with the truth.
+    """Record what the sensors say in episodes of the simulation, with the truth or, for competitors, without.
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
     problem, keywords = problem_of(environment), parse_settings(settings or [])
     check_names(problem.task, keywords)
-    if out.suffix != ".nc":
+    if not blind and out.suffix != ".nc":
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
-    writable_file(out)
+    (writable_folder if blind else writable_file)(out)
     experiment = problem.experiment(scenario, episodes, seed, split, backend=backend, keywords=keywords)
     with progress_bar() as bar:
         line = bar.add_task("recording", total=episodes * experiment.make_task().horizon)
         recording = record_experiment(experiment, lambda done: bar.update(line, advance=done))
-    with whole_file(out) as waiting:
-        recording.write(waiting)
-    console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
+    if not blind:
+        with whole_file(out) as waiting:
+            recording.write(waiting)
+        console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
+        return
+    write_blind(out, recording, experiment.make_task())
+    chosen = [f"--scenario {scenario}"] * (scenario is not None) + [f"--set {one}" for one in settings or []]
+    judged = f"--episodes {episodes} --seed {seed} --split {split} --policy file:ESTIMATES.csv"
+    console.print(f"{episodes} episodes in {out}; what estimates them is judged by", soft_wrap=True)
+    console.print(f"  filtergym evaluate {' '.join([environment, *chosen, judged])}", soft_wrap=True)
 
 
 def write_offline(

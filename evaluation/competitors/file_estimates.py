@@ -1,0 +1,229 @@
+"""A competitor that answers with estimates from a file: what any other program has made of the same measurements.
+
+A row of the file belongs to a measurement by its track and its time. Where there is none for a measurement the last row
+before it is held, as whoever listens to that program would have to, and counted; before the first row the initial
+estimate stands. Soon after the last row of a track the episode is lost.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...envs.contract.filter import Filter, Input, Stated
+from ...envs.contract.model import Model
+from ...envs.contract.observation import Array
+from ...envs.contract.task import Task
+from ..storage.dataset import NO_ROW
+from ..storage.estimate_tables import EstimateTable, read_estimates
+from .smoothers import check_open_loop
+
+SAME_TIME = 1e-3
+"""s, within which a row is of a measurement; at most a quarter of the time between two."""
+ENDED = 10
+"""Sampling intervals after the last row of a track from which on it is lost: some programs answer less often."""
+SHOWN = 5
+"""Names of tracks in an error."""
+
+
+class FileEstimates:
+    """What makes a competitor of a file of estimates, see :mod:`..storage.estimate_tables`.
+
+    Args:
+        path: of the file.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def of_tracks(self, task: Task, tracks: Mapping[int, str]) -> "TrackEstimates":
+        """Read the file for the tracks of an evaluation.
+
+        Args:
+            task: on NumPy arrays.
+            tracks: name of each by the seed of its episode.
+
+        Raises:
+            ValueError: if it cannot be read, is of other tracks or another clock, or does not say what an error costs.
+        """
+        name = str(self.path)
+        table = read_estimates(self.path, [component.name for component in task.components])
+        held, known = sorted({*table.track.tolist()}), {*tracks.values()}
+        if held == [""] and len(known) > 1:
+            raise ValueError(f"{name} names no tracks in a column track, and there are {len(known)}")
+        if held != [""] and not known & {*held}:
+            raise ValueError(
+                f"{name} has the tracks {', '.join(held[:SHOWN])}{', ...' * (len(held) > SHOWN)}, and those of the "
+                f"evaluation are {', '.join([*tracks.values()][:SHOWN])}{', ...' * (len(known) > SHOWN)}"
+            )
+        nothing = numpy.where(table.known, 0.0, numpy.nan)[:, None] + numpy.zeros(8)
+        if task.has_truth and not numpy.isfinite(task.world.error_cost(nothing)).all():
+            missing = [c.name for c, there in zip(task.components, table.known, strict=True) if not there]
+            raise ValueError(
+                f"{name} holds no {', '.join(missing)}, without which {task.id} does not say what an error costs"
+            )
+        return TrackEstimates(table, dict(tracks), _recorded_times(task, table, name))
+
+
+def bind_tracks(name: str, competitor: Any, model: Model, tracks: Mapping[int, str]) -> Any:
+    """Return a competitor, if it is from a file with the rows of these tracks.
+
+    Args:
+        name: of it, in errors.
+        competitor: or what makes it.
+        model: that it runs in.
+        tracks: names by the seeds of their episodes.
+
+    Raises:
+        ValueError: if the estimates do not belong to the tracks, or the loop is closed.
+    """
+    if not isinstance(competitor, FileEstimates):
+        return competitor
+    check_open_loop(model, f"{name!r}")
+    return competitor.of_tracks(model.on_numpy().task, tracks)
+
+
+class TrackEstimates(NamedTuple):
+    """Estimates of a file for the tracks of an evaluation; plain data for any process."""
+
+    table: EstimateTable
+    tracks: Mapping[int, str]
+    times: Mapping[str, numpy.ndarray] | None
+    """Of the measurements of a recording by its tracks, s by the clock of the file; None of a simulation."""
+    kind: str = "estimator"
+
+    def of_episodes(self, task: Task, seeds: Sequence[int]) -> "FileTrack":
+        """Return the filter that answers in the episodes of these seeds."""
+        return FileTrack(task, self, [self.tracks[seed] for seed in seeds])
+
+
+def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
+    """Times of the measurements of a recording by the clock of the estimates."""
+    import pandas
+
+    from ...envs.data.flight_tables import clock_seconds
+
+    recording = task.recording
+    if recording is None:
+        if table.clock != "seconds":
+            raise ValueError(f"the times of {name} are {table.clock}, and those of a simulation seconds")
+        return None
+    times = recording.seconds + recording.started[:, None]
+    if table.clock == "seconds":
+        return dict(zip(recording.names, times, strict=True))
+    if recording.log_time is None:
+        raise ValueError(f"the times of {name} are {table.clock}, and {recording.name!r} knows seconds only")
+    found = {}
+    for track, rows, said in zip(recording.names, recording.rows, recording.log_time, strict=True):
+        clock, own = clock_seconds(pandas.Series(said[:rows]))
+        if clock != table.clock and table.clock != "log":
+            raise ValueError(f"the times of {name} are {table.clock}, and those of the log {clock}")
+        found[track] = own
+    return found
+
+
+class FileState(NamedTuple):
+    """Where the episodes are."""
+
+    measurements: int
+    """So far."""
+    seconds: numpy.ndarray
+    """Time of the last, ``(N,)``."""
+    row: numpy.ndarray
+    """Of the file, that is the estimate, ``(N,)``; -1 before the first."""
+    missing: numpy.ndarray
+    """One where the file has no row for this measurement, ``(N,)``."""
+    over: numpy.ndarray
+    """One where the file has no more rows of this track, ``(N,)``."""
+    initial: Any
+
+
+class FileTrack(Filter[Task, Any, FileState]):
+    """A filter that answers with the rows of a file.
+
+    Args:
+        task: the estimation problem.
+        given: the rows.
+        names: of the track of each episode.
+    """
+
+    in_python = True
+
+    def __init__(self, task: Task, given: TrackEstimates, names: Sequence[str]) -> None:
+        super().__init__(task)
+        table, self.given, self.names = given.table, given, list(names)
+        self.stated = Stated(table.known, table.deviations)
+        held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
+        if {*table.track.tolist()} == {""}:
+            held = {name: numpy.arange(len(table.time)) for name in held}
+        # All rows one after another, each track in a stretch of time of its own, so that one search finds all.
+        self._begin = float(table.time.min(initial=0.0))
+        self._span = float(table.time.max(initial=0.0)) - self._begin + 2.0
+        order, keys, self._last = [], [], []
+        for number, name in enumerate(self.names):
+            rows = held[name][numpy.argsort(table.time[held[name]], kind="stable")]
+            order.append(rows)
+            keys.append(table.time[rows] - self._begin + number * self._span)
+            self._last.append(table.time[rows[-1]] if len(rows) else -numpy.inf)
+        self._order, self._keys = numpy.concatenate(order), numpy.concatenate(keys)
+        self._first = numpy.cumsum([0, *map(len, order)])[:-1]
+        usual = getattr(task.parameters, "sampling_interval", None) or task.interval
+        self._interval = usual or 1.0
+        self._tolerance = min(SAME_TIME, 0.25 * self._interval)
+
+    def start(self, initial: Any) -> FileState:
+        """Nothing is measured yet."""
+        width = initial.mean.shape[-1]
+        none = numpy.zeros(width)
+        return FileState(0, none, numpy.full(width, -1), none, none, initial)
+
+    def update(self, state: FileState, given: Input) -> FileState:
+        """Find the row of each episode: the newest that is not later than the measurement."""
+        width = given.measurement[0].shape[-1]
+        lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)
+        seconds = self._times(state, given.measurement)
+        at = numpy.clip(seconds - self._begin + self._tolerance, 0.0, self._span - 0.5)
+        found = numpy.searchsorted(self._keys, at + lane * self._span, side="right") - 1
+        there = found >= self._first[lane]
+        row = numpy.where(there, self._order[numpy.maximum(found, 0)], -1) if len(self._order) else state.row
+        fresh = there & (self.given.table.time[row] >= seconds - self._tolerance)
+        over = seconds > numpy.array(self._last)[lane] + (ENDED - 0.5) * self._interval
+        return FileState(state.measurements + 1, seconds, row, 1.0 - fresh, 1.0 * over, state.initial)
+
+    def _times(self, state: FileState, measurement: Any) -> numpy.ndarray:
+        """Times of the measurements, s by the clock of the file."""
+        width = measurement[0].shape[-1]
+        if self.given.times is None:
+            interval = getattr(measurement, "interval", None)
+            return state.seconds + (self._interval if interval is None else interval)
+        each = [self.given.times[name] for name in self.names]
+        now = [times[min(state.measurements, len(times) - 1)] for times in each]
+        # Beyond the end of a shorter recording its last measurement is repeated.
+        now = [
+            times[numpy.isfinite(times)][-1] if numpy.isnan(t) else t
+            for t, times in zip(now, each, strict=True)
+        ]
+        return numpy.array(now)[numpy.minimum(numpy.arange(width), len(now) - 1)]
+
+    def mean(self, state: FileState) -> Array:
+        """That of the row."""
+        unknown = ~numpy.array(self.given.table.known)[:, None]
+        initial = numpy.where(unknown, numpy.nan, state.initial.mean)
+        return numpy.where(state.row >= 0, self.given.table.mean[:, state.row], initial)
+
+    def covariance(self, state: FileState) -> Array:
+        """Likewise; NaN where none is stated."""
+        unknown = ~numpy.logical_and.outer(*2 * [self.given.table.deviations])[:, :, None]
+        initial = numpy.where(unknown, numpy.nan, state.initial.covariance)
+        return numpy.where(state.row >= 0, self.given.table.covariance[..., state.row], initial)
+
+    def records(self, state: FileState, measurement: Any) -> dict[str, Array]:
+        """What the file tells of the measurement, and whether it has a row for it."""
+        told = {
+            name: numpy.where(state.missing > 0.0, numpy.nan, values[state.row])
+            for name, values in self.given.table.likelihood.items()
+        }
+        return {**told, "missing": state.missing, "lost": state.over * NO_ROW}

@@ -1,0 +1,254 @@
+"""Estimates that another program has made, read from a file: CSV, NetCDF, or trajectories in the format of the TUM
+RGB-D benchmark.
+
+A row is an estimate: its track, its time in seconds, the mean of each component, and what is stated of its error. The
+columns are those that ``filtergym evaluate --estimates`` and the programs of ``filtergym export`` write:
+
+    track (or recording, episode)      name of the track; left out where there is one track
+    seconds (or time, t), log_time     s since the start of the track; or the time as it stands in a log
+    estimate_X (or mean_X, X)          mean of the component X, in its unit
+    sigma_X                            its standard deviation; or
+    covariance_X_Y                     of two components, in either order; zero where a pair is left out
+    log_likelihood, nis, nis_degrees   how well the measurement was predicted
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...envs.data.flight_tables import clock_seconds, list_names, numbers, open_netcdf, read_table
+from ...envs.data.foreign_files import MOST_NUMBERS, quote_shortened, read_content
+
+SUFFIXES = (".csv", ".nc", ".parquet", ".tum")
+TRACK = ("track", "recording", "episode")
+SECONDS = ("seconds", "time", "t")
+LOG_TIME = "log_time"
+LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
+AXES = ("position_x", "position_y", "position_z")
+"""Components of a position, of which a trajectory has two or three."""
+
+
+class EstimateTable(NamedTuple):
+    """Estimates of all tracks of a file, R rows of C components."""
+
+    track: numpy.ndarray
+    """Name of the track of each row, ``(R,)``; empty words where the file names none."""
+    time: numpy.ndarray
+    """s by ``clock``, ``(R,)``."""
+    clock: str
+    """What the times are: ``seconds`` since the start of the track, or of a log ``dates`` or ``times of day``."""
+    mean: numpy.ndarray
+    """``(C, R)``; NaN of a component that the file does not hold."""
+    known: tuple[bool, ...]
+    """Which components it holds."""
+    deviations: tuple[bool, ...]
+    """Of which components it says how large the errors are."""
+    covariance: numpy.ndarray
+    """``(C, C, R)``; NaN of the other components."""
+    likelihood: Mapping[str, numpy.ndarray]
+    """What it holds of :data:`LIKELIHOOD`, ``(R,)`` each."""
+
+
+def read_estimates(path: Path, components: Sequence[str]) -> EstimateTable:
+    """Read the estimates of a file, or of a folder of trajectories.
+
+    Args:
+        path: of the file; a folder holds ``NAME.TRACK.tum``, a file for each track.
+        components: names of what is estimated.
+
+    Raises:
+        ValueError: if it cannot be read, holds no estimates, or those of several competitors.
+    """
+    try:
+        if path.suffix not in SUFFIXES:
+            raise ValueError(f"estimates are in files that end in {', '.join(SUFFIXES)}")
+        if not path.exists():
+            raise ValueError("there is no such file")
+        if path.suffix == ".tum":
+            return _trajectories(path, components)
+        columns = _netcdf_columns(path) if path.suffix == ".nc" else _table_columns(path, components)
+        return _of_columns(columns, components)
+    except ValueError as error:
+        raise ValueError(f"cannot read the estimates {str(path)!r}: {error}") from error
+
+
+def _table_columns(path: Path, components: Sequence[str]) -> dict[str, Any]:
+    """Columns of a table, numbers or words."""
+    pairs = [f"covariance_{a}_{b}" for a in components for b in components]
+    forms = [form + name for name in components for form in ("estimate_", "mean_", "sigma_", "")]
+    columns, names, _ = read_table(path, {*TRACK, *SECONDS, LOG_TIME, "policy", *LIKELIHOOD, *forms, *pairs})
+    if not len(columns):
+        raise ValueError(f"it holds no rows of known columns; it has {list_names(names) or 'none'}")
+    words = (*TRACK, *SECONDS, LOG_TIME, "policy")
+    return {
+        str(name): values if name in words else numbers(str(name), values).to_numpy()
+        for name, values in columns.items()
+    }
+
+
+def _netcdf_columns(path: Path) -> dict[str, Any]:
+    """The same of the variables of a NetCDF file, over policy, episode, time and component as they are written."""
+    import pandas
+
+    with open_netcdf(path, decode_times=False) as data:
+        if sum(variable.size for variable in data.variables.values()) > MOST_NUMBERS:
+            raise ValueError(f"it holds more than {MOST_NUMBERS:,} numbers: split it")
+        if data.sizes.get("policy", 1) > 1:
+            raise _several(data["policy"].values.tolist())
+        data = data.isel(policy=0) if "policy" in data.dims else data
+        data = data if "episode" in data.dims else data.expand_dims("episode")
+        if not {"seconds", "component"} <= {*data.variables} or "time" not in data.dims:
+            raise ValueError("it needs seconds over episode and time, and the coordinate component")
+        rows = (data.sizes["episode"], data.sizes["time"])
+        names = [str(name) for name in data["component"].values]
+
+        def flat(values: Any) -> numpy.ndarray:
+            return numpy.asarray(numpy.broadcast_to(values, rows).reshape(-1), dtype=float)
+
+        def of(variable: str, *further: str) -> numpy.ndarray:
+            return data[variable].transpose("episode", "time", *further).values
+
+        found: dict[str, Any] = {"seconds": flat(data["seconds"].transpose(..., "time").values)}
+        tracks = data["recording"].values if "recording" in data.variables else numpy.arange(rows[0])
+        found["track"] = pandas.Series(numpy.repeat(tracks.astype(str), rows[1]))
+        for variable in ({"estimate", "mean"} & {*data.variables}) | ({"sigma"} & {*data.variables}):
+            form = "sigma_" if variable == "sigma" else "estimate_"
+            found |= {
+                form + name: flat(values)
+                for name, values in zip(names, numpy.moveaxis(of(variable, "component"), -1, 0), strict=True)
+            }
+        if "covariance" in data:
+            whole = of("covariance", "component", "other_component")
+            found |= {
+                f"covariance_{a}_{b}": flat(whole[..., i, j])
+                for i, a in enumerate(names)
+                for j, b in enumerate(names)
+            }
+        found |= {name: flat(of(name)) for name in LIKELIHOOD if name in data}
+    # Beyond the end of a shorter episode there is neither time nor estimate.
+    there = numpy.isfinite(found["seconds"])
+    return {name: values[there] for name, values in found.items()}
+
+
+def _several(names: Sequence[str]) -> ValueError:
+    return ValueError(f"it holds estimates of several competitors, {list_names(names)}: keep those of one")
+
+
+def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> EstimateTable:
+    """Put the columns of a file into arrays."""
+    if "policy" in columns and len(names := sorted({*map(str, columns["policy"])})) > 1:
+        raise _several(names)
+    found = {}
+    for name in components:
+        form = next((form for form in ("estimate_", "mean_", "") if form + name in columns), None)
+        if form is not None:
+            found[name] = columns[form + name]
+    if not found:
+        raise ValueError(f"it holds no estimate of {', '.join(components)}: name the columns estimate_X")
+    time_name = next((name for name in (LOG_TIME, *SECONDS) if name in columns), None)
+    if time_name is None:
+        raise ValueError("it needs a column seconds, the time since the start of the track")
+    clock, time = _times(columns[time_name])
+    track = next((columns[name] for name in TRACK if name in columns), None)
+    rows = len(time)
+    mean = numpy.full((len(components), rows), numpy.nan)
+    for i, name in enumerate(components):
+        mean[i] = found.get(name, numpy.nan)
+    return EstimateTable(
+        numpy.full(rows, "") if track is None else numpy.array([*map(_track_name, track)], dtype=str),
+        time,
+        "log" if time_name == LOG_TIME and clock == "seconds" else clock,
+        mean,
+        tuple(name in found for name in components),
+        *_covariance(columns, components, rows),
+        {name: columns[name] for name in LIKELIHOOD if name in columns},
+    )
+
+
+def _times(values: Any) -> tuple[str, numpy.ndarray]:
+    """Clock of a column of times, and the times in seconds."""
+    import pandas
+
+    if not isinstance(values, pandas.Series):
+        return "seconds", values
+    try:  # seconds since the start of the track may be large, and are no date
+        time = numbers("time", values).to_numpy()
+    except ValueError:
+        return clock_seconds(values)
+    if not numpy.isfinite(time).all():
+        raise ValueError(f"time has no value in row {int(numpy.argmin(numpy.isfinite(time)))}")
+    return "seconds", time
+
+
+def _track_name(value: Any) -> str:
+    """Name of a track; of a number without a fraction the whole number."""
+    text = str(value).strip()
+    return text.removesuffix(".0") if text.removesuffix(".0").isdigit() else text
+
+
+def _covariance(
+    columns: Mapping[str, Any], components: Sequence[str], rows: int
+) -> tuple[tuple[bool, ...], numpy.ndarray]:
+    """Of which components something is stated of the errors, and the covariance ``(C, C, R)``, NaN of the others."""
+    count = len(components)
+    found = numpy.full((count, count, rows), numpy.nan)
+    for i, a in enumerate(components):
+        for j, b in enumerate(components):
+            pair = next((c for c in (f"covariance_{a}_{b}", f"covariance_{b}_{a}") if c in columns), None)
+            if pair is not None:
+                found[i, j] = columns[pair]
+        if f"sigma_{a}" in columns and numpy.isnan(found[i, i]).all():
+            found[i, i] = columns[f"sigma_{a}"] ** 2
+    stated = tuple(not numpy.isnan(found[i, i]).all() for i in range(count))
+    both = numpy.logical_and.outer(stated, stated)[:, :, None]
+    absent = both & numpy.isnan(found).all(axis=2, keepdims=True)
+    return stated, numpy.where(absent, 0.0, found)
+
+
+def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
+    """Positions of one file, or of a folder with a file for each track; what is said of the orientation is not read."""
+    axes = [components.index(name) for name in AXES if name in components]
+    if len(axes) < 2:
+        raise ValueError("a trajectory is of the components position_x and position_y, and there are none")
+    files = [path] if path.is_file() else sorted(path.glob("*.tum"))
+    files = [file for file in files if not file.name.startswith("truth.")]
+    owners = {file.name.removesuffix(".tum").rpartition(".")[0] for file in files}
+    if path.is_dir() and len(owners) > 1:
+        raise _several(sorted(owners))
+    if not files:
+        raise ValueError("it holds no trajectories")
+    tracks, rows = [], []
+    for file in files:
+        own = _trajectory(file)
+        name = "" if path.is_file() else file.name.removesuffix(".tum").rpartition(".")[2]
+        tracks += [name] * len(own)
+        rows.append(own)
+    table = numpy.concatenate(rows)
+    mean = numpy.full((len(components), len(table)), numpy.nan)
+    mean[axes] = table[:, 1 : 1 + len(axes)].T
+    known = tuple(i in axes for i in range(len(components)))
+    silent, none = (False,) * len(components), numpy.full((*2 * [len(components)], len(table)), numpy.nan)
+    return EstimateTable(
+        numpy.array(tracks, dtype=str), table[:, 0], "seconds", mean, known, silent, none, {}
+    )
+
+
+def _trajectory(file: Path) -> numpy.ndarray:
+    """Time and position of every line, ``(rows, 4)``."""
+    found = []
+    for number, line in enumerate(read_content(file).decode("utf-8").splitlines()):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != 8 or not numpy.isfinite(values[:4]).all():
+            raise ValueError(f"line {number + 1} of {file.name} is no pose: {quote_shortened(line)}")
+        found.append(values[:4])
+    if not found:
+        raise ValueError(f"{file.name} holds no poses")
+    return numpy.array(found)

@@ -1,0 +1,72 @@
+"""Tables of a crash test, for the terminal and as a page."""
+
+import io
+from collections import Counter
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ...evaluation.stress.crash_test import (
+    DEGRADED,
+    DESCRIPTIONS,
+    FAILED,
+    NOTHING,
+    PASSED,
+    UNSAID,
+    Finding,
+)
+
+STYLES = {PASSED: "green", DEGRADED: "yellow", FAILED: "red", NOTHING: "dim"}
+PAGE_WIDTH = 150
+"""Columns of a page."""
+
+
+def count_verdicts(findings: Sequence[Finding]) -> str:
+    """Say how often each verdict was given: ``14 passed, 6 degraded, 2 failed``."""
+    counts = Counter(finding.verdict for finding in findings)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in (PASSED, DEGRADED, FAILED))
+
+
+def crash_table(findings: Sequence[Finding], described: bool = False) -> Table:
+    """Return the table of one competitor, a line for each alteration that applies.
+
+    Args:
+        findings: of the competitor, in the order of the catalogue.
+        described: whether each line says what happens.
+    """
+    left_out = [finding.alteration for finding in findings if finding.reason == UNSAID]
+    notes = f"Does not apply, as {UNSAID}: {', '.join(left_out)}." if left_out else ""
+    table = Table(
+        title=f"{findings[0].competitor}: {count_verdicts(findings)}",
+        caption=notes or None,
+        box=None,
+        pad_edge=False,
+    )
+    for name in ("alteration", *["what happens"] * described, "verdict", "how"):
+        table.add_column(name)
+    for finding in findings:
+        if finding.reason != UNSAID:
+            what = [DESCRIPTIONS[finding.alteration]] * described
+            verdict = Text(finding.verdict, STYLES[finding.verdict])
+            table.add_row(finding.alteration, *what, verdict, Text(finding.reason))
+    return table
+
+
+def crash_page(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
+    """Return a page of HTML that needs nothing else.
+
+    Args:
+        title: above the tables.
+        tables: of :func:`crash_table`.
+        notes: sentences below them.
+    """
+    console = Console(width=PAGE_WIDTH, record=True, file=io.StringIO(), force_terminal=True)
+    console.print(title, style="bold", markup=False, highlight=False)
+    for table in tables:
+        console.print()
+        console.print(table)
+    for note in notes:
+        console.print(note, markup=False, highlight=False)
+    return console.export_html(inline_styles=True)

@@ -1,0 +1,155 @@
+"""Estimates from files: what another program has made of the same measurements is judged as what runs here."""
+
+import dataclasses
+
+import numpy as np
+import pandas
+import pytest
+from filtergym import evaluate, record, tidy_records
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors.file_estimates import FileEstimates
+from filtergym.evaluation.storage.blind import write_blind
+from filtergym.evaluation.storage.dataset import NO_ROW, notes_of
+from filtergym.evaluation.storage.estimates import write_estimates
+
+TARGET = "filtergym/ManeuveringTarget-v0"
+SETTINGS = {"scenario": "irregular-scans", "episodes": 6, "horizon": 20, "detection_probability": (0.8, 0.8)}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Estimates of ``imm``, in every form that is written, and what they were written from."""
+    folder = tmp_path_factory.mktemp("estimates")
+    whole = evaluate(TARGET, "imm", **SETTINGS, tracks=True)
+    for form in ("csv", "nc", "tum"):
+        write_estimates(folder / f"imm.{form}", whole)
+    return folder, whole
+
+
+def judged(path, **settings):
+    """Evaluation of a file, and its records of whole episodes by metric and component."""
+    found = evaluate(TARGET, f"file:{path}", **{**SETTINGS, **settings})
+    return found, {(r.metric, r.component): r.value for r in tidy_records(found) if r.window == "all"}
+
+
+@pytest.mark.parametrize("form", ["csv", "nc", "tum"])
+def test_what_is_written_costs_what_it_has_cost(files, form):
+    folder, whole = files
+    found, records = judged(folder / f"imm.{form}")
+    # Trajectories have nine decimals.
+    np.testing.assert_allclose(found["cost"], whole["cost"], rtol=0.0 if form != "tum" else 1e-9)
+    assert records["missing", ""] == records["lost_episodes", ""] == 0.0
+    if form == "tum":  # no velocity, and nothing is said of the errors
+        assert records["rmse", "velocity"] is None
+        assert ("anees", "state") not in records
+    else:
+        assert records["rmse", "velocity"] > 0.0
+        np.testing.assert_array_equal(found["nis"], whole["nis"])
+
+
+def test_a_covariance_is_taken_as_it_is_stated_beside_whoever_states_it(files):
+    folder, whole = files
+    table = pandas.read_csv(folder / "imm.csv").drop(columns=["policy", "nis", "nis_degrees"])
+    names = whole["component"].values.tolist()
+    for i, a in enumerate(names):
+        for j, b in enumerate(names[: i + 1]):
+            table[f"covariance_{a}_{b}"] = whole["covariance"].values[0, :, :, i, j].ravel()
+    table.to_csv(folder / "whole.csv", index=False)
+    table[["recording", "seconds", "estimate_position_x", "estimate_position_y", "sigma_position_x"]].to_csv(
+        folder / "part.csv", index=False
+    )
+    names = ["imm", f"file:{folder / 'whole.csv'}", f"file:{folder / 'part.csv'}"]
+    found = evaluate(TARGET, names, **SETTINGS)
+    np.testing.assert_allclose(found["nees"][1], whole["nees"][0], rtol=1e-9)  # a root and a square
+    records = {r.policy: r.value for r in tidy_records(found) if (r.metric, r.window) == ("anees", "all")}
+    assert records["imm"] == pytest.approx(records[names[1]])
+    # Of y there is a mean and no deviation.
+    expected = whole["error"].values[0, ..., 0] ** 2 / whole["covariance"].values[0, ..., 0, 0]
+    np.testing.assert_allclose(found["nees"][2], expected, rtol=1e-9)
+
+
+def test_rows_that_are_missing_are_counted_and_tracks_that_end_are_lost(files):
+    folder, whole = files
+    table = pandas.read_csv(folder / "imm.csv")
+    kept = (table["measurement"] != 3) & (table["recording"] != 2)
+    kept &= (table["recording"] != 4) | (table["measurement"] <= 5)
+    table[kept].to_csv(folder / "gaps.csv", index=False)
+    found, records = judged(folder / "gaps.csv")
+    run, E, K = found.isel(policy=0), SETTINGS["episodes"], SETTINGS["horizon"]
+    missing = E + (K - 1) + (K - 5)
+    assert records["missing", ""] == pytest.approx(missing / (E * K))
+    np.testing.assert_array_equal(run["lost"].isel(time=-1), [0, 0, NO_ROW, 0, NO_ROW, 0])
+    # What is missing is held: before any row the initial estimate. Sums and differences round.
+    estimate = (run["error"] - whole["error"][0]).values + whole["estimate"][0].values
+    np.testing.assert_allclose(estimate[0, 2], whole["estimate"].values[0, 0, 1], rtol=1e-12)
+    np.testing.assert_allclose(estimate[2], np.tile(estimate[2, :1], (K, 1)), rtol=1e-12)
+    (note,) = notes_of(found)
+    assert "2 of 6 episodes lost: the file holds no more estimates of the track in episode 2" in note
+
+
+def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
+    recording = record(TARGET, "paper", 2, horizon=15)
+    began = np.datetime64("2024-05-01T00:00:00", "ms")
+    clock = (began + (1000.0 * recording.seconds).astype("timedelta64[ms]")).astype(str)
+    recording = dataclasses.replace(recording, names=("east", "west"), log_time=clock)
+    whole = evaluate(TARGET, "imm", recording, tracks=True)
+    write_estimates(tmp_path / "whole.csv", whole)
+    table = pandas.read_csv(tmp_path / "whole.csv", dtype={"log_time": str})
+    table.drop(columns=["log_time"]).to_csv(tmp_path / "seconds.csv", index=False)
+    table.drop(columns=["seconds"]).to_csv(tmp_path / "dates.csv", index=False)
+    for name in ("seconds", "dates"):
+        found = evaluate(TARGET, f"file:{tmp_path / name}.csv", recording, tracks=True)
+        np.testing.assert_array_equal(found["cost"], whole["cost"])
+        assert not found["missing"].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a,b\n1,2\n", "holds no estimate of position_x"),
+        (
+            "track,seconds,position_x,position_y\nfoo,1,2,3\n",
+            "tracks foo, and those of the evaluation are 0, 1",
+        ),
+        ("seconds,position_x,position_y\n1,2,3\n", "names no tracks"),
+        ("track,seconds,velocity_x\n0,1,2\n", "holds no position_x, position_y, velocity_y, without which"),
+        ("track,position_x,position_y\n0,2,3\n", "needs a column seconds"),
+        ("track,seconds,position_x,position_y\n0,1,x,3\n", "position_x has 'x' in row 0"),
+        (
+            "track,time,position_x,position_y\n0,2024-05-01T00:00:00,1,3\n",
+            "are dates, and those of a simulation",
+        ),
+        ("policy,track,seconds,position_x\na,0,1,2\nb,0,2,2\n", "several competitors, a, b"),
+        (None, "there is no such file"),
+    ],
+)
+def test_what_belongs_to_no_track_is_refused(tmp_path, text, said):
+    if text is not None:
+        (tmp_path / "mine.csv").write_text(text)
+    task = problem_of(TARGET).experiment(None).make_task()
+    with pytest.raises(ValueError, match=said):
+        FileEstimates(tmp_path / "mine.csv").of_tracks(task, {11: "0", 12: "1"})
+
+
+def test_a_closed_loop_is_refused(files):
+    with pytest.raises(ValueError, match="closed loop"):
+        evaluate("filtergym/UavAutopilot-v0", f"file:{files[0] / 'imm.csv'}", episodes=2)
+
+
+def test_a_blind_recording_holds_all_that_is_received_and_no_truth(files, tmp_path):
+    folder, whole = files
+    experiment = problem_of(TARGET).experiment(None)
+    recording = record(TARGET, **SETTINGS)
+    write_blind(tmp_path, recording, experiment.make_task())
+    table = pandas.read_csv(tmp_path / "measurements.csv").set_index(["track", "measurement"])
+    written = pandas.read_csv(folder / "imm.csv").set_index(["recording", "measurement"])
+    np.testing.assert_allclose(table["seconds"], written["seconds"], rtol=1e-12)
+    missed = table["available"] == 0.0
+    assert missed.any()
+    assert table.loc[missed, "position_1"].isna().all()
+    shown = whole["measurement_position"].values[0, ..., 0].ravel()
+    np.testing.assert_array_equal(table.loc[~missed, "position_1"], shown[~missed])
+    start = pandas.read_csv(tmp_path / "start.csv")
+    np.testing.assert_array_equal(start["mean_velocity_y"], recording.initial["mean"][:, 3])
+    assert not [name for name in [*table, *start] if "truth" in name]
+    assert b"truth" not in (tmp_path / "measurements.nc").read_bytes()
