@@ -23,7 +23,7 @@ from typing import Any
 import numpy
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.compiler.c_source import DOUBLE, FLOAT, Scalar
+from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
 from filtergym.compiler.native import native
 from filtergym.envs.contract.filter import Input
