@@ -49,7 +49,7 @@ class _Part(Instructions):
         if step not in self.known:
             self.known.add(step)
             if operation == "input":
-                self.read(*arguments, name)
+                self.read(arguments[0], arguments[1], name)
             elif operation == "constant":
                 address = self.new(f"getelementptr double, ptr {self.constants}, i64 {arguments[0]}")
                 if logical:
