@@ -1,9 +1,10 @@
 """Every ranked competitor as C99: compiled, run over recorded episodes, and compared with what it estimated itself.
 
-A line for each: operations and bytes of state in double; the largest difference to the replay in double and in float,
-in the standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that
-LLVM makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written
-says why. Times are of processor time, the least of several runs.
+A line for each: operations and bytes of state in double; bytes of the source, of code and constants as ``-Os`` makes them
+of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
+standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM
+makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written says why.
+Times are of processor time, the least of several runs.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -18,12 +19,12 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.compiler.c_source import DOUBLE, FLOAT, Scalar
+from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
 from filtergym.compiler.native import native
 from filtergym.envs.contract.filter import Input
@@ -52,8 +53,8 @@ from filtergym.exports.traced_filter import (
 from filtergym.names import find_competitor
 
 COLUMNS = (
-    "environment", "competitor", "operations", "state_bytes", "weight_bytes", "double_sigmas", "float_sigmas",
-    "double_ns", "float_ns", "llvm_ns", "numpy_ns", "refusal",
+    "environment", "competitor", "operations", "state_bytes", "weight_bytes", "source_bytes", "code_bytes",
+    "stack_bytes", "double_sigmas", "float_sigmas", "double_ns", "float_ns", "llvm_ns", "numpy_ns", "refusal",
 )  # fmt: skip
 LANES = 512
 BATCH = """#include <math.h>
@@ -95,10 +96,31 @@ int main(int argc, char **argv) {{
 """
 
 
+class Size(NamedTuple):
+    """Bytes of an exported filter."""
+
+    source: int
+    code: int
+    """With constants."""
+    stack: int
+    """Of the function that takes most."""
+
+
+def size_of(file: Path, compiler: str) -> Size:
+    """Size of an exported filter, compiled to be small by gcc."""
+    folder, made = file.parent, file.with_suffix(".small.o")
+    command = [compiler, *FLAGS, "-Os", "-fstack-usage", "-c", file.name, "-o", made.name]
+    subprocess.run(command, cwd=folder, check=True)
+    told = subprocess.run(["size", made.name], cwd=folder, check=True, capture_output=True, text=True).stdout
+    usage = made.with_suffix(".su").read_text(encoding="utf-8").splitlines()
+    stack = max(int(line.split("\t")[1]) for line in usage)
+    return Size(file.stat().st_size, int(told.splitlines()[1].split()[0]), stack)
+
+
 def run_in_c(
     name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compiler: str
-) -> tuple[float, float, Writer]:
-    """Largest difference, in standard deviations, nanoseconds an update, and what wrote the files."""
+) -> tuple[float, float, Writer, Size]:
+    """Largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their size."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
     batch = BATCH.format(
@@ -125,8 +147,9 @@ def run_in_c(
             capture_output=True,
             text=True,
         )
+        size = size_of(folder / f"{writer.name}.c", compiler)
         means = numpy.frombuffer((folder / "out").read_bytes()).reshape(E, T, -1)
-    return given.largest_difference(numpy.moveaxis(means, 0, -1)), float(done.stdout), writer
+    return given.largest_difference(numpy.moveaxis(means, 0, -1)), float(done.stdout), writer, size
 
 
 def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
@@ -199,8 +222,9 @@ def lines(
         except ValueError as error:
             yield {**line, "refusal": str(error)}
             continue
-        double, double_ns, writer = run_in_c(name, traced, given, DOUBLE, compiler)
+        double, double_ns, writer, size = run_in_c(name, traced, given, DOUBLE, compiler)
         line |= {"double_sigmas": double, "double_ns": double_ns}
+        line |= {"source_bytes": size.source, "code_bytes": size.code, "stack_bytes": size.stack}
         operations, state, weights, _ = writer.sizes
         line |= {"operations": operations, "state_bytes": state, "weight_bytes": weights}
         if operations > 10_000:
@@ -209,7 +233,7 @@ def lines(
                 run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
             )
         else:
-            line["float_sigmas"], line["float_ns"], _ = run_in_c(name, traced, given, FLOAT, compiler)
+            line["float_sigmas"], line["float_ns"], *_ = run_in_c(name, traced, given, FLOAT, compiler)
         with numpy.errstate(all="ignore"):
             line |= {
                 "llvm_ns": llvm_nanoseconds(traced, given),
@@ -219,7 +243,16 @@ def lines(
 
 
 ACCURACY = ("environment", "written", "double: median", "largest", "float: median", "largest")
-COST = ("environment", "operations", "state, bytes", "ns in C", "NumPy / C", "C / LLVM")
+COST = (
+    "environment",
+    "operations",
+    "state, bytes",
+    "code, kB",
+    "stack, kB",
+    "ns in C",
+    "NumPy / C",
+    "C / LLVM",
+)
 
 
 def summary(found: list[dict[str, Any]]) -> str:
@@ -241,7 +274,9 @@ def summary(found: list[dict[str, Any]]) -> str:
         for key in ("double_sigmas", "float_sigmas"):
             cells += [f"{numpy.median(numbers[key]):.0e}", f"{numbers[key].max():.0e}"]
         accuracy.append(f"| {' | '.join(cells)} |")
-        cells = [name, *(_range(numbers[key]) for key in ("operations", "state_bytes", "double_ns"))]
+        cells = [name, *(_range(numbers[key]) for key in ("operations", "state_bytes"))]
+        cells += [_range(numbers[key] / 1000.0) for key in ("code_bytes", "stack_bytes")]
+        cells += [_range(numbers["double_ns"])]
         cells += [_range(numbers["numpy_ns"] / ns), f"{numpy.median(faster):.1f}" if len(faster) else ""]
         cost.append(f"| {' | '.join(cells)} |")
     return "\n".join([*accuracy, "", *cost])

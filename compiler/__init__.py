@@ -4,8 +4,9 @@ What it is for: a function written for NumPy or torch through the array API stan
 each of N independent lanes, the last axis of all its arrays. On small arrays nearly all the time goes into calling
 the array library. Run once on symbols (:mod:`.namespace`), the function leaves the arithmetic of one lane behind, a
 straight line without branches (:mod:`.program`). It is emitted as LLVM code that takes a block of lanes at a time
-(:mod:`.emission`), translated to the processor at hand and kept for the next process (:mod:`.native`,
-:mod:`.cache`). Exponentials and their like come from a vector library that is chosen at run time (:mod:`.library`).
+(:mod:`.emission`), where it is long in loops over its array operations (:mod:`.rolling`, :mod:`.loop_emission`),
+translated to the processor at hand and kept for the next process (:mod:`.native`, :mod:`.cache`). Exponentials and
+their like come from a vector library that is chosen at run time (:mod:`.library`).
 
 Nothing here knows what the functions compute. What cannot be traced (a branch that depends on the numbers, a function
 that the namespace lacks) raises :class:`~.namespace.NotTraceable`.

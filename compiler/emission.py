@@ -3,7 +3,8 @@
 The entry ``@program(table, first, last)`` goes through the blocks between two lanes and calls for each one
 ``@part0``, ``@part1``, ...: a long straight line is cut into parts, because the time that LLVM takes grows faster
 than the length of a function. What crosses a cut lies in a scratch array on the stack. ``table`` holds the address
-of the constants, then two integers for each argument, address and stride.
+of the constants, then two integers for each argument, address and stride. Of a program in loops every loop is a part
+(:mod:`.loop_emission`).
 """
 
 import functools
@@ -48,7 +49,7 @@ class _Part(Instructions):
         if step not in self.known:
             self.known.add(step)
             if operation == "input":
-                self.read(*arguments, name)
+                self.read(arguments[0], arguments[1], name)
             elif operation == "constant":
                 address = self.new(f"getelementptr double, ptr {self.constants}, i64 {arguments[0]}")
                 if logical:

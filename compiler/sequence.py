@@ -7,24 +7,38 @@ with every step: the address of a row of noise or of a report, or a counter.
 A tile of lanes goes through all steps before the next one begins, and stays in the processor's cache meanwhile.
 """
 
-import ctypes
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy
 
 from .functions import Call, address_of, run_over
-from .native import native_text
+from .native import Native, native_text
 
 TILE = 64
 """Lanes that go through all steps together: enough that a call costs little beside its numbers, few enough for the
 cache. Of programs of 300 to 80,000 operations all run within a tenth of their fastest tile, from 32 to 512 lanes."""
 
 TEXT = """
-define void @program(ptr %codes, ptr %tables, i64 %calls, ptr %entries, ptr %amounts, i64 %moving,
-                     i64 %steps, i64 %first, i64 %last, i64 %tile) {
+define void @program(ptr %given, i64 %first, i64 %last) {
 entry:
+  %codes.place = getelementptr i64, ptr %given, i64 0
+  %codes = load ptr, ptr %codes.place
+  %tables.place = getelementptr i64, ptr %given, i64 1
+  %tables = load ptr, ptr %tables.place
+  %calls.place = getelementptr i64, ptr %given, i64 2
+  %calls = load i64, ptr %calls.place
+  %entries.place = getelementptr i64, ptr %given, i64 3
+  %entries = load ptr, ptr %entries.place
+  %amounts.place = getelementptr i64, ptr %given, i64 4
+  %amounts = load ptr, ptr %amounts.place
+  %moving.place = getelementptr i64, ptr %given, i64 5
+  %moving = load i64, ptr %moving.place
+  %steps.place = getelementptr i64, ptr %given, i64 6
+  %steps = load i64, ptr %steps.place
+  %tile.place = getelementptr i64, ptr %given, i64 7
+  %tile = load i64, ptr %tile.place
   br label %tile.head
 tile.head:
   %start = phi i64 [%first, %entry], [%ahead, %tile.next]
@@ -92,14 +106,38 @@ exit:
   ret void
 }
 """
-"""The driver, in LLVM's words."""
+"""The driver, in LLVM's words; it is given what :class:`CallList` and :class:`CallSequence` put together."""
 
 
 @functools.cache
-def _driver() -> Any:
-    pointer, integer = ctypes.c_void_p, ctypes.c_int64
-    kinds = [pointer, pointer, integer, pointer, pointer, integer, integer, integer, integer, integer]
-    return native_text(TEXT, ctypes.CFUNCTYPE(None, *kinds))
+def _driver() -> Native:
+    driver: Native = native_text(TEXT)
+    return driver
+
+
+class CallList:
+    """Calls one after another, some lanes after the others through all of them, as one native call.
+
+    Args:
+        calls: in their order.
+    """
+
+    def __init__(self, calls: Sequence[Call]) -> None:
+        self._calls = calls
+        self._natives = [call.native for call in calls]
+        self._codes = numpy.array([call.native_address for call in calls], dtype=numpy.int64)
+        self._tables = numpy.array([call.address for call in calls], dtype=numpy.int64)
+        addresses = address_of(self._codes), address_of(self._tables)
+        self._given = numpy.array([*addresses, len(calls), 0, 0, 0, 1, TILE], dtype=numpy.int64)
+        self._address, self._run = address_of(self._given), _driver()
+
+    def __call__(self, first: int, last: int) -> None:
+        """Run from one lane to another."""
+        natives = [call.native for call in self._calls]
+        if natives != self._natives:  # better code
+            self._natives = natives
+            self._codes[:] = [call.native_address for call in self._calls]
+        self._run(self._address, first, last)
 
 
 class Moving(NamedTuple):
@@ -162,17 +200,14 @@ class CallSequence:
             addresses, entries = (
                 address_of(own) + own.itemsize * places for places in (self._starts, self._places)
             )
-            _driver()(
-                address_of(codes),
-                address_of(addresses),
-                self._count,
-                address_of(entries),
-                address_of(self._amounts),
-                len(self._amounts),
-                steps,
-                first,
-                last,
-                tile,
+            given = numpy.array(
+                [
+                    *(address_of(codes), address_of(addresses), self._count),
+                    *(address_of(entries), address_of(self._amounts), len(self._amounts)),
+                    *(steps, tile),
+                ],
+                dtype=numpy.int64,
             )
+            _driver()(address_of(given), first, last)
 
         run_over(lanes, width, threads)

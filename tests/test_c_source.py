@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.compiler import c_source
-from filtergym.compiler.c_source import (
+from filtergym.compiler.c_source import helper_functions, write_lanes, write_program
+from filtergym.compiler.c_text import (
     DOUBLE,
     FLOAT,
     Parameter,
     comment,
     function_text,
-    helper_functions,
     identifier,
     literal,
-    write_lanes,
-    write_program,
 )
 from filtergym.compiler.library import BINARY
 from filtergym.compiler.program import COMPARISONS, FUNCTIONS, LOGICAL, OPERATIONS, Graph, Result, program

@@ -9,7 +9,7 @@ from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.library import VARIANTS, portable
 from filtergym.compiler.native import OPTIMISED, Setting, quick_setting
 from filtergym.compiler.parts import cut_parts
-from filtergym.compiler.program import Graph
+from filtergym.compiler.program import COMPARISONS, Graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -198,6 +198,47 @@ def test_less_work_for_the_same_finite_numbers(function, expected):
         for name in ("where", "exp", "maximum", "negative"):
             patch.setattr(namespace, name, getattr(np, name))
         np.testing.assert_array_equal(result, function(*arrays))
+
+
+ARITHMETIC = (*COMPARISONS, "add", "subtract", "multiply", "divide", "maximum", "minimum", "where")
+UNARY = ("negative", "absolute", "sqrt", "exp")
+
+
+def expressions(name, count=400):
+    """A graph, and columns of arguments of an operation: known numbers and truth values, and those that vary."""
+    graph, rng = Graph(), np.random.default_rng(0)
+    known = [graph.constant(value) for value in (0.0, -0.0, 1.0, -1.0, 2.5, np.inf, np.nan)]
+    numbers = [*known, *(graph.input(0, row) for row in range(5))]
+    numbers += [graph.node("negative", number) for number in numbers[-2:]]
+    truths = [graph.constant(True), graph.constant(False)]
+    truths += [graph.node("less", number, known[4]) for number in numbers[-5:]]
+    kinds = {"where": (truths, numbers, numbers), "number": (truths,)}
+    kinds |= dict.fromkeys(("logical_and", "logical_or"), (truths, truths))
+    kinds |= dict.fromkeys(UNARY, (numbers,))
+    return graph, [rng.choice(kind, count) for kind in kinds.get(name, (numbers, numbers))]
+
+
+def written(graph, node):
+    """An expression with all that it is made of; a constant by its bits."""
+    if graph.operations[node] == "constant":
+        return np.float64(graph.values[node]).tobytes(), graph.logical[node]
+    if graph.operations[node] == "input":
+        return graph.arguments[node]
+    return (
+        graph.operations[node],
+        graph.logical[node],
+        *(written(graph, part) for part in graph.arguments[node]),
+    )
+
+
+@pytest.mark.parametrize("name", [*ARITHMETIC, *UNARY, "logical_and", "logical_or", "number"])
+def test_members_of_a_large_array_are_made_as_one_by_one(name):
+    """Also where several are the same, known, simpler than they look, or the same in the other order."""
+    (one, columns), (all_at_once, _) = expressions(name), expressions(name)
+    expected = [one.node(name, *row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    found = all_at_once.nodes(name, columns)
+    assert [written(all_at_once, node) for node in found] == [written(one, node) for node in expected]
+    assert sorted(all_at_once.operations) == sorted(one.operations)
 
 
 def test_a_product_with_zeros_of_a_matrix_vanishes():

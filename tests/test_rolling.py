@@ -8,14 +8,9 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.compiler import cache, emission, functions, namespace, native, rolling
 from filtergym.compiler.block import block_of
-from filtergym.compiler.c_source import (
-    Arrays,
-    Parameter,
-    Rows,
-    function_text,
-    helper_functions,
-    write_program,
-)
+from filtergym.compiler.c_loops import Arrays, Rows
+from filtergym.compiler.c_source import helper_functions, write_program
+from filtergym.compiler.c_text import Parameter, function_text
 from filtergym.compiler.emission import emit
 from filtergym.compiler.interpretation import interpret
 from filtergym.compiler.library import portable

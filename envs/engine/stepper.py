@@ -17,14 +17,12 @@ from ...compiler.functions import (
     map_arrays,
     run_over,
 )
-from ...compiler.sequence import CallSequence, Moving, moving_array
+from ...compiler.sequence import CallList, CallSequence, Moving, moving_array
 from ..contract.model import Episode
 from ..contract.observation import Array, DecisionMeans
 from .episode_noise import EpisodeNoise
 from .programs import Report
 
-TILE = 1024
-"""Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
 ANSWERING = 2
 """Of the four parts of a step the first ones: update and report; the others let a measurement arrive."""
 MANY = 64
@@ -127,6 +125,7 @@ class Stepper:
             self._calls.append(step)
             self._begin.append(begin)
         self._now = 0
+        self._lists: dict[tuple[Call, ...], CallList] = {}
         self._stepped = 0
         """Lanes that steps went over and that no code was told of."""
         self._small: dict[int, Stepper] = {}
@@ -230,17 +229,9 @@ class Stepper:
             calls[-2].table[self._row_entry] = noise.address
         calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
-        if self.width <= TILE:
-            for call in calls:
-                call.native(call.address, 0, self.width)
-            return
-
-        def tiles(first: int, last: int) -> None:
-            for start in range(first, last, TILE):
-                for call in calls:
-                    call(start, min(start + TILE, last))
-
-        run_over(tiles, self.width, self._threads)
+        if calls not in self._lists:
+            self._lists[calls] = CallList(calls)
+        run_over(self._lists[calls], self.width, self._threads)
 
     def run(self, noise: EpisodeNoise, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.

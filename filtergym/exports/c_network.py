@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 
 from ..agents.learned_policy import OBSERVATION_LIMIT, LearnedPolicy
-from ..compiler.c_source import FLOAT, Parameter, Scalar, array_text, function_text, literal
+from ..compiler.c_text import FLOAT, Parameter, Scalar, array_text, function_text, literal
 
 _LAYER = """/* One linear layer: the sums of all rows side by side, each in its order, so that they vectorise. */
 static void {name}_layer(

@@ -15,19 +15,17 @@ from typing import Any
 import numpy
 
 from ..baselines.fitted_filters import LogSetup
-from ..compiler.c_source import (
+from ..compiler.c_loops import Arrays, Rows
+from ..compiler.c_source import helper_functions, write_program
+from ..compiler.c_text import (
     DOUBLE,
     FLOAT,
-    Arrays,
     Parameter,
-    Rows,
     Scalar,
     comment,
     function_text,
-    helper_functions,
     identifier,
     literal,
-    write_program,
 )
 from ..evaluation.storage.files import whole_files
 from .c_network import memory_size, network_operations, network_text, scratch_size

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy
 
-from ..compiler.c_source import Scalar, comment, identifier
+from ..compiler.c_text import Scalar, comment, identifier
 from .traced_filter import Member
 
 

@@ -1,0 +1,279 @@
+"""Loops of a rolled program as text of C99."""
+
+import re
+import struct
+import textwrap
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy
+
+from .c_text import WIDTH, Scalar, array_text, expression, literal
+from .program import Program
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, steady
+
+SAVED = 40
+"""Bytes of tables that a second loop must save, and again for each place that it goes on from."""
+
+
+class Rows(NamedTuple):
+    """Where the rows of an argument lie, for loops over them."""
+
+    array: str
+    """Expression of a pointer to numbers."""
+    places: Mapping[int, int] | Sequence[int]
+    """Place of every row behind it."""
+
+
+class Arrays(NamedTuple):
+    """Where the rows of all arguments lie."""
+
+    read: Mapping[int, Rows]
+    written: Mapping[int, Rows]
+
+
+class Loops:
+    """Loops of a program as text.
+
+    Args:
+        program: that was rolled up.
+        name: that tables begin with.
+        read: expression of a row of an argument.
+        write: where a row of an argument goes.
+        arrays: where these rows lie.
+        scalar: kind of numbers.
+        tables: by where ``take`` finds them.
+        qualifier: of tables.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        name: str,
+        read: Callable[[int, int], str],
+        write: Callable[[int, int], str],
+        arrays: Arrays,
+        scalar: Scalar,
+        tables: Mapping[int, str],
+        qualifier: str,
+    ) -> None:
+        self.program, self.name, self.read, self.write, self.arrays = program, name, read, write, arrays
+        self.scalar, self.tables, self.qualifier = scalar, tables, qualifier
+        self.defined: list[str] = []
+        self._found: dict[tuple[Any, ...], str] = {}
+        self._columns, self._runs = 1, [0]
+        self._starts: dict[tuple[int, ...], str] = {}
+
+    def loop(self, loop: Loop) -> list[str]:
+        """Return the lines of a loop, or of two where rows and columns, or runs of members whose places are steadily
+        apart, take shorter tables than all members.
+        """
+        self._choose_form(loop)
+        lines = []
+        for number, operation, operands, logical, table, kept in loop.body:
+            values = [self._value(operand) for operand in operands]
+            known = [operand.array == CONSTANTS for operand in operands]
+            taken = (self.tables[table[0]], table[1]) if operation == "take" else None
+            text = expression(operation, values, known, self.scalar, taken)
+            if operation == "copy":
+                own = self._number(text, logical)
+            else:
+                kind = "int" if logical else self.scalar.name
+                lines.append(f"const {kind} v{number} = {text};")
+                own = self._number(f"v{number}", logical)
+            for to in kept:
+                place = self._place(to, self.write, self.arrays.written)
+                if place:
+                    lines.append(f"{place} = {own};")
+        if loop.turns == 1:
+            return lines
+        uses_k = any(re.search(r"\bk\b", line) for line in lines)
+        if len(self._runs) > 1:
+            return self._in_runs(lines, loop.turns, uses_k)
+        head = [f"for (int k = 0; k < {loop.turns}; ++k) {{"]
+        if self._columns > 1:
+            first, on = (", k = 0", ", ++k") if uses_k else ("", "")
+            head = [
+                f"for (int i = 0{first}; i < {loop.turns // self._columns}; ++i)",
+                f"for (int j = 0; j < {self._columns}; ++j{on}) {{",
+            ]
+        return [*head, *(f"    {line}" for line in lines), "}"]
+
+    def _in_runs(self, lines: list[str], turns: int, uses_k: bool) -> list[str]:
+        """A loop over runs around one over their members."""
+        lengths = [end - start for start, end in pairwise([*self._runs, turns])]
+        begin, on = [], ["--n", *["++k"] * uses_k]
+        for places, name in self._starts.items():
+            begin.append(f"    int {name} = {self._entry([places[start] for start in self._runs])};")
+            steps = self._entry(_steps(places, self._runs, turns))
+            if steps != "0":
+                on.append(f"++{name}" if steps == "1" else f"{name} += {steps}")
+        return [
+            f"for (int i = 0{', k = 0' * uses_k}; i < {len(self._runs)}; ++i) {{",
+            *begin,
+            f"    for (int n = {self._entry(lengths)}; n > 0; {', '.join(on)}) {{",
+            *(f"        {line}" for line in lines),
+            "    }",
+            "}",
+        ]
+
+    def _entry(self, numbers: Sequence[int]) -> str:
+        """Expression of a number of run ``i``."""
+        if steady(numbers) is None:
+            return f"{self._table(tuple(numbers))}[i]"
+        least, text = self._term(numbers, "i")
+        return " + ".join([str(least)] * (least != 0 or not text) + [text] * (text != ""))
+
+    def _choose_form(self, loop: Loop) -> None:
+        """Find the form in which the tables of a loop are shortest."""
+        self._columns, self._runs, self._starts = 1, [0], {}
+        irregular = set()
+        for statement in loop.body:
+            for operands, rows in (
+                (statement.operands, self.arrays.read),
+                (statement.kept, self.arrays.written),
+            ):
+                for operand in operands:
+                    if operand.array not in (TURN, CONSTANTS):
+                        places = self._own_places(operand, rows)
+                        if steady(places) is None:
+                            irregular.add(_from_least(places))
+        if not irregular:
+            return
+
+        def size(columns: int) -> int:
+            parts = [part for places in irregular for part in _grid(places, columns) or [places]]
+            return sum(map(_bytes, parts))
+
+        divisors = [n for n in range(2, loop.turns // 2 + 1) if loop.turns % n == 0]
+        columns = min(divisors, key=size, default=1)
+        runs = _runs(irregular, loop.turns)
+        of_runs = _bytes([end - start for start, end in pairwise([*runs, loop.turns])])
+        for places in irregular:
+            of_runs += _bytes([places[start] for start in runs])
+            of_runs += _bytes(_steps(places, runs, loop.turns)) + SAVED
+        best = size(1)
+        if columns > 1 and size(columns) + SAVED < best:
+            self._columns, best = columns, size(columns)
+        if of_runs + SAVED < best:
+            self._columns, self._runs = 1, runs
+
+    def _number(self, value: str, logical: bool) -> str:
+        one, zero = literal(1.0, self.scalar), literal(0.0, self.scalar)
+        return f"{value} ? {one} : {zero}" if logical else value
+
+    def _value(self, operand: Operand) -> str:
+        if operand.array == TURN:
+            return f"v{operand.places[0]}"
+        if operand.array == CONSTANTS:
+            numbers = tuple(float(self.program.constants[place]) for place in operand.places)
+            if len({struct.pack("d", number) for number in numbers}) == 1:
+                text = literal(numbers[0], self.scalar)
+                return str(int(numbers[0] != 0.0)) if operand.logical else text
+            text = f"{self._table(numbers)}[k]"
+        else:
+            text = self._place(operand, self.read, self.arrays.read)
+        return f"({text} != {literal(0.0, self.scalar)})" if operand.logical else text
+
+    def _place(self, operand: Operand, single: Callable[[int, int], str], rows: Mapping[int, Rows]) -> str:
+        """Expression of a member of an array, in a turn of the loop."""
+        array, places = operand.array, operand.places
+        if array != SCRATCH and len(set(places)) == 1:
+            return single(array, places[0])
+        pointer = "w" if array == SCRATCH else rows[array].array
+        return f"{pointer}[{self._index(self._own_places(operand, rows))}]"
+
+    def _own_places(self, operand: Operand, rows: Mapping[int, Rows]) -> tuple[int, ...]:
+        """Places of the members behind the pointer to their array."""
+        if operand.array == SCRATCH:
+            return operand.places
+        of_row = rows[operand.array].places
+        return tuple(of_row[row] for row in operand.places)
+
+    def _index(self, places: tuple[int, ...]) -> str:
+        """Expression of the place of member ``k``, which is the one in row ``i`` and column ``j``."""
+        if len(self._runs) > 1 and steady(places) is None:
+            name = self._starts.setdefault(_from_least(places), f"r{len(self._starts)}")
+            return f"{min(places)} + {name}" if min(places) else name
+        grid = _grid(places, self._columns) if steady(places) is None else None
+        parts = zip(grid, "ij", strict=True) if grid else [(places, "k")]
+        terms = [self._term(part, letter) for part, letter in parts]
+        first = sum(least for least, _ in terms)
+        return " + ".join([str(first)] * (first != 0) + [text for _, text in terms if text]) or "0"
+
+    def _term(self, places: Sequence[int], letter: str) -> tuple[int, str]:
+        """The least of some places, and an expression of how far the others are from it."""
+        step, least = steady(places), min(places)
+        if step is None:
+            return least, f"{self._table(_from_least(places))}[{letter}]"
+        if step < 0:
+            letter = f"({len(places) - 1} - {letter})"
+        return least, "" if step == 0 else letter if abs(step) == 1 else f"{abs(step)} * {letter}"
+
+    def _table(self, values: tuple[Any, ...]) -> str:
+        """Name of a constant array: of numbers, or of distances."""
+        key = (type(values[0]), *(struct.pack("d", value) for value in values))
+        if key not in self._found:
+            name = self._found[key] = (
+                f"{self.name}_{'values' if key[0] is float else 'at'}_{len(self._found)}"
+            )
+            if key[0] is float:
+                text = array_text(name, numpy.array(values), self.scalar, f"{self.qualifier}const")
+            else:
+                inside = textwrap.fill(", ".join(map(str, values)), WIDTH)
+                text = f"{self.qualifier}const {_kind(values)} {name}[{len(values)}] = {{\n{inside}\n}};\n"
+            self.defined.append(text)
+        return self._found[key]
+
+
+def _grid(places: Sequence[int], columns: int) -> list[tuple[int, ...]] | None:
+    """Places of rows and of columns whose sums all places are, row by row; None where there are none."""
+    if columns == 1:
+        return None
+    rows, row = tuple(places[::columns]), tuple(place - places[0] for place in places[:columns])
+    alike = all(place == rows[k // columns] + row[k % columns] for k, place in enumerate(places))
+    return [rows, row] if alike else None
+
+
+def _from_least(places: Sequence[int]) -> tuple[int, ...]:
+    least = min(places)
+    return tuple([place - least for place in places])
+
+
+def _kind(numbers: Sequence[int]) -> str:
+    """Type of C that holds some numbers."""
+    for size, kind in ((8, "char"), (16, "short")):
+        if min(numbers) >= 0 and max(numbers) < 2**size:
+            return f"unsigned {kind}"
+        if min(numbers) >= -(2 ** (size - 1)) and max(numbers) < 2 ** (size - 1):
+            return f"signed {kind}"
+    return "int"
+
+
+def _bytes(numbers: Sequence[int]) -> int:
+    """Size of a table, none where its entries are steadily apart."""
+    if steady(numbers) is not None:
+        return 0
+    return len(numbers) * {"char": 1, "short": 2}.get(_kind(numbers).split()[-1], 4)
+
+
+def _runs(tables: Collection[tuple[int, ...]], turns: int) -> list[int]:
+    """Members with which runs begin, in each of which every table's entries are steadily apart."""
+    apart = numpy.diff(numpy.array(list(tables)), axis=1)
+    bends = (apart[:, 1:] != apart[:, :-1]).any(axis=0).tolist()
+    starts = [0]
+    for member in range(2, turns):
+        # Two members are always steadily apart.
+        if bends[member - 2] and member - starts[-1] >= 2:
+            starts.append(member)
+    return starts
+
+
+def _steps(places: Sequence[int], runs: Sequence[int], turns: int) -> list[int]:
+    """Distance from member to member in every run; of a run of one, for which any will do, that of the run before."""
+    steps: list[int] = []
+    for start, end in pairwise([*runs, turns]):
+        alone = steps[-1] if steps else 1
+        steps.append(places[start + 1] - places[start] if end - start > 1 else alone)
+    return steps
