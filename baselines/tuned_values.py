@@ -2,12 +2,12 @@
 
 import json
 import math
-import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..envs.contract.parameters import quote_shortened
 from ..envs.engine.catalogue import nearest, short_name
 from ..evaluation.competitors.kinds import Kind
 from ..evaluation.storage.files import write_text
@@ -147,13 +147,13 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
     """
     limits = tunable.limits
     if not fits(values, dict[str, float]) or values.keys() != limits.keys():
-        raise ValueError(f"it must give a number for each of {', '.join(limits)}, got {reprlib.repr(values)}")
+        raise ValueError(f"it must give a number for each of {', '.join(limits)}, got {quote_shortened(values)}")
     for name, (low, high) in limits.items():
         # Values are stored rounded, so that one at a limit can lie just beyond it.
         beyond = tunable.beyond.get(name, 0.0)
         if not min(low, round_value(low)) - beyond <= values[name] <= max(high, round_value(high)) + beyond:
             raise ValueError(
-                f"{name} must be from {low - beyond:g} to {high + beyond:g}, got {reprlib.repr(values[name])}"
+                f"{name} must be from {low - beyond:g} to {high + beyond:g}, got {quote_shortened(values[name])}"
             )
     found: dict[str, float] = values
     return found

@@ -13,6 +13,7 @@ from .baselines.state_space import state_space_baselines
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
 from .envs.contract.model import Model
+from .envs.contract.parameters import Limits, check, quote_shortened, read_numbers
 from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.engine.catalogue import nearest
 from .envs.linear.state_space import (
@@ -91,13 +92,25 @@ def state_space(
     for parameter in parameters:
         if parameter not in allowed:
             raise nearest("argument of state_space", parameter, allowed)
+    if not isinstance(id, str):
+        raise ValueError(f"an id is a word such as 'mine/Tracker-v0', got {quote_shortened(id)}")
     mean = _array("mean", mean, (None,))
     n = len(mean)
+    hypotheses, names, units, measured = (
+        _sequence(what, given)
+        for what, given in (
+            ("hypotheses", hypotheses),
+            ("names", names),
+            ("units", units),
+            ("measured", measured),
+        )
+    )
     first = {"f": f, "h": h, "Q": Q, "R": R}
     given = [first, *({**first, **_known("hypotheses", one)} for one in hypotheses)]
-    interval = float(parameters.get("sampling_interval", StateSpaceParameters.sampling_interval))
+    check("switching", switching, bool, Limits())
+    interval = StateSpaceParameters(**parameters).sampling_interval
     world = tuple(_model(one, n, interval) for one in given)
-    mistaken = _known("filter_model", filter_model or {})
+    mistaken = {} if filter_model is None else _known("filter_model", filter_model)
     filters = tuple(_model({**one, **mistaken}, n, interval) for one in given) if mistaken else world
     if len({model.h.size for model in (*world, *filters)}) > 1:
         raise ValueError("all models must measure as many numbers")
@@ -108,17 +121,19 @@ def state_space(
         world,
         filters,
         _chain(transition, count),
-        bool(switching),
+        switching,
         mean,
         _covariance("covariance", covariance, n),
         numpy.full(n, 1.0 / n) if weights is None else _array("weights", weights, (n,)),
     )
     if not (definition.weights >= 0.0).all() or not definition.weights.any():
         raise ValueError(f"weights must not be negative, nor all zero, got {definition.weights.tolist()}")
-    names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
-    units = tuple(units) or ("1",) * n
+    names = names or tuple(f"x{i + 1}" for i in range(n))
+    units = units or ("1",) * n
     if len(names) != n or len(units) != n:
-        raise ValueError(f"names and units must be {n} each, got {names!r} and {units!r}")
+        raise ValueError(
+            f"names and units must be {n} each, got {quote_shortened(names)} and {quote_shortened(units)}"
+        )
     measured = _measured(measured, world[0].h.size)
     name = id.rpartition("/")[2].rpartition("-")[0] or id
     module = sys._getframe(1).f_globals.get("__name__", "__main__")
@@ -135,16 +150,30 @@ def state_space(
 
 def _known(what: str, part: Mapping[str, Any]) -> dict[str, Any]:
     """Return a mapping, or raise ValueError for what is none of f, h, Q and R."""
+    if not isinstance(part, Mapping):
+        raise ValueError(f"{what} says f, h, Q or R by name, got {quote_shortened(part)}")
     unknown = [name for name in part if name not in EQUATIONS]
     if unknown:
-        raise ValueError(f"{what} says f, h, Q or R, got {unknown[0]!r}")
+        raise ValueError(f"{what} says f, h, Q or R, got {quote_shortened(unknown[0])}")
     return dict(part)
+
+
+def _sequence(what: str, given: Any) -> tuple[Any, ...]:
+    """Return words, or models, as a tuple."""
+    kind, of = (Mapping, "models") if what == "hypotheses" else (str, "words")
+    if (
+        not isinstance(given, Sequence)
+        or isinstance(given, str)
+        or not all(isinstance(one, kind) for one in given)
+    ):
+        raise ValueError(f"{what} must be a sequence of {of}, got {quote_shortened(given)}")
+    return tuple(given)
 
 
 def _measured(names: Sequence[str], count: int) -> tuple[str, ...]:
     """Names of what is measured, which can be told apart in a table."""
     names = tuple(names) or tuple(f"z{j + 1}" for j in range(count))
-    lower = {str(name).lower() for name in names}
+    lower = {name.lower() for name in names}
     if len(names) != count or len(lower) != count or lower & {*TIME, RECORDING, ""}:
         raise ValueError(f"measured must be {count} different names, none of them a time, got {names!r}")
     if any(name.startswith(TRUTH) for name in lower):
@@ -153,7 +182,7 @@ def _measured(names: Sequence[str], count: int) -> tuple[str, ...]:
 
 
 def _array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
-    array = numpy.asarray(values, dtype=float)
+    array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if not fits or not numpy.isfinite(array).all() or not array.size:
         words = ", ".join("n" if size is None else str(size) for size in shape)

@@ -181,10 +181,10 @@ def reading(reader: str, place: Path):
     from filtergym.submission import check_submission, read_submission, unpack
 
     problem = problem_of(ENVIRONMENT)
-    path = place / (reader if "." in reader else f"a.{reader}")
+    path = place / (f"a.{reader}" if reader == "filter.json" or "." not in reader else reader)
     work = None
     if reader == "truth.csv":
-        track().assign(x=lambda t: t["x"] + 5.0).to_csv(place / "log.csv", index=False)
+        track().assign(x=lambda t: t["x"] + 5.0 * np.cos(t["time"])).to_csv(place / "log.csv", index=False)
     elif reader == "imu.csv":
         inertial.write_log(place)
     elif reader == "tuned.json":
@@ -393,6 +393,7 @@ def main(reader: str, seconds: float, inputs: int = 0, seed: int = 0) -> int:
     counts = np.memmap(place / "counts", np.int64, "w+", shape=3)
     limits = [
         f"-timeout={SECONDS}", f"-rss_limit_mb={MEGABYTES}", f"-max_len={LONGEST}", f"-artifact_prefix={failed}/",
+        "-mutate_depth=1",
     ]  # fmt: skip
     this = [sys.executable, __file__, reader, "--inner", *limits]
     until, broken = time.monotonic() + seconds, 0
