@@ -561,6 +561,11 @@ def test_wrong_arguments_get_one_sentence(name):
             filter.start(value, COVARIANCE)
         with pytest.raises(ValueError, match=r"tracks are numbers from 0 to 0|cannot start"):
             filter.start(STATE, COVARIANCE, tracks=value if value is not np.inf else "x")
+        with pytest.raises(ValueError, match=r"time must be|each of the two|values are given"):
+            filter.start_from({"time": value, "x": 1e4, "y": 2e4}, value)
+    for what in ("regular", "control", "backend", "tracks"):
+        with pytest.raises(ValueError, match=f"{what}"):
+            filtergym.online(RADAR, name, **{what: np.eye(2)})
     filter.update(4.0, x=1e4, y=2e4)
     with pytest.raises(
         ValueError, match=r"measurements of filtergym/ManeuveringTarget-v0 are at least .* s apart"

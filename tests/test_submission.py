@@ -373,6 +373,8 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    (tmp_path / "named.json").write_text(json.dumps({"x" * 10_000: 0}))
+    assert len(refused(command, tmp_path / "named.json")) < 1000
     assert "there is no file" in refused(command, tmp_path / "none.json")
     assert "it is no file but a folder, a device or a pipe" in refused(command, "/dev/zero")
 
