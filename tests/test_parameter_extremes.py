@@ -162,6 +162,13 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("UavAutopilot", {"actuator_disturbance": 0.0}),
         ("UavAutopilot", {"gain_decades": 1e6}),
         ("UavAutopilot", {"lift_incidence": -1e6}),
+        ("UavAutopilot", {"sensor_sigmas": (0.5, 1e-6, 0.5), "wide_band_scale": 1e6}),
+        (
+            "UavAutopilot",
+            {"mass": 1e-6, "chord": 1e-6}
+            | dict.fromkeys(("moment_disturbance", "gust_sigma", "actuator_disturbance"), 1e-6),
+        ),
+        ("ManeuveringTarget", {"glint_factor": 1e6}),
         ("UavAutopilot", {"moment_rate": 1e6}),
         (
             "UavAutopilot",

@@ -55,8 +55,9 @@ class ManeuveringTargetParameters(TaskParameters):
     never)."""
     glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """That both errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
-    glint_factor: float = parameter(5.0, above=0.0)
-    """Their standard deviation over that of the others (ours)."""
+    glint_factor: float = parameter(5.0, above=0.0, at_most=1e4)
+    """Their standard deviation over that of the others (ours). The limit is a quarter of the digits of a number: its
+    square stands beside the usual variance in one covariance, which shall keep half of them."""
     coloured_sigma: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Limits of the standard deviation of coloured errors along x and y, first-order Gauss-Markov, beside the white
     ones and in units of theirs; each episode draws its own, and nobody says so (ours; the paper: none)."""
