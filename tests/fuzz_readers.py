@@ -376,8 +376,9 @@ def run_inner(reader: str, place: Path, flags: list[str]) -> None:
     atheris.Fuzz()
 
 
-def main(reader: str, seconds: float, inputs: int = 0, seed: int = 0) -> int:
+def main(reader: str, seconds: float, inputs: int = 0, seed: int | None = None) -> int:
     """Fuzz a reader, reduce its corpus, and return how many inputs failed."""
+    seed = int(time.time()) if seed is None else seed
     place = ROOT / "build" / "fuzz" / reader
     corpus, found, failed, reduced = (place / name for name in ("corpus", "found", "failed", "reduced"))
     corpus.mkdir(parents=True, exist_ok=True)

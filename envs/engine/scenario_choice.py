@@ -172,7 +172,7 @@ def _read_recording(
     rename: Mapping[str, str] | None,
 ) -> Recording:
     """Read one file."""
-    if not file.is_file():
+    if not file.exists():
         raise ValueError("there is no such file")
     if names_environment(file):
         if truth is not None:
