@@ -213,8 +213,7 @@ def competitors_of(
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     for name, entry in named.items():
-        own = isinstance(entry, str | Path) and entry == name
-        if not own and _is_competitor(problem, name) and entry != find_competitor(problem, name):
+        if _is_competitor(problem, name) and not _is_same(entry, name, find_competitor(problem, name)):
             raise ValueError(
                 f"{name!r} is the name of what {problem.id} has already: call your own something else"
             )
@@ -224,6 +223,11 @@ def competitors_of(
         else with_normalisation(entry)
         for name, entry in named.items()
     }
+
+
+def _is_same(entry: Any, *known: Any) -> bool:
+    """Whether what a user gives under a name is one of what the name stands for already."""
+    return any(type(entry) is type(one) and bool(entry == one) for one in known)
 
 
 def _is_competitor(problem: Problem, name: str) -> bool:
