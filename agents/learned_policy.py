@@ -284,6 +284,8 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
             raise ValueError(
                 f"{name} must be finite numbers of shape {shape}, got shape {arrays[name].shape}"
             )
+    if not arrays["observation_scale"].all():
+        raise ValueError("observation_scale must not be zero")
     return width
 
 

@@ -366,7 +366,7 @@ def run_inner(reader: str, place: Path, flags: list[str]) -> None:
     def mutate(content: bytes, longest: int, seed: int) -> bytes:
         rng = random.Random(seed)
         if rng.random() < 0.5:
-            with contextlib.suppress(Exception):  # it has lost its form before
+            with contextlib.suppress(ValueError, LookupError, TypeError, OSError):  # it has lost its form before
                 return change_structure(reader, content, rng)[:longest]
         return atheris.Mutate(content, longest)
 
@@ -426,7 +426,7 @@ def main(reader: str, seconds: float, inputs: int = 0, seed: int | None = None) 
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "docs" / "make")]
     if len(sys.argv) < 3:
         print("\n".join(READERS))
     elif "--inner" in sys.argv:
