@@ -181,6 +181,16 @@ def stored(tmp_path):
     return store
 
 
+def test_an_observation_that_is_divided_by_zero_is_refused(stored):
+    path = stored()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(np.ones(1, np.float32).tobytes(), bytes(4), 1))
+    with pytest.raises(
+        ValueError, match="is not a learned policy of filtergym: observation_scale must not be zero"
+    ):
+        learned_policy.load_policy(task_class(ID), path)
+
+
 def test_policy_of_another_environment_is_refused(stored):
     from filtergym.agents.learned_policy import load_policy
 
