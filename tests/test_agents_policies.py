@@ -196,7 +196,7 @@ def test_policy_of_another_environment_is_refused(stored):
 
     assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
     path = stored(environment="filtergym/Other-v0")
-    with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
+    with pytest.raises(ValueError, match="was trained on 'filtergym/Other-v0', not on " + ID):
         load_policy(problem_of(ID).task, path)
     fields = [field.name for field in make_model(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))

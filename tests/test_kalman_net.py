@@ -358,7 +358,7 @@ def test_a_file_is_an_estimator(stored, command):
 
 
 def test_a_file_is_refused_elsewhere(stored):
-    with pytest.raises(ValueError, match=f"was trained on {RADAR}, not on {FUSION}"):
+    with pytest.raises(ValueError, match=f"was trained on '{RADAR}', not on {FUSION}"):
         filtergym.evaluate(FUSION, [str(stored)], episodes=1)
     with pytest.raises(ValueError, match="does not act: of kind estimator"):
         filtergym.make_policy(RADAR, str(stored))

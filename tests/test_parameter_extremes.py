@@ -169,6 +169,8 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
             | dict.fromkeys(("moment_disturbance", "gust_sigma", "actuator_disturbance"), 1e-6),
         ),
         ("ManeuveringTarget", {"glint_factor": 1e6}),
+        ("ManeuveringTarget", {"coloured_sigma": (0.0, 1e5)}),
+        ("ManeuveringTarget", {"bias": 1e5}),
         ("UavAutopilot", {"moment_rate": 1e6}),
         (
             "UavAutopilot",

@@ -212,7 +212,7 @@ def test_other_arrays_do_not_hold(edited, command, tmp_path):
 def test_arrays_of_another_environment_are_refused(edited, command):
     other = PRETRAINED / "UavAutopilot-v0" / "bptt-small.safetensors"
     text = refused(command, edited("agent", lambda content: with_agent(content, other)))
-    assert "was trained on filtergym/UavAutopilot-v0" in text
+    assert "was trained on 'filtergym/UavAutopilot-v0'" in text
 
 
 @pytest.mark.parametrize("content", [b"", b"half", b"\xff" * 8, b"\x08" + 7 * b"\0" + b'{"a":{}}'])
