@@ -555,7 +555,7 @@ def test_wrong_arguments_get_one_sentence(name):
         with pytest.raises(ValueError, match=r"x must (be|have)") as error:
             filter.update(4.0, x=value, y=1e4)
         assert len(str(error.value)) < 200
-        with pytest.raises(ValueError, match="time must be (numbers|finite seconds)"):
+        with pytest.raises(ValueError, match=r"time must be (numbers|finite seconds)"):
             filter.update(value, x=1e4, y=1e4)
         with pytest.raises(ValueError, match=r"mean must (be|have)"):
             filter.start(value, COVARIANCE)
