@@ -207,7 +207,7 @@ def test_policy_of_another_environment_is_refused(stored):
 def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command):
     now = make_model(ID).task.interface
     path = stored(interface=str(now - 1))
-    with pytest.raises(ValueError, match=rf"its interface {now - 1}, now {now}\): train it again"):
+    with pytest.raises(ValueError, match=rf"its interface '{now - 1}', now {now}\): train it again"):
         evaluate(ID, [str(path)], episodes=1)
     code, _, error = command("evaluate", ID, "--policy", path, "--episodes", 1)
     assert code == 2
