@@ -367,7 +367,7 @@ def test_a_file_is_refused_elsewhere(stored):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"interface": "1"}, r"its interface 1, now 2\): train it again"),
+        ({"interface": "1"}, r"its interface .1., now 2\): train it again"),
         ({"fields": json.dumps(["innovation_along"])}, "is not a learned policy of filtergym"),
         ({"control": "gain"}, "was trained on other fields"),
     ],
