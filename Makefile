@@ -26,7 +26,7 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
 # What reads files beside the packages, so that an unpacked source distribution must hold them.
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
   test_example_environment.py test_observation.py test_reproduction.py)
-EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,ins,adapters,onnx,offline,cluster
+EXTRAS := agents,fast,tensorboard,report,render,flights,logs,ins,adapters,onnx,offline,cluster
 # A link that leads nowhere, or a page that no other leads to, is an error.
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
@@ -134,7 +134,7 @@ $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report,agents,search,dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report,agents,dev]"
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made

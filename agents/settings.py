@@ -109,15 +109,6 @@ def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
     return section
 
 
-def read_section(path: Path, id: str) -> Any:
-    """Return an environment's section of a YAML file of sections by environment id or ``default``.
-
-    Raises:
-        ValueError: if the file cannot be read, is of another form, or has no section for the environment.
-    """
-    return _section(_read_table(path, "sections by environment id or default"), path, id)
-
-
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of settings.
 

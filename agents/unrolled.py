@@ -11,6 +11,7 @@ from typing import Any
 import numpy
 import torch
 
+from ..envs.contract.observation import DecisionMeans
 from ..envs.engine.rollout import Rollout
 from ..envs.interface.vector_environment import TaskVectorEnv
 from .gate import Gate
@@ -280,8 +281,8 @@ class Unrolled:
         self._gate_memory: Any = None
         self._opened = numpy.ones((self._truncation, env.num_envs))
         fields = env.model.fields
-        self._mean = [i for i, field in enumerate(fields) if field.over_interval == "mean"]
-        self._last = [i for i, field in enumerate(fields) if field.over_interval != "mean"]
+        self._means = DecisionMeans(fields, self._interval)
+        self._last = [i for i in range(len(fields)) if i not in self._means.columns]
 
     def descend_episodes(self, descend: Callable[[], None]) -> float:
         """Fly one episode in every environment; see :func:`.bptt.descend_episodes`."""
@@ -312,17 +313,14 @@ class Unrolled:
             action = policy.forward(decision, self._observation)
             if self._gate is not None:
                 action = self._through_gate(decision, action)
-            mean: Any = 0.0
+            total: Any = 0.0
             for measurement in range(decision * interval, (decision + 1) * interval):
                 rollout.action[measurement, :, :count] = action
                 rollout.noise[measurement] = self._lanes.next_row()
                 rollout.forward()
                 paid += float(rollout.reward[:count].sum())
-                if interval > 1:
-                    mean = mean + rollout.shown[self._mean, :count]
-            self._observation = rollout.shown[:, :count].copy()
-            if interval > 1:
-                self._observation[self._mean] = mean / interval
+                total = self._means.add(total, rollout.shown[:, :count])
+            self._observation = numpy.array(self._means.show(rollout.shown[:, :count], total, numpy))
         if not numpy.isfinite(rollout.action[: decisions * interval]).all():
             raise ValueError("the policy has answered with what are no finite numbers")
         share = 1.0 / (count * decisions * interval)
@@ -343,8 +341,7 @@ class Unrolled:
                 size = numpy.sqrt((of_action * of_action).sum(axis=0)) / (share * interval)
                 of_action *= self._largest / numpy.maximum(size, self._largest)
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
-            if interval > 1:
-                rollout.shown_adjoint[self._mean] /= interval
+            rollout.shown_adjoint[self._means.columns] /= interval
         policy.add_gradients(decisions)
         rollout.go_on()
         return -paid * share

@@ -2,16 +2,18 @@
 
 The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
 chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
-19, 1974), and fitted to all three quarters. So is its rival among what is shipped, which is not fitted: the paper's
-algorithm, unless another is likelier beyond chance. The fitted one is advised where its gain over the rival is beyond
-chance. The last quarter judges. Who is best there in hindsight is named beside: the best of many looks better than it
-is. Intervals are of whole stretches of measurements, since neighbours are not independent.
+19, 1974): the simplest that the likeliest does not beat beyond chance. It is fitted to all three quarters. So is its
+rival chosen among what is shipped, which is not fitted: the paper's algorithm, unless another is likelier beyond
+chance, and then the cheapest that is as good as the likeliest. The fitted one is advised where its gain over the rival
+is beyond chance, or where it is as good and cheaper. The last quarter judges: where the fitted one errs more there,
+beyond chance, the likelihood misleads, and the rival is advised. Who is best there in hindsight is named
+beside: the best of many looks better than it is. Intervals are of whole stretches of measurements, since neighbours are
+not independent.
 """
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -23,7 +25,7 @@ from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.statistics.bootstrap import Estimate
-from ..evaluation.statistics.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
+from ..evaluation.statistics.predictions import Predictions
 from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
@@ -39,93 +41,16 @@ from .fitting import (
     with_noise_scale,
     with_outliers,
 )
+from .judgement import FEWEST, Competitor, Judgement, Share, likeliest_of, share_out
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
 
-LEAST = 5
-"""Measurements after the start of the track that anything can be fitted to."""
-FEWEST = 40
-"""Measurements of a recording from which on it is cut into blocks; of fewer everything is fitted to all of it."""
-LARGEST_LOSS = 0.5
-"""Nats per measurement by which a fit may be worse over the whole recording than in its windows, which begin anew:
-what loses more has lost the track."""
-BLOCK_MEASUREMENTS = 40
-MOST_BLOCKS = 24
-LONGEST_WARM_UP = 20
 APART = 10.0
 """s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own
 filter makes of them, and one-step predictions say much of that and little of errors that last."""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
-
-
-class Share(NamedTuple):
-    """Measurements of a recording that serve one purpose."""
-
-    fitted: list[Span]
-    chosen: list[Span]
-    judged: list[Span]
-    warm_up: int
-    apart: bool
-    """Whether the three are different measurements."""
-
-
-def share_out(recording: Recording) -> Share:
-    """Cut a recording into what filters are fitted to, chosen on and judged on: a half and two quarters of it.
-
-    Raises:
-        ValueError: if it has too few measurements for anything.
-    """
-    total = int(recording.rows.sum())
-    if total < LEAST:
-        raise ValueError(
-            f"recording {recording.name!r} has {total} measurements after the start of its track: to fit anything "
-            f"takes {LEAST}"
-        )
-    blocks = min(MOST_BLOCKS, max(8, total // BLOCK_MEASUREMENTS)) // 4 * 4
-    warm_up = max(2, min(LONGEST_WARM_UP, total // 20))
-    if total < FEWEST:
-        whole = [Span(i, min(2, int(rows) - 1), int(rows)) for i, rows in enumerate(recording.rows)]
-        return Share(whole, whole, whole, warm_up, False)
-    ends = [total * i // blocks for i in range(blocks + 1)]
-    found: list[list[Span]] = [[], [], [], []]
-    first_of_episode = numpy.concatenate([[0], numpy.cumsum(recording.rows)])
-    for block, (begin, end) in enumerate(itertools.pairwise(ends)):
-        for episode, offset in enumerate(first_of_episode[:-1]):
-            first, last = max(begin, offset), min(end, first_of_episode[episode + 1])
-            if block == 0:
-                first = max(first, offset + warm_up)  # the start of the track is no motion
-            if last > first:
-                found[block % 4].append(Span(episode, int(first - offset), int(last - offset)))
-    return Share([*found[0], *found[2]], found[1], found[3], warm_up, True)
-
-
-class Competitor(NamedTuple):
-    """One line of the table of an advice."""
-
-    name: str
-    fitted: bool
-    """Whether its parameters were fitted to this recording."""
-    parameters: int
-    """How many were."""
-    log_likelihood: float
-    """Mean of the measurements that chose, less one nat in all for each fitted parameter, nats; NaN where it says
-    none."""
-    gain: Estimate
-    """The same less that of the rival, paired."""
-    difference: Estimate
-    """Judged log-likelihood per measurement less that of the rival, nats."""
-    prediction: float
-    """Root mean square of the judged prediction errors; NaN where the log format has no prediction."""
-    error: float
-    """Root mean square of the judged errors of the main components; NaN without truth."""
-    relative_error: Estimate
-    """Judged error over that of the rival, less one; without truth of the prediction errors."""
-    nis: float
-    """Mean normalised innovation squared of judged measurements over its dimension."""
-    correlation: Estimate
-    """Of successive judged prediction errors; zero where they are white."""
 
 
 class Anchor(NamedTuple):
@@ -138,6 +63,37 @@ class Anchor(NamedTuple):
     to such measurements."""
 
 
+class Prices(Mapping[str, Mapping[str, int] | None]):
+    """What an update of each competitor costs, found out when it is asked for; None where that cannot be said.
+
+    Args:
+        makers: competitors by name.
+        price_of: says what one of them costs: ``operations`` of an update and whatever else counts.
+    """
+
+    def __init__(
+        self, makers: Mapping[str, Any], price_of: Callable[[str, Any], Mapping[str, int] | None]
+    ) -> None:
+        self.makers, self.price_of = makers, price_of
+        self._known: dict[str, Mapping[str, int] | None] = {}
+
+    def __getitem__(self, name: str) -> Mapping[str, int] | None:
+        if name not in self._known:
+            self._known[name] = self.price_of(name, self.makers[name])
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.makers)
+
+    def __len__(self) -> int:
+        return len(self.makers)
+
+    def operations(self, name: str) -> float:
+        """Of an update; infinite where it is not known."""
+        price = self[name]
+        return math.inf if price is None else float(price["operations"])
+
+
 class Advice(NamedTuple):
     """What :func:`advise` has found."""
 
@@ -146,7 +102,7 @@ class Advice(NamedTuple):
     competitors: list[Competitor]
     """The advised one first, then by their log-likelihood."""
     fitted: Competitor
-    """The likeliest of the fitted ones."""
+    """The simplest of the fitted ones that the likeliest of them does not beat beyond chance."""
     rival: str
     """Shipped filter that one would take without the judged measurements."""
     best_shipped: str
@@ -166,8 +122,10 @@ class Advice(NamedTuple):
     outliers: numpy.ndarray
     """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
     dearer: tuple[str, Estimate] | None
-    """Likeliest family, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
-    None where it is the fitted one. ``fitted`` is the cheapest of those that it does not beat beyond chance."""
+    """Likeliest of all, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
+    None where it is the advised one."""
+    prices: "Prices"
+    """What an update of each costs."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -188,6 +146,7 @@ def advise(
     noise: bool = True,
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda what, share: None,
+    price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
     **keywords: Any,
 ) -> Advice:
     """Fit every family of filters to a recording, choose one, and judge it against what is shipped.
@@ -200,6 +159,8 @@ def advise(
         noise: fit the scale of the measurement noise, too, where measurements state one.
         seed: of the starts of the fits.
         progress: told what is done, and which share of all.
+        price_of: says what an update of a competitor costs, of its name and what makes it: ``operations`` and
+            whatever else counts; None where that is not known, and then it is taken for dearer than all others.
         **keywords: parameters of the task.
 
     Raises:
@@ -234,31 +195,25 @@ def advise(
             for name, found in fits.items()
         },
     }
+    prices = Prices(makers, price_of)
     counts = {name: len(found.values) for name, found in fits.items()}
     anchored = [name for name, tunable in tunables.items() if tunable.anchored]
 
-    def judge(makers: Mapping[str, Any]) -> _Judgement:
+    def judge(makers: Mapping[str, Any]) -> Judgement:
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
+        return Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
 
     progress(_first_verdict(fits, tunables, len(shipped)), 0.6)
-    judgement = judge(makers)
+    judgement = all_judged = judge(makers)
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.items() if name not in anchored}
     )
-    rival, best = judgement.rival(), judgement.best_shipped()
-    competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
-    candidates = [c for c in competitors if c.fitted and c.name not in anchored]
-    chosen = dearer = _likeliest(candidates)
-    # Families come the cheapest first: the first that the likeliest does not beat beyond chance.
-    for one in candidates:
-        extra = judgement.difference(dearer.name, one.name)
-        if extra.low <= 0.0 or one is dearer:
-            chosen = one
-            break
-    brought = judgement.difference(dearer.name, chosen.name)
+    rival, best = judgement.rival(prices.operations), judgement.best_shipped()
+    competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
+    comparable = [c for c in competitors if c.name not in anchored]
+    chosen = judgement.simplest([c for c in comparable if c.fitted])
     anchor = None
     for name in anchored:
         both = {each: tunables[each] for each in (name, chosen.name)}
@@ -267,6 +222,7 @@ def advise(
             chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
     profiles = {}
+    takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
     if share.apart:  # to all that does not judge
         begin = dataclasses.replace(tunable, start=fits[name].values)
         spans = [*share.fitted, *share.chosen]
@@ -278,11 +234,15 @@ def advise(
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
+    if not tunable.anchored and chosen.relative_error.low > 0.0:
+        takes_fitted = False  # the likelihood misleads
+    advised = chosen if takes_fitted else next(c for c in competitors if c.name == rival)
+    likeliest, brought = likeliest_of(comparable), None
+    if not tunable.anchored and likeliest.name != advised.name:
+        brought = likeliest.name, all_judged.difference(likeliest.name, advised.name)
     if name not in profiles:
         fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
-    sure = tunable.anchored or chosen.gain.low > 0.0
-    advised = chosen if sure else next(c for c in competitors if c.name == rival)
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
@@ -302,7 +262,8 @@ def advise(
         profiles,
         anchor,
         find_outliers(task, recording, tunable, fits[name]),
-        None if chosen.name == dearer.name or tunable.anchored else (dearer.name, brought),
+        brought,
+        prices,
     )
 
 
@@ -458,122 +419,3 @@ def _compare_anchored(
 def _interval(recording: Recording) -> float:
     """Median time between measurements, s."""
     return float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
-
-
-class _Judgement:
-    """What all competitors did on the measurements that chose and on those that judge.
-
-    Args:
-        predictions: of all.
-        share: which measurements they are.
-        parameters: how many were fitted, by the name of who was fitted; all others are shipped.
-        default: shipped filter that stands unless another is likelier beyond chance; empty: none.
-        anchored: names of filters with a second sensor, of which an estimate alone does not say what they predict.
-    """
-
-    def __init__(
-        self,
-        predictions: Predictions,
-        share: Share,
-        parameters: Mapping[str, int],
-        default: str,
-        anchored: Container[str] = (),
-    ) -> None:
-        self.predictions, self.parameters, self.default = predictions, parameters, default
-        choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
-        self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
-        self.shipped = [name for name in predictions.names if name not in parameters]
-        alone = [name for name in predictions.names if name not in anchored]
-        errors = {name: predictions.prediction_error(name) for name in alone}
-        self._errors = {name: each for name, each in errors.items() if each is not None}
-        self._predicted = {name: (each**2).sum(axis=0) for name, each in self._errors.items()}
-        names = predictions.names if predictions.has_truth else []
-        self._squares = {name: predictions.squared_error(name) for name in names}
-
-    def _mask(self, spans: Sequence[Span]) -> numpy.ndarray:
-        """Measurements, ``(episodes, time)``."""
-        mask = numpy.zeros(self.predictions.shape, dtype=bool)
-        for span in spans:
-            mask[span.episode, span.first : span.last] = True
-        return mask
-
-    def _least(self, squares: Mapping[str, numpy.ndarray], mask: numpy.ndarray) -> str:
-        """Shipped filter of smallest mean square; by log-likelihood where there are no squares."""
-        found = self.predictions
-        means = {
-            name: mean_of(squares[name] if squares else -found.log_likelihood(name), mask)
-            for name in self.shipped
-        }
-        return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
-
-    def rival(self) -> str:
-        """Shipped filter that one would take by the measurements that chose."""
-        found, default = self.predictions, self.default
-        means = {name: mean_of(found.log_likelihood(name), self.chosen) for name in self.shipped}
-        known = [name for name, mean in means.items() if not math.isnan(mean)]
-        if not known:
-            return self._least(self._predicted, self.chosen)
-        likeliest = max(known, key=means.__getitem__)
-        if default in known and not found.difference(likeliest, default, self.chosen).low > 0.0:
-            return default
-        return likeliest
-
-    def best_shipped(self) -> str:
-        """Shipped filter that is best on the measurements that judge."""
-        return self._least(self._squares or self._predicted, self.judged)
-
-    def relative_error(self, name: str, other: str) -> Estimate:
-        """Judged error over that of another, less one; without truth of the prediction errors."""
-        squares = self._squares or self._predicted
-        known = name in squares and other in squares
-        return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
-
-    def difference(self, name: str, other: str) -> Estimate:
-        """Chosen log-likelihood of a fitted filter less that of another, their parameters paid for, nats."""
-        found = self.predictions.difference(name, other, self.chosen)
-        penalty = (self.parameters[name] - self.parameters[other]) / self.chosen.sum()
-        return Estimate(*(value - penalty for value in found))
-
-    def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
-        """Return who loses the track in the whole recording; nobody where all do.
-
-        Args:
-            fits: what their likelihood is in windows.
-        """
-        found = self.predictions
-        values = {name: found.log_likelihood(name)[self.chosen | self.judged] for name in fits}
-        most = max(int(numpy.isfinite(each).sum()) for each in values.values())
-        diverging = [
-            name
-            for name, each in values.items()
-            if (there := numpy.isfinite(each)).sum() < 0.99 * most
-            or each[there].mean() < fits[name].log_likelihood / fits[name].measurements - LARGEST_LOSS
-        ]
-        return tuple(diverging) if len(diverging) < len(fits) else ()
-
-    def competitor(self, name: str, rival: str) -> Competitor:
-        """Judge somebody, paired with another."""
-        found, judged = self.predictions, self.judged
-        penalty = self.parameters.get(name, 0) / self.chosen.sum()
-        gain = found.difference(name, rival, self.chosen)
-        return Competitor(
-            name,
-            name in self.parameters,
-            self.parameters.get(name, 0),
-            mean_of(found.log_likelihood(name), self.chosen) - penalty,
-            Estimate(*(value - penalty for value in gain)),
-            found.difference(name, rival, judged),
-            math.sqrt(mean_of(self._predicted[name], judged)) if name in self._predicted else math.nan,
-            math.sqrt(mean_of(self._squares[name], judged)) if self._squares else math.nan,
-            self.relative_error(name, rival),
-            found.nis(name, judged),
-            correlation(self._errors[name], judged) if name in self._errors else UNKNOWN,
-        )
-
-
-def _likeliest(competitors: Sequence[Competitor]) -> Competitor:
-    """The one of largest log-likelihood; where nobody says any, the one of smallest error."""
-    known = [c for c in competitors if not math.isnan(c.log_likelihood)]
-    if not known:
-        return min(competitors, key=lambda c: (math.isnan(c.error), c.error))
-    return max(known, key=lambda c: c.log_likelihood)

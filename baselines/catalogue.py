@@ -46,8 +46,9 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
         ValueError: if the table names what is not there.
     """
     reference = {**table.references, **table.bounds}
-    if table.score_paper not in ("", *table.policies):
-        raise nearest("policy as score_paper", table.score_paper, table.policies)
+    for field in ("score_paper", "stronger_paper"):
+        if getattr(table, field) not in ("", *table.policies):
+            raise nearest(f"policy as {field}", getattr(table, field), table.policies)
     if table.score_reference not in ("", *reference):
         raise nearest("reference as score_reference", table.score_reference, reference)
     if table.fallback not in ("", *table.policies, *table.estimators):

@@ -57,8 +57,8 @@ class Mehra(MeasurementNoise):
         return adaptation.mehra(memory, innovation, P, LEAST * stated, available)
 
 
-class SageHusa(MeasurementNoise):
-    """By the fading mean square of the innovations.
+class FadingNoise(MeasurementNoise):
+    """Estimated with a memory that fades.
 
     Args:
         memory: measurements that count, ``1 / (1 - b)``.
@@ -67,6 +67,10 @@ class SageHusa(MeasurementNoise):
 
     def __init__(self, memory: float, trust: float | None = None) -> None:
         self.forgetting, self.trust = 1.0 - 1.0 / memory, memory if trust is None else trust
+
+
+class SageHusa(FadingNoise):
+    """By the fading mean square of the innovations; arguments as of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
         """Level at the stated variance."""
@@ -80,17 +84,17 @@ class SageHusa(MeasurementNoise):
         return level.value, level
 
 
-class VariationalBayes(SageHusa):
-    """By an inverse-gamma distribution; arguments as of :class:`SageHusa`, with ``rho`` for ``b``."""
+class VariationalBayes(FadingNoise):
+    """By an inverse-gamma distribution; arguments as of :class:`FadingNoise`, with ``rho`` for ``b``."""
 
     iterations = 2
 
-    def start(self, stated: Array) -> adaptation.InverseGamma:  # type: ignore[override]
+    def start(self, stated: Array) -> adaptation.InverseGamma:
         """Distribution about the stated variance."""
         shape = 0.5 * self.trust + 0.0 * stated
         return adaptation.InverseGamma(shape, shape * stated)
 
-    def update(  # type: ignore[override]
+    def update(
         self, memory: adaptation.InverseGamma, innovation: Array, P: Array, stated: Array, available: Array
     ) -> tuple[Array, adaptation.InverseGamma]:
         """Equations (6) and (7) of ``filters/noise_adaptation.py``."""

@@ -1,6 +1,6 @@
 """What belongs to an environment, found once where its id is given and handed down as one object."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import ModuleType
@@ -64,6 +64,15 @@ class Problem:
                 "score_paper names one"
             )
         return self.baselines.score_paper
+
+    def paper_among(self, names: Collection[str]) -> str:
+        """Return the name of the paper's algorithm that some competitors are compared with; empty: of none.
+
+        Args:
+            names: of the competitors: the stronger reading of the paper where it is among them.
+        """
+        stronger = self.baselines.stronger_paper
+        return stronger if stronger in names else self.baselines.score_paper
 
     @property
     def knows(self) -> dict[str, str]:
@@ -131,6 +140,7 @@ class Problem:
         """
         options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
         experiment = self.experiment(*arguments, **options, keywords=keywords)
+        experiment = replace(experiment, paper=self.paper_among(competitors))
         return run_experiment(experiment, competitors, progress, workers)
 
 

@@ -3,21 +3,25 @@ filter that is told the true model.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy
 
 from ..envs.contract.filter import Filter, Initial, Input, Likelihood, Track
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
-from ..envs.linear.state_space import Equations, Measurement, StateSpace, Truth
+from ..envs.linear.equations import Equations
+from ..envs.linear.state_space import Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
-from ..filters.innovation_update import kalman_gain, keep_received, unscented_update, update_with_gain
+from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
+SENSOR_NOISE = "_noise"
+"""Ends the name of a factor on R of a sensor."""
 UNCERTAIN = 1e-9
 """Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
 
@@ -81,13 +85,16 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
+        **sensor_noises: factors on R of some sensors, by their names with ``_noise``.
     """
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
         super().__init__(task)
         self.equations = task.believed[0]
         self.factor = process_noise
-        self.R = measurement_noise * self.equations.R[:, :, None]
+        self.R = self.equations.sensor_noise(measurement_noise, _by_sensor(sensor_noises))
 
     def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
@@ -95,9 +102,8 @@ class Extended(Filter[StateSpace, Measurement, Track]):
 
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
-        interval = given.measurement.interval
-        mean, carried = self.equations.carry(state.mean, state.covariance, interval)
-        Q = self.factor * self.equations.process_noise(interval)
+        mean, carried = self.equations.carry(state.mean, state.covariance, given.measurement)
+        Q = self.factor * self.equations.process_noise(mean, given.measurement)
         result = _update(self.equations, mean, carried + Q, self.R, given.measurement, self.xp)
         return Track(
             result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
@@ -107,17 +113,18 @@ class Extended(Filter[StateSpace, Measurement, Track]):
 def _update(
     equations: Equations, mean: Array, P: Array, R: Array, measurement: Measurement, xp: Any
 ) -> kalman.Update:
-    nu = _numbers(measurement, xp) - equations.measure(mean)
-    received = keep_received(nu, equations.measurement_matrix(mean), R, measurement.available)
-    return update_with_gain(mean, P, received, kalman_gain(P, received))
+    received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
+    return update_with_gain(mean, P, received, equations.gain(P, received))
 
 
 class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`."""
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
-        super().__init__(task, process_noise, measurement_noise)
-        usual = self.equations.model.process_noise(task.parameters.sampling_interval)
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
+        super().__init__(task, process_noise, measurement_noise, **sensor_noises)
+        usual = task.definition.usual_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Track:
@@ -127,22 +134,34 @@ class Unscented(Extended):
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update by sigma points."""
         measurement = given.measurement
-        interval = measurement.interval
         mean, spread = unscented.transform(
-            state.mean, state.covariance, lambda x: self.equations.move(x, interval)
+            state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
         )
-        Q = self.factor * self.equations.process_noise(interval)
-        z, h = _numbers(measurement, self.xp), self.equations.measure
-        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available)
+        spread = spread + self.equations.input_noise(state.mean, measurement)
+        Q = self.factor * self.equations.process_noise(mean, measurement)
+        own = self.equations
+        z, h, near = _numbers(measurement, self.xp), own.measure, own.measure(mean)
+
+        def h_near(x: Array) -> Array:
+            """Measurements of sigma points, angles near that of the mean."""
+            return near[:, None] + own.subtract(own.measure(x), near[:, None])
+
+        if own.wraps:
+            z, h = near + own.subtract(z, near), h_near
+        gates = own.within_gates if own.gated else None
+        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available, gates)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 
 class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
-    def __init__(self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0) -> None:
+    def __init__(
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+    ) -> None:
         super().__init__(task)
-        self.bank = HypothesisBank(task, "evidence", process_noise, measurement_noise)
+        factors = process_noise, measurement_noise
+        self.bank = HypothesisBank(task, "evidence", *factors, **_by_sensor(sensor_noises))
 
     def start(self, initial: Initial) -> Mixture:
         """Start where everyone starts."""
@@ -182,8 +201,8 @@ class KnownModel:
         xp, chosen = self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
-            mean, carried = equations.carry(*memory, measurement.interval)
-            P = carried + truth.process_noise * equations.process_noise(measurement.interval)
+            mean, carried = equations.carry(*memory, measurement)
+            P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = truth.measurement_noise * equations.R[:, :, None]
             result = _update(equations, mean, P, R, measurement, xp)
             held = truth.hypothesis == float(j)
@@ -197,11 +216,18 @@ class KnownModel:
         return *after, after, _likelihood(chosen, measurement.available, xp)
 
 
-class _Scales(NamedTuple):
-    """What is tuned: lower limit, value without tuning, upper limit."""
+def _by_sensor(noises: Mapping[str, Any]) -> dict[str, Any]:
+    """Factors by the names of the sensors."""
+    return {name.removesuffix(SENSOR_NOISE): factor for name, factor in noises.items()}
 
-    log10_process_noise: tuple[float, float, float] = (-4.0, 0.0, 4.0)
-    log10_measurement_noise: tuple[float, float, float] = (-2.0, 0.0, 2.0)
+
+def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
+    """What is tuned: lower limit, value without tuning, upper limit."""
+    channels = task.definition.channels
+    noises = (
+        [channel.name + SENSOR_NOISE for channel in channels] if len(channels) > 1 else ["measurement_noise"]
+    )
+    return {"log10_process_noise": (-4.0, 0.0, 4.0), **{f"log10_{name}": (-2.0, 0.0, 2.0) for name in noises}}
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:
@@ -224,6 +250,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         policies = {"imm": InteractingMultipleModel, **policies}
         estimators["kalman-imm"] = InteractingKalman
     paper = next(iter(policies))
+    families = {name: tunable(make, **_scales(task)) for name, make in estimators.items()}
     return Baselines(
         environment=task.id,
         policies=policies,
@@ -232,6 +259,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         score_paper=paper,
         score_reference="known-model",
         physical=("rmse", task.components[0].name),
-        tunable={name: tunable(make, **_Scales()._asdict()) for name, make in estimators.items()},
+        tunable=families,
+        log_families=lambda recording: families,  # their factors may be arrays: candidates run side by side
         benchmark=(*policies, *estimators, "known-model"),
     )

@@ -143,6 +143,9 @@ class Baselines:
     """Classes that keep the protocol :class:`.Smoother`: estimators that use later measurements."""
     score_paper: str = ""
     """The policy whose score is 0."""
+    stronger_paper: str = ""
+    """Another reading of the paper's algorithm, of less cost: where it takes part, costs are compared with it, and its
+    score is 0."""
     score_reference: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
@@ -154,6 +157,9 @@ class Baselines:
     measurement_seconds: float = 5e-6
     """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
     full benchmark."""
+    headline_episodes: int = 0
+    """Episodes of the training distribution at least where a benchmark is asked for narrow intervals; of costs whose
+    tails are heavy many."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None

@@ -29,7 +29,7 @@ class Tuned:
     scenario: str
     values: dict[str, float]
     cost: float
-    """Mean cost on the validation split."""
+    """Geometric mean of the costs of episodes of the validation split."""
     untuned_cost: float
     environment_steps: int
     seed: int

@@ -1,8 +1,9 @@
 """Tuning of classical competitors on training episodes, so that nothing learned is compared with a straw man.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
-values; every candidate meets the same episodes of the training split, so differences are not noise. The
-best candidate is kept by its cost on the validation split only if it beats the untuned values there.
+values; every candidate meets the same episodes of the training split, so differences are not noise. Costs are geometric
+means over the episodes, so that no lost track decides. The best candidate is kept only if it beats the untuned values
+significantly on episodes of the validation split.
 """
 
 import json
@@ -22,6 +23,7 @@ from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.running.parallel import Workers, check_workers
 from ..evaluation.running.rollout import Progress, run_competitor
 from ..evaluation.running.seeds import episode_seeds
+from ..evaluation.statistics.bootstrap import Bootstrap
 from ..evaluation.storage.store import Store, Work
 from .problem import Problem
 from .table import Tunable
@@ -57,16 +59,24 @@ def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
     return numpy.ascontiguousarray(found["cost"].T)
 
 
-def mean_cost(candidate: Candidate, workers: Workers | None = None) -> float:
-    """Mean uncapped cost of a candidate over its episodes, which the workers share."""
+def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy.ndarray:
+    """Mean cost of a candidate in each of its episodes, ``(episodes,)``; the workers share them."""
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
     costs = numpy.concatenate(workers.results(_costs, pieces), axis=1)
-    total = 0.0
-    for cost in costs:  # added up as if one process had run all episodes side by side
-        total += float(cost.sum())
-    return total / costs.size
+    found: numpy.ndarray = costs.mean(axis=0)
+    return found
+
+
+def geometric_cost(costs: numpy.ndarray) -> float:
+    """Geometric mean of the costs of episodes."""
+    return float(numpy.exp(numpy.log(costs).mean()))
+
+
+def is_better(costs: numpy.ndarray, others: numpy.ndarray) -> bool:
+    """Whether costs are significantly lower than others on the same episodes, by the geometric mean of their ratios."""
+    return Bootstrap(len(costs)).estimate(numpy.log(costs / others)).high < 0.0
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,8 @@ class Search:
     """Of the training episodes and of the search."""
     episodes: int = 256
     """Training episodes that every candidate meets."""
+    confirming: int = 2048
+    """Validation episodes on which the best candidate has to beat the untuned values."""
     backend: str = "auto"
     """What computes the steps, see :func:`~.envs.backend.task_on`."""
 
@@ -91,7 +103,7 @@ class _Generations:
     Args:
         tunable: what is searched.
         allowed: candidates that the budget is enough for.
-        measure: mean cost of a candidate's values.
+        measure: cost of a candidate's values.
     """
 
     def __init__(
@@ -196,18 +208,21 @@ def tune(
     def measure(values: Mapping[str, float]) -> float:
         name = f"{short_name(problem.id)}.{policy}"
         work = Work(name, json.dumps([*asked, values])) if problem.shipped else None
-        cost = store.result(work, float, lambda: mean_cost(candidate(values, train), workers))
+        cost = store.result(
+            work, float, lambda: geometric_cost(episode_costs(candidate(values, train), workers))
+        )
         progress(steps)
         return cost
 
     generations = _Generations(tunable, evaluations, measure)
     values = generations.run(population, numpy.random.default_rng(search.seed))
     # A winner among many candidates on the training episodes is flattered by them: ask fresh episodes.
-    fresh = episode_seeds("validation", search.seed, 4 * search.episodes)
-    untuned = mean_cost(candidate(tunable.start, fresh), workers)
-    cost = mean_cost(candidate(values, fresh), workers)
-    if untuned <= cost:
-        cost, values = untuned, dict(tunable.start)
+    fresh = episode_seeds("validation", search.seed, search.confirming)
+    before = episode_costs(candidate(tunable.start, fresh), workers)
+    after = episode_costs(candidate(values, fresh), workers)
+    if not is_better(after, before):
+        after, values = before, dict(tunable.start)
+    cost, untuned = geometric_cost(after), geometric_cost(before)
     kept = {name: round_value(value) for name, value in values.items()}
     store.clear()
     return Tuned(problem.id, policy, chosen.name, kept, cost, untuned, generations.spent * steps, search.seed)

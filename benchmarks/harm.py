@@ -2,10 +2,11 @@
 
 Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 500 --policy bptt
 
-Each agent flies alone and behind the gate (``gated:NAME``), beside the fallback of that gate, on the test split. A cell
-is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm, over
-paired episodes, lies above +2 % as a whole. A track counts as lost where an episode costs ten times what it costs the
-paper, and more than all but one in a hundred of the paper's episodes in that cell. ``--cells`` prints every cell.
+Each agent flies alone and behind the gate (``gated:NAME``), beside the fallback of that gate, on the test split. A
+cell is a scenario or a stress. Harm is counted where the 95 % interval of the cost against the paper's algorithm,
+geometric mean of the episodes' ratios, lies above +2 % as a whole. A track counts as lost where an episode costs ten
+times what it costs the paper, and more than all but one in a hundred of the paper's episodes in that cell.
+``--cells`` prints every cell.
 """
 
 import argparse
@@ -75,7 +76,7 @@ def fly(
     beyond, found = numpy.quantile(paper, 0.99), {}
     for policy in makers:
         cost = mean_cost(run, policy)
-        ratio = bootstrap.relative_difference(bootstrap.means(cost), bootstrap.means(paper))
+        ratio = bootstrap.geometric_difference(cost, paper)
         lost = int(((cost > LOST * paper) & (cost > beyond)).sum())
         anees = float(run["nees"].sel(policy=policy).mean()) / run.sizes["component"]
         low, middle, high = float(ratio[1]), float(ratio[0]), float(ratio[2])

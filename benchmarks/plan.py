@@ -47,7 +47,7 @@ from filtergym.agents.training_run import FILES, RunOptions, new_run
 from filtergym.agents.training_session import Bookkeeping, Session
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
-from filtergym.baselines.tuning import Candidate, mean_cost
+from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.envs.engine.catalogue import bare_name, catalogue, short_name
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.running.curves import DISTRIBUTION_LIMIT
@@ -253,8 +253,8 @@ def tuning_seconds(id: str, name: str, kept: dict[str, Any]) -> float:
     seeds = episode_seeds("train", 0, CANDIDATE)
     # Each candidate has other values, and so may have to be compiled.
     middle = {value: 0.5 * (low + high) for value, (low, high) in tunable.limits.items()}
-    mean_cost(Candidate(problem_of(id), scenario, tunable, tunable.start, seeds))
-    seconds = spent(lambda: mean_cost(Candidate(problem_of(id), scenario, tunable, middle, seeds)))[1]
+    episode_costs(Candidate(problem_of(id), scenario, tunable, tunable.start, seeds))
+    seconds = spent(lambda: episode_costs(Candidate(problem_of(id), scenario, tunable, middle, seeds)))[1]
     task = make_task(catalogue()[id], scenario)
     candidates = kept["environment_steps"] / (CANDIDATE * (task.horizon // task.decision_interval))
     return (candidates + 8.0) * seconds

@@ -22,12 +22,10 @@ import numpy
 from .interpretation import first_steps
 from .parts import FREE, Statement, cut_parts, scratch_slots
 from .program import Program
-from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Rolled, roll, steady
+from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, roll_where_shorter, steady
 
 PART = 200
 """Statements of a function."""
-SHORTER = 1.5
-"""Straight statements that are as long, compiled, as a statement in a loop with its tables."""
 ROWS = 32
 """Entries of tables that a second loop must save."""
 WIDTH = 100
@@ -518,7 +516,7 @@ def write_program(
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
     ]
-    rolled = None if arrays is None else _shorter(program, results if between else 0, count_operations)
+    rolled = None if arrays is None else roll_where_shorter(program, results if between else 0)
     if arrays is not None and rolled is not None:
         loops = _Loops(program, name, read, write, arrays, scalar, tables, qualifier)
         blocks, before = _packed([loops.loop(loop) for loop in rolled.loops], rolled.before)
@@ -551,13 +549,6 @@ def write_program(
     ]
     replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
     return Source("\n".join(defined), body, count_operations, count, replaced)
-
-
-def _shorter(program: Program, results: int, operations: int) -> Rolled | None:
-    """A program as loops, where they are less text than a straight line of so many operations."""
-    rolled = roll(program, results)
-    statements = sum(len(loop.body) for loop in rolled.loops)
-    return rolled if SHORTER * statements < operations + len(program.results) else None
 
 
 def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:

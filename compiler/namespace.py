@@ -194,12 +194,10 @@ def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None
 def _elementwise(name: str, arrays: Sequence[Traced], dtype: Any) -> Traced:
     graph = _OPEN.get()
     graph.begin_group()
-    node = graph.node
     spread = (
         numpy.broadcast_arrays(*(array.nodes for array in arrays)) if len(arrays) > 1 else [arrays[0].nodes]
     )
-    columns = [part.ravel().tolist() for part in spread]
-    made = [node(name, *row) for row in zip(*columns, strict=True)]
+    made = graph.nodes(name, [part.ravel() for part in spread])
     return Traced(numpy.array(made, dtype=numpy.int64).reshape(spread[0].shape), dtype)
 
 

@@ -3,6 +3,7 @@
 import contextvars
 import ctypes
 import functools
+import hashlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from . import cache
+import numpy
+
+from . import cache, emission
 from .block import LANES, block_for, block_of
 from .emission import emit, product_symbol, product_text
 from .library import Library, fastest
@@ -82,17 +85,19 @@ class Setting(NamedTuple):
     """Statements of a part."""
     level: int
     """Of LLVM's optimisation of code."""
+    loops: bool = False
+    """Whether a long program is computed in loops."""
 
 
-def quick_setting(features: str, has_loops: bool) -> Setting:
-    """Return the setting that takes LLVM the least time: no optimisation, blocks of one register; with loops those of
-    the fastest code, as the product of a matrix takes twice as long in half of a block.
+def quick_setting(features: str, has_products: bool) -> Setting:
+    """Return the setting that takes LLVM the least time: no optimisation, loops, blocks of one register; with products
+    of matrices those of the fastest code, as a product takes twice as long in half of a block.
 
     Args:
         features: of the processor.
-        has_loops: whether the program multiplies with matrices.
+        has_products: whether the program multiplies with matrices.
     """
-    return Setting(LANES if has_loops else block_for(features).lanes, 150, 0)
+    return Setting(LANES if has_products else block_for(features).lanes, 150, 0, loops=not has_products)
 
 
 OPTIMISED = Setting(LANES, 200, 1)
@@ -100,8 +105,24 @@ OPTIMISED = Setting(LANES, 200, 1)
 HOT = 2_000_000
 """Lanes after which a program is worth the time that optimisation takes: three to five times that of the quick setting,
 for code that takes up to a third less. Both are in proportion to the program's length, so the lanes are not."""
-LONG = 20_000
-"""Steps of a program from which on optimisation saves nothing: its numbers do not fit into the nearest caches."""
+IN_LOOPS = 4
+"""How many times sooner that is so where the quick code is loops, which take 1.2 to 2 times as long."""
+LONG, LONGEST = 20_000, 100_000
+"""Steps of a program from which on optimisation saves nothing, because its numbers do not fit into the nearest caches;
+and from which on a straight line saves nothing either, because its code does not."""
+
+
+def better_setting(quick: Setting, steps: int, in_loops: bool) -> Setting | None:
+    """Return the setting of the fastest code; None: it is the quick one.
+
+    Args:
+        quick: the quick one.
+        steps: of the program.
+        in_loops: whether the quick code is loops.
+    """
+    if steps < LONG:
+        return OPTIMISED
+    return quick._replace(loops=False) if in_loops and steps < LONGEST else None
 
 
 Native = Callable[[int, int, int], None]
@@ -136,19 +157,22 @@ def optimised_code() -> Iterator[None]:
 class Code:
     """Code of a program, called as :data:`Native`.
 
-    A program is compiled quickly first, and with optimisation once it has run over two million lanes, unless it has
-    20,000 steps or more, which gain nothing.
+    A program is compiled quickly first, and better once it has run over many lanes, where that gains anything.
 
     Args:
         run: the code.
         optimise: makes better code; None: there is none.
+        hot: lanes after which it is made.
 
     Attributes:
         run: the code of now.
     """
 
-    def __init__(self, run: Native, optimise: Callable[[], Native] | None = None) -> None:
+    def __init__(
+        self, run: Native, optimise: Callable[[], Native] | None = None, hot: int | None = None
+    ) -> None:
         self.run, self._optimise, self._lanes = run, optimise, 0
+        self._hot = HOT if hot is None else hot
 
     def __call__(self, table: int, first: int, last: int) -> None:
         """Run from one lane to another."""
@@ -157,7 +181,7 @@ class Code:
     def expect(self, lanes: int) -> None:
         """Prepare to run over so many lanes: make better code where it has become worth its time."""
         self._lanes += lanes
-        if self._optimise is not None and (self._lanes > HOT or _EAGER.get()):
+        if self._optimise is not None and (self._lanes > self._hot or _EAGER.get()):
             optimise, self._optimise = self._optimise, None
             self.run = optimise()
 
@@ -174,32 +198,32 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         binding, (_, features) = llvm(), processor()
         library = library or fastest(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
-        # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
-        steps, results = ([tuple(entry) for entry in entries] for entries in (program.steps, program.results))
-        has_loops = any(step.operation == "product" for step in program.steps)
-        quick = quick_setting(features, has_loops)
-        made_of = repr((steps, results, list(lane_first), symbols)), _own_text()
-        key = _key(*made_of, repr(quick))
+        has_products = any(step.operation == "product" for step in program.steps)
+        quick = quick_setting(features, has_products)
+        in_loops = quick.loops and len(program.steps) >= emission.LONG
+        better = better_setting(quick, len(program.steps), in_loops)
+        made_of = _text_of(program), repr((list(lane_first), symbols)), _own_text()
+        key, better_key = (_key(*made_of, repr(setting)) for setting in (quick, better))
         if key not in _CODES:
             for own in library.functions.values():
                 binding.add_symbol(own.symbol, own.address)
 
             def code(setting: Setting, key: str) -> Native:
                 with LOCK:
-                    block, part = block_of(setting.lanes), setting.part
-                    if has_loops:
+                    block = block_of(setting.lanes)
+                    if has_products:
                         product = native_text(product_text(block), PRODUCT)
                         binding.add_symbol(product_symbol(block), address_of_code(product))
+                    form = block, setting.part, setting.loops
                     return _load(
-                        key, lambda: emit(program, lane_first, library, block, part), NATIVE, setting.level
+                        key, lambda: emit(program, lane_first, library, *form), NATIVE, setting.level
                     )
 
-            better = _key(*made_of, repr(OPTIMISED))
-            if cache.holds(better) or (_EAGER.get() and len(steps) < LONG):
-                _CODES[key] = Code(code(OPTIMISED, better))
+            if better is not None and (cache.holds(better_key) or _EAGER.get()):
+                _CODES[key] = Code(code(better, better_key))
             else:
-                optimise = functools.partial(code, OPTIMISED, better) if len(steps) < LONG else None
-                _CODES[key] = Code(code(quick, key), optimise)
+                optimise = None if better is None else functools.partial(code, better, better_key)
+                _CODES[key] = Code(code(quick, key), optimise, HOT // IN_LOOPS if in_loops else HOT)
         return _CODES[key]
 
 
@@ -223,6 +247,18 @@ def native_text(text: str, signature: Any = NATIVE) -> Any:
 def _key(*texts: str) -> str:
     """Name of the code that is made of some texts for this processor."""
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
+
+
+def _text_of(program: Program) -> str:
+    """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
+    and other numbers leave it as it is.
+    """
+    operations = " ".join([step[0] for step in program.steps])
+    arguments = numpy.fromiter(
+        (number for step in program.steps for number in (len(step[1]), *step[1], step[2])), dtype=numpy.int64
+    )
+    results = numpy.array(program.results, dtype=numpy.int64)
+    return operations + hashlib.sha256(arguments.tobytes() + results.tobytes()).hexdigest()
 
 
 @functools.cache

@@ -10,7 +10,9 @@ that every bit is.
 import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+import numpy
 
 from .interpretation import first_steps
 from .parts import FREE
@@ -20,9 +22,11 @@ LEAST = 3
 """Members of a statement: fewer are statements of their own."""
 MOST = 100
 """Statements of a loop."""
-SCRATCH, CONSTANTS, TURN = -1, -2, -3
-"""In place of an argument: the scratch array, the constants, and what a statement of the same loop has computed in the
-same turn."""
+SHORTER = 1.5
+"""Straight statements that are as long, compiled, as a statement in a loop with its tables."""
+SCRATCH, CONSTANTS, TURN, COMPUTED = -1, -2, -3, -4
+"""In place of an argument: the scratch array, the constants, what a statement of the same loop has computed in the same
+turn, and what is computed at all."""
 
 
 class Operand(NamedTuple):
@@ -74,8 +78,8 @@ class _Draft:
     def __init__(
         self,
         operation: str,
-        members: Sequence[int],
-        columns: Sequence[Sequence[int]],
+        members: numpy.ndarray,
+        columns: Sequence[numpy.ndarray],
         late: bool,
         logical: bool,
     ) -> None:
@@ -95,7 +99,14 @@ class _Roller:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
         self.drafts: list[_Draft] = []
-        self.where: dict[int, tuple[int, int]] = {}
+        self.group, self.order = numpy.array(program.origins, dtype=numpy.int64).reshape(-1, 2).T
+        self.logical = numpy.array([logical for _, _, logical in self.steps], dtype=bool)
+        # Where a free step's number is found, and at which place there; what others are made of, -1 where of less.
+        self.source, self.place = numpy.full((2, len(self.steps)), COMPUTED)
+        self.parts = numpy.full((len(self.steps), 3), -1)
+        self._read_steps()
+        # Statement of a step, and which member it is there.
+        self.statement, self.member = numpy.full((2, len(self.steps)), -1)
         for members in self._alike():
             self._compute(members)
         early = program.results[:results]
@@ -107,53 +118,82 @@ class _Roller:
                 self._write(argument, nodes, late)
         self._copy_what_is_mixed()
 
+    def _read_steps(self) -> None:
+        """Put steps into arrays, operation by operation."""
+        operations = [operation for operation, _, _ in self.steps]
+        arguments = [given for _, given, _ in self.steps]
+        self.names = sorted(set(operations))
+        numbers = {name: number for number, name in enumerate(self.names)}
+        self.kinds = numpy.array([numbers[name] for name in operations], dtype=numpy.int64)
+        self.tables = numpy.zeros(len(self.steps), dtype=numpy.int64)
+        for name, number in numbers.items():
+            there = numpy.flatnonzero(self.kinds == number)
+            given = numpy.array([arguments[index] for index in there.tolist()], dtype=numpy.int64)
+            if name == "constant":
+                self.source[there], self.place[there] = CONSTANTS, given[:, 0]
+            elif name == "input":
+                self.source[there], self.place[there] = given.T
+            elif name == "take":
+                self.tables[there], self.parts[there, 0] = given[:, 0], given[:, 2]
+            else:
+                self.parts[there, : given.shape[1]] = given
+
     def _add(self, draft: _Draft) -> None:
-        for k, step in enumerate(draft.members):
-            self.where[step] = len(self.drafts), k
+        if len(draft.members):
+            self.statement[draft.members] = len(self.drafts)
+            self.member[draft.members] = numpy.arange(draft.count)
         self.drafts.append(draft)
 
     # --- what becomes a statement
 
-    def _alike(self) -> Iterator[list[int]]:
+    def _alike(self) -> Iterator[numpy.ndarray]:
         """Steps of one array operation with one form, in the order of that operation."""
-        steps, origins = self.steps, self.program.origins
-        levels = [0] * len(steps)
-        found: dict[Any, list[int]] = {}
-        for index, step in enumerate(steps):
-            if step.operation in FREE:
-                continue
-            group = origins[index][0]
-            # What one operation makes in several steps.
-            levels[index] = max((levels[x] + 1 for x in step.parts if origins[x][0] == group), default=0)
-            extremes = step.operation in ("maximum", "minimum")
-            known = tuple(extremes and steps[x].operation == "constant" for x in step.parts)
-            truths = tuple(steps[x].logical for x in step.parts)
-            table = step.arguments[:2] if step.operation == "take" else ()
-            key = (
-                index >= self.pause,
-                group,
-                levels[index],
-                step.operation,
-                step.logical,
-                known,
-                truths,
-                table,
-            )
-            found.setdefault(key, []).append(index)
-        for key in sorted(found, key=lambda key: key[:3]):
-            members = sorted(found[key], key=lambda index: origins[index][1])
+        parts = self.parts
+        computed = numpy.flatnonzero(self.source == COMPUTED)
+        if not len(computed):
+            return
+        own_kinds = self.kinds[computed]
+        extremes = [number for number, kind in enumerate(self.names) if kind in ("maximum", "minimum")]
+        extreme = numpy.isin(own_kinds, extremes)
+        own = parts[computed]
+        known = (self.source[own] == CONSTANTS) & extreme[:, None] & (own >= 0)
+        flags = numpy.column_stack([known, self.logical[own] & (own >= 0), self.logical[computed]])
+        form = flags @ (1 << numpy.arange(flags.shape[1]))
+        keys = numpy.stack(
+            [
+                own_kinds,
+                self.tables[computed],
+                form,
+                self._levels()[computed],
+                self.group[computed],
+                computed >= self.pause,
+            ]
+        )
+        order = numpy.lexsort([self.order[computed], *keys])
+        sorted_keys = keys[:, order]
+        cuts = numpy.flatnonzero((sorted_keys[:, 1:] != sorted_keys[:, :-1]).any(axis=0)) + 1
+        for members in numpy.split(computed[order], cuts):
             if len(members) < LEAST:
-                yield from ([index] for index in members)
+                yield from numpy.split(members, len(members))
             else:
                 yield members
 
-    def _compute(self, members: list[int]) -> None:
+    def _levels(self) -> numpy.ndarray:
+        """Of what one operation makes in several steps: how many come before."""
+        inside = (self.parts >= 0) & (self.group[self.parts] == self.group[:, None])
+        inside &= self.source[self.parts] == COMPUTED
+        levels = numpy.zeros(len(self.steps), dtype=numpy.int64)
+        for index in numpy.flatnonzero(inside.any(axis=1)).tolist():
+            levels[index] = levels[self.parts[index][inside[index]]].max() + 1
+        return levels
+
+    def _compute(self, members: numpy.ndarray) -> None:
         first = self.steps[members[0]]
-        columns = list(zip(*(self.steps[index].parts for index in members), strict=True))
-        draft = _Draft(first.operation, members, columns, members[0] >= self.pause, first.logical)
+        columns = list(self.parts[members].T[: len(first.parts)])
+        draft = _Draft(first.operation, members, columns, bool(members[0] >= self.pause), first.logical)
         if first.operation == "take":
             draft.table = first.arguments[0], first.arguments[1]
-        draft.group = self.program.origins[members[0]][0]
+        draft.group = int(self.group[members[0]])
         self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
@@ -161,9 +201,8 @@ class _Roller:
         by_draft: dict[int, list[tuple[int, int]]] = {}
         rest = []
         for row, step in sorted(nodes.items()):
-            if step in self.where:
-                draft, k = self.where[step]
-                by_draft.setdefault(draft, []).append((k, row))
+            if self.statement[step] >= 0:
+                by_draft.setdefault(int(self.statement[step]), []).append((int(self.member[step]), row))
             else:
                 rest.append(row)
         for number, pairs in by_draft.items():
@@ -176,33 +215,27 @@ class _Roller:
             self._copy_out(argument, rows, nodes, late)
 
     def _copy_out(self, argument: int, rows: list[int], nodes: dict[int, int], late: bool) -> None:
-        column = [nodes[row] for row in rows]
-        draft = _Draft("copy", (), [column], late, all(self.steps[x].logical for x in column))
+        column = numpy.array([nodes[row] for row in rows])
+        draft = _Draft("copy", column[:0], [column], late, bool(self.logical[column].all()))
         draft.results.append(Operand(argument, tuple(rows), draft.logical))
         self._add(draft)
 
-    def _source(self, column: Sequence[int]) -> int | None:
+    def _source(self, column: numpy.ndarray) -> int | None:
         """Argument or constants that a whole operand is read from; None: the scratch array."""
-        kinds = {self.steps[x].operation for x in column}
-        if kinds == {"constant"}:
-            return CONSTANTS
-        arguments = {self.steps[x].arguments[0] for x in column}
-        return arguments.pop() if kinds == {"input"} and len(arguments) == 1 else None
+        source = int(self.source[column[0]])
+        if source == COMPUTED or (len(column) > 1 and (self.source[column] != source).any()):
+            return None
+        return source
 
     def _copy_what_is_mixed(self) -> None:
         """Inputs and constants that stand beside other values in an operand are copied to the scratch array, once."""
         for late in (False, True):
-            sources: dict[int, set[int]] = {}
-            for draft in self.drafts:
-                for column in draft.columns:
-                    if draft.late == late and self._source(column) is None:
-                        for x in column:
-                            if x not in self.where:
-                                source = self._source([x])
-                                assert source is not None
-                                sources.setdefault(source, set()).add(x)
-            for _, inputs in sorted(sources.items()):
-                members = sorted(inputs, key=lambda x: (self.steps[x].arguments, x))
+            columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
+            mixed = [column[self.statement[column] < 0] for column in columns if self._source(column) is None]
+            free = numpy.unique(numpy.concatenate(mixed)) if mixed else numpy.zeros(0, dtype=numpy.int64)
+            for source in numpy.unique(self.source[free]):
+                inputs = free[self.source[free] == source]
+                members = inputs[numpy.argsort(self.place[inputs], kind="stable")]
                 draft = _Draft("copy", members, [members], late, False)
                 draft.group = -1 - len(self.drafts)
                 self._add(draft)
@@ -215,14 +248,18 @@ class _Roller:
         for column in draft.columns:
             if self._source(column) is None:
                 turn = self._same_turn(column)
-                for number in {self.where[x][0] for x in column}:
+                for number in self._statements(column):
                     needs[number] = needs.get(number, True) and number == turn
         return needs
 
-    def _same_turn(self, column: Sequence[int]) -> int | None:
+    def _statements(self, column: numpy.ndarray) -> set[int]:
+        """Statements whose members these are."""
+        return set(self.statement[column].tolist())
+
+    def _same_turn(self, column: numpy.ndarray) -> int | None:
         """Statement whose members these are, one by one."""
-        number = self.where[column[0]][0]
-        return number if list(column) == list(self.drafts[number].members) else None
+        number = int(self.statement[column[0]])
+        return number if numpy.array_equal(column, self.drafts[number].members) else None
 
     def schedule(self) -> list[list[int]]:
         """Put every statement into a loop with others of its count, as early as what it takes allows."""
@@ -280,26 +317,24 @@ class _Roller:
                 if turn is not None and drafts[turn].loop == draft.loop:
                     turns[number, i] = turn
                     continue
-                for other in {self.where[x][0] for x in column}:
+                for other in self._statements(column):
                     kept.add(other)
                     group = drafts[other].group
                     last[group] = max(last.get(group, 0), draft.loop)
         at, scratch = self._slots(kept, last)
+        computed = numpy.flatnonzero(self.statement >= 0)
+        first = numpy.array([at.get(number, 0) for number in range(len(drafts))], dtype=numpy.int64)
+        own_places = numpy.zeros(len(self.steps), dtype=numpy.int64)
+        own_places[computed] = first[self.statement[computed]] + self.member[computed]
 
-        def operand(number: int, i: int, column: Sequence[int]) -> Operand:
-            logical = (
-                drafts[number].logical
-                if drafts[number].operation == "copy"
-                else self.steps[column[0]].logical
-            )
+        def operand(number: int, i: int, column: numpy.ndarray) -> Operand:
+            copied = drafts[number].operation == "copy"
+            logical = drafts[number].logical if copied else bool(self.logical[column[0]])
             if (number, i) in turns:
                 return Operand(TURN, (turns[number, i],), logical)
             source = self._source(column)
-            if source is None:
-                places = [self.where[x] for x in column]
-                return Operand(SCRATCH, tuple(at[other] + k for other, k in places), logical)
-            place = 0 if source == CONSTANTS else 1
-            return Operand(source, tuple(self.steps[x].arguments[place] for x in column), logical)
+            places = own_places if source is None else self.place
+            return Operand(SCRATCH if source is None else source, tuple(places[column].tolist()), logical)
 
         def statement(number: int) -> Statement:
             draft = drafts[number]
@@ -349,6 +384,21 @@ def roll(program: Program, results: int = 0) -> Rolled:
         results: first results that are written before any other input than theirs is read.
     """
     return _Roller(program, results).finish()
+
+
+def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
+    """Roll a program up where that makes less code; None: it stays a straight line.
+
+    Args:
+        program: with origins.
+        results: as :func:`roll` has it.
+    """
+    if any(step.operation == "product" for step in program.steps):
+        return None
+    operations = sum(step.operation not in FREE for step in program.steps)
+    rolled = roll(program, results)
+    statements = sum(len(loop.body) for loop in rolled.loops)
+    return rolled if SHORTER * statements < operations + len(program.results) else None
 
 
 def steady(places: Sequence[int]) -> int | None:

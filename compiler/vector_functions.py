@@ -33,7 +33,7 @@ class VectorFunction:
 
     Args:
         function: takes an array ``(n + g,)`` and returns a sequence or an array of m numbers; or a matrix ``(m, n)``.
-        size: n.
+        size: n; of a function without a derivative 0.
         given: further numbers that the function takes after these, without a derivative, g; at first there are none.
 
     Attributes:
@@ -56,7 +56,7 @@ class VectorFunction:
             shape = answer.shape
             gradients = [
                 pullback(graph, [answer[i]], [namespace.asarray(1.0)], [x])[0]
-                for i in range(len(answer) if len(shape) == 1 else 0)
+                for i in range(len(answer) if size and len(shape) == 1 else 0)
             ]
         if len(shape) != 1:
             raise ValueError(

@@ -71,6 +71,8 @@ if TYPE_CHECKING:
     from .envs.data.recording import Recording
     from .envs.data.trajectory import Trajectory
     from .envs.engine.scenario_choice import read_recording
+    from .envs.linear.inputs import Input
+    from .envs.linear.sensors import Sensor
     from .evaluation.competitors.kinds import FunctionPolicy
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
@@ -80,8 +82,10 @@ __version__ = "0.1.0"
 __all__ = [
     "Flights",
     "FunctionPolicy",
+    "Input",
     "Likelihood",
     "Recording",
+    "Sensor",
     "Trajectory",
     "evaluate",
     "make_policy",
@@ -100,6 +104,8 @@ MODULES = {
     "envs.data.recording": ("Recording",),
     "envs.engine.scenario_choice": ("read_recording",),
     "envs.data.trajectory": ("Trajectory",),
+    "envs.linear.inputs": ("Input",),
+    "envs.linear.sensors": ("Sensor",),
     "evaluation.competitors.kinds": ("FunctionPolicy",),
     "live": ("online",),
     "names": ("evaluate", "make_policy", "record", "tidy_records"),

@@ -45,7 +45,6 @@ GROUPS: Mapping[str, Commands] = {
     "Tune and train": {
         "tune": "improve:tune_policy",
         "train": "improve:train",
-        "search": "improve:search",
     },
     "Share": {
         "report": "report:make",

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
-from .envs.contract.live_input import Feed
 from .envs.contract.parameters import Limits, check
+from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
 from .evaluation.competitors.kinds import kind_of, make_competitor

@@ -1,6 +1,7 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
 from .envs.interface.environment import TaskEnv
 from .envs.interface.vector_environment import TaskVectorEnv
+from .evaluation.competitors.isolation import ISOLATED, isolate_estimator
 from .evaluation.competitors.kinds import check_competitor, kind_of, make_competitor
+from .evaluation.competitors.programs import EXEC, Program
 from .evaluation.competitors.stepping import SteppingPolicy
 from .evaluation.running import metrics
 from .evaluation.running.evaluate import Experiment, check_observation, control_of
@@ -37,7 +40,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
-            ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
+            ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's,
+            ``isolated:module:Class`` of an estimator in a process of its own, ``exec:COMMAND`` of any program, or
             ``gated:NAME`` of a policy: an estimator that answers with that one's filter while it is trusted, else with
             a classical filter. A path is that of a file or folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
@@ -50,6 +54,10 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
     """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
+    if isinstance(name, str) and name.startswith(EXEC):
+        return Program(name.removeprefix(EXEC))
+    if isinstance(name, str) and name.startswith(ISOLATED):
+        return isolate_estimator(name.removeprefix(ISOLATED))
     if isinstance(name, Path) and name.name.endswith(SUFFIX):
         return _find_advised(problem, name)
     if isinstance(name, Path):
@@ -108,6 +116,15 @@ def assumed_parameters(env: str | None, names: Sequence[str]) -> dict[str, float
             if log is not None and log.assumed:
                 return log.assumed
     return {}
+
+
+def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
+    """Return names of competitors, where each ``module:Class`` is one in a process of its own."""
+    known = (EXEC, ISOLATED)
+    return [
+        ISOLATED + name if ":" in name and name not in problem.names and not name.startswith(known) else name
+        for name in names
+    ]
 
 
 def is_learned(problem: Problem, name: str) -> bool:
@@ -255,6 +272,7 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
+    experiment = replace(experiment, paper=problem.paper_among(makers))
     own, horizon = problem.baselines.metrics, experiment.make_task().horizon
     return [
         EvaluationRequest(experiment, name, maker, own, horizon, curves=curves)

@@ -2,7 +2,8 @@
 
 A file is JSON of declared types. Nothing in it is compressed, so that it is as large as it looks, and nothing in it
 names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and executes nothing. An estimator is its source
-text, which runs only where the reader says that it is trusted. A competitor of this package is its name.
+text, which runs only where the reader says that it is trusted, and then in a process that is told what is measured and
+nothing else (:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
 
 Whoever runs a file again finds the same numbers but for rounding: the noise of an episode is a function of its seed.
 Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
@@ -13,10 +14,11 @@ next power of ten.
 
 import hashlib
 import inspect
+import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -25,11 +27,11 @@ from .agents.learned_policy import load_policy, pretrained_path
 from .agents.named_policies import pretrained_agents
 from .agents.training_run import best_agent, training_scenarios
 from .baselines.problem import Problem, problem_of
-from .envs.contract.failures import own_line
 from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import import_user_module, nearest
 from .envs.engine.scenario_choice import find_mixture
-from .evaluation.competitors.kinds import RANKED, check_competitor, kind_of
+from .evaluation.competitors.isolation import isolate_source
+from .evaluation.competitors.kinds import RANKED, kind_of
 from .evaluation.running.parallel import Workers
 from .evaluation.running.rollout import Progress
 from .evaluation.running.summary import EvaluationRequest, combine_summaries, summaries
@@ -46,7 +48,9 @@ OWN = "submission"
 """Name of a submission among the competitors of its evaluation."""
 TIME = "nanoseconds"
 """The metric that differs from run to run: it is told, and not compared."""
-RATIOS = ("relative_cost_difference", "median_cost_ratio", "win_rate", "anees", "lost_episodes")
+RATIOS = (
+    "geometric_cost_difference", "lost_tracks", "relative_cost_difference", "anees", "lost_episodes",
+)  # fmt: skip
 """Metrics whose scale is one."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""
@@ -100,7 +104,7 @@ class Arrays(_Stored, frozen=True, tag="arrays"):
 
 
 class Source(_Stored, frozen=True, tag="source"):
-    """An estimator or a policy: one file of Python, and the name of the class in it."""
+    """An estimator: one file of Python, and the name of the class in it. It runs in a process of its own."""
 
     text: str
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_]\w{0,99}\Z")]
@@ -236,6 +240,10 @@ def pack(problem: Problem, name: str) -> Arrays | Source | Shipped:
             "competitor to submit", name, [*problem.baselines.names, *pretrained_agents(problem.id)]
         )
     found = import_user_module(module, f"cannot submit {name!r}")
+    if colon and kind_of(getattr(found, attribute, None)) != "estimator":
+        raise ValueError(
+            f"cannot submit {name!r}: what is handed in as source is an estimator, with start and update"
+        )
     try:
         text = inspect.getsource(found)
     except (OSError, TypeError) as error:
@@ -265,8 +273,8 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
                 f"{path} holds source code, and to verify it is to execute it: read it (--source FILE writes it), and "
                 "if you trust it add --trust"
             )
-        found = _run_source(held, path)
-    elif held.name in problem.baselines.names:
+        return isolate_source(held.text, held.name, f"source of {path}")
+    if held.name in problem.baselines.names:
         found = problem.competitor(held.name)
     else:
         raise nearest("competitor", held.name, problem.baselines.names)
@@ -274,10 +282,6 @@ def unpack(problem: Problem, submission: Submission, path: Path, trust: bool = F
         raise ValueError(
             f"{path} holds a {kind_of(found)}, which may know what no sensor says: only policies and estimators can be "
             "submitted"
-        )
-    if isinstance(held, Source) and getattr(found, "task_keywords", None):
-        raise ValueError(
-            f"{path} asks for parameters of its own, task_keywords: a submission takes the environment as it is"
         )
     return found
 
@@ -313,22 +317,6 @@ def _check_trained(problem: Problem, scenario: Any) -> None:
         if not (isinstance(name, str) and name in problem.task.scenarios):
             raise nearest("scenario", name, problem.task.scenarios)
         training_scenarios(problem.task, name)
-
-
-def _run_source(held: Source, path: Path) -> Any:
-    """Execute source text and return the class that it names."""
-    module = ModuleType(
-        f"{__name__}.source"
-    )  # nobody finds it by this name: other processes get the class itself
-    try:
-        exec(compile(held.text, f"<source of {path}>", "exec", dont_inherit=True), module.__dict__)
-    except Exception as error:  # a module is a program: it can raise anything
-        raise ValueError(
-            f"cannot run the source of {path}: {type(error).__name__}: {error}{own_line(error)}"
-        ) from error
-    if held.name not in module.__dict__:
-        raise ValueError(f"the source of {path} has no {held.name!r}")
-    return check_competitor(held.name, module.__dict__[held.name])
 
 
 # --- runs
@@ -467,9 +455,11 @@ def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
         return Deviation(float("inf"), f"its results are not those of its protocol: {which}")
     for key, numbers in known.items():
         for one, other, which in zip(said[key], numbers, ("", "lower end of ", "upper end of "), strict=True):
-            size = 0.0 if one is None and other is None else float("inf")
+            size = 0.0 if one is None and other is None and which else float("inf")
             if one is not None and other is not None:
                 size = abs(one - other) / (TOLERANCE * (abs(other) + (key[1] in RATIOS)) or 1.0)
+            if math.isnan(size):  # what is no number never holds
+                size = math.inf
             if size > worst.size:
                 name = f"{which}{key[1]} {key[2]}".rstrip()
                 worst = Deviation(

@@ -19,7 +19,7 @@ from .gaussian import log_density
 from .kalman import Update
 from .ordered_sums import ordered_sum
 from .small_matrices import apply, mirror_lower, product, solve_definite, transpose
-from .unscented import GAUSSIAN, Spread, transform
+from .unscented import transform
 
 
 class Received(NamedTuple):
@@ -96,7 +96,7 @@ def unscented_update(
     h: Callable[[Array], Array],
     R: Array,
     available: Array,
-    spread: Spread = GAUSSIAN,
+    within_gates: Callable[[Array, Array], Array] | None = None,
 ) -> Update:
     """Measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
     Proceedings of the IEEE 92 (2004), 401-422.
@@ -108,19 +108,24 @@ def unscented_update(
         h: from points ``(n, 2n + 1, N)`` to measurements ``(m, 2n + 1, N)``.
         R: ``(m, m)`` or ``(m, m, N)``.
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
-        spread: parameters of the transform.
+        within_gates: from innovation ``(m, N)`` and its covariance to 1 for entries that are taken in, else 0,
+            ``(m, N)``; the likelihood counts the others all the same. None: all are.
     """
     xp = namespace(mean)
     n = mean.shape[0]
     R = R[..., None] if R.ndim == 2 else R
-    joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
+    joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]))
     nu = available * (z - joint[n:])
     S = _independent(spread_out[n:, n:] + R, available)
     cross = available[:, None] * spread_out[n:, :n]
-    K = transpose(solve_definite(S, cross))
+    gated, taken = S, nu
+    if within_gates is not None:
+        kept = within_gates(nu, S)
+        gated, taken, cross = _independent(S, kept), kept * nu, kept[:, None] * cross
+    K = transpose(solve_definite(gated, cross))
     density, nis = log_density(nu, S)
     return Update(
-        mean + apply(K, nu),
+        mean + apply(K, taken),
         mirror_lower(covariance - product(K, cross)),
         density + _of_missing(available),
         nis,

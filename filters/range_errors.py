@@ -61,7 +61,7 @@ def start(mean: Array, covariance: Array, satellites: int, variance: Array) -> t
     return xp.concat([mean, empty[:satellites]]), xp.stack(rows)
 
 
-def advance(state: Array, axis: Array, T: float, decay: float, kept: Array) -> Array:
+def advance(state: Array, axis: Array, T: float, decay: float, kept: Array | list[Array]) -> Array:
     """Multiply by the transition matrix from the left, as :func:`.gnss_ins.advance`.
 
     Args:
@@ -69,14 +69,25 @@ def advance(state: Array, axis: Array, T: float, decay: float, kept: Array) -> A
         axis: transition of (x, v, a), ``(3, 3, ...)``.
         T: step, s.
         decay: factor of the attitude rates.
-        kept: psi, what is left of each range error, broadcasts against ``(...)``.
+        kept: psi, what is left of a range error, broadcasts against ``(...)``; or a list of one for each.
     """
-    errors = kept * state[gnss_ins.SIZE :]
+    known = gnss_ins.SIZE
+    if isinstance(kept, list):
+        errors = namespace(state).stack([psi * state[known + j] for j, psi in enumerate(kept)])
+    else:
+        errors = kept * state[known:]
     return namespace(state).concat([gnss_ins.advance(state, axis, T, decay), errors], axis=0)
 
 
 def predict(
-    mean: Array, covariance: Array, axis: Array, T: float, decay: float, Q: Array, kept: Array, gained: Array
+    mean: Array,
+    covariance: Array,
+    axis: Array,
+    T: float,
+    decay: float,
+    Q: Array,
+    kept: Array | list[Array],
+    gained: Array | list[Array],
 ) -> tuple[Array, Array]:
     """Time update, ``F x`` and ``F P F^T + Q``.
 
@@ -87,14 +98,15 @@ def predict(
         T: step, s.
         decay: factor of the attitude rates.
         Q: covariance of the process noise of the first 17 states, with zeros beyond, ``(17 + S, 17 + S, M, 1)``.
-        kept: psi, ``(N,)`` or a number.
+        kept: psi, ``(N,)`` or a number; or a list of one for each error.
         gained: variance of w, m^2, likewise.
     """
     xp = namespace(mean)
     moved = advance(covariance, axis, T, decay, kept)
     both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay, kept) + Q
     for j in range(gnss_ins.SIZE, mean.shape[0]):
-        both = _replace(both, j, both[j], both[j, j] + gained)
+        own = gained[j - gnss_ins.SIZE] if isinstance(gained, list) else gained
+        both = _replace(both, j, both[j], both[j, j] + own)
     return advance(mean, axis, T, decay, kept), both
 
 

@@ -86,7 +86,6 @@ env.close()"""
 NEEDS = {
     "agents": [Need(TRAIN)],
     "fast": [Need(f"{EVALUATE} --policy imm --backend compiled")],
-    "search": [Need(f"filtergym search {ID} --steps 512 --trials 1 --out found", beside=("agents",))],
     "tensorboard": [Need(TRAIN, beside=("agents",), written="run/log/*tfevents*")],
     "report": [Need("filtergym report results.json --out report.html", RESULTS)],
     "render": [Need(f"python -c {shlex.quote(VIDEO)}", refusal="moviepy is not installed")],

@@ -24,7 +24,7 @@ REPETITIONS = (0, 1)
 """Numbers of the repetitions that a test makes of several lanes."""
 LOOSEST = 1e-4
 """A result, or one, times this is the largest tolerance: what rounding takes further, a test says nothing about."""
-PARTS = {"world": ("begin", "advance"), "filter": ("start", "predict", "act", "feedback")}
+PARTS = {"world": ("begin", "advance"), "filter": ("start", "predict", "act")}
 """Methods of the parts of a task that are called within a step."""
 
 
@@ -72,7 +72,7 @@ def move_roundings(env, repetition=0):
     beside = lanes.beside.model if lanes.beside else lanes.model
     for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
-        for owner, names in ((model, ("observe", "charge")), *((part, PARTS[p]) for part, p in parts)):
+        for owner, names in ((model, ("observe", "charge", "feedback")), *((part, PARTS[p]) for part, p in parts)):
             for name in names:
                 setattr(owner, name, _that_moves(getattr(owner, name), pattern))
     return env

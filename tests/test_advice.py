@@ -12,6 +12,7 @@ from filtergym.baselines import fitting
 from filtergym.baselines.advice import advise, share_out
 from filtergym.baselines.fitted_filters import own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
+from filtergym.baselines.judgement import AS_GOOD, Judgement
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
@@ -23,7 +24,7 @@ from filtergym.evaluation.statistics.bootstrap import Estimate
 from models import Asked
 
 from filtergym import evaluate
-from filtergym.reports.tables.advice import advice_lines, parameter_lines
+from filtergym.reports.tables.advice import PRICES, advice_lines, parameter_lines, price_table
 
 ID = "filtergym/ManeuveringTarget-v0"
 PROBLEM = problem_of(ID)
@@ -366,6 +367,39 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
         assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
 
+def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
+    """Where both are as good, the operations of an update decide, and what the likelier one would bring is said."""
+    recording = read(write_log(tmp_path, count=240, acceleration=0.8, sigma=1.0, seed=5))
+    true = partial(ConstantVelocity, acceleration=0.8)
+    true.kind = "estimator"
+    operations = {"true": 500, "constant-velocity": 400}
+    asked = []
+
+    def price_of(name, maker):
+        asked.append(name)
+        return dict.fromkeys(PRICES.values(), operations[name]) if name in operations else None
+
+    found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm"), "true": true}, price_of=price_of)
+    assert found.rival == "true"
+    assert -AS_GOOD < found.fitted.gain.low < 0.0
+    assert found.advised.name == "constant-velocity"
+    assert "imm" not in asked  # it is no candidate: nothing is traced for it
+    lines = list(advice_lines(found, []))
+    assert lines[0].startswith(
+        "Take constant-velocity, with the parameters below, as good as true and cheaper: "
+    )
+    likelier = found._replace(dearer=("true", Estimate(0.25, -0.125, 0.5)))
+    assert (
+        "true is likelier where filters were chosen: it would bring +0.250 [-0.125, +0.500] nats per measurement and "
+        "takes 500 operations an update for 400." in list(advice_lines(likelier, []))
+    )
+    table = price_table(found, [])
+    assert list(table.columns[1].cells) == [
+        "400" if each == "constant-velocity" else "500" if each == "true" else "-"
+        for each in table.columns[0].cells
+    ]
+
+
 def test_the_best_in_hindsight_is_named_beside(advice):
     """It has the least judged error of the shipped ones; a rival may be another, and then both are said."""
     shipped = {c.name: c.error for c in advice.competitors if not c.fitted}
@@ -382,9 +416,24 @@ def test_the_best_in_hindsight_is_named_beside(advice):
 def test_a_likelihood_that_misleads_is_said(advice):
     """As where errors last longer than a measurement: what predicts best errs more."""
     worse = advice.fitted._replace(relative_error=Estimate(0.07, 0.02, 0.12))
-    line = next(advice_lines(advice._replace(fitted=worse, competitors=[worse, *advice.competitors[1:]]), []))
-    assert "7.0 % more error [2.0, 12.0]" in line
-    assert f"the likelihood misleads here, keep {advice.rival}." in line
+    kept = next(c for c in advice.competitors if c.name == advice.rival)
+    line = next(advice_lines(advice._replace(fitted=worse, competitors=[kept, worse]), []))
+    assert line.startswith(
+        f"Take {advice.rival}, as it is shipped: {worse.name}, fitted, predicts more likely and has "
+    )
+    assert "7.0 % more error [2.0, 12.0] than it" in line
+    assert line.endswith("The likelihood misleads here.")
+
+
+def test_where_the_likelihood_misleads_the_rival_is_advised(one_family, tmp_path, monkeypatch):
+    """Beyond chance; a difference that may be chance changes nothing."""
+    recording = read(write_log(tmp_path, count=240, acceleration=0.8, sigma=1.0, seed=5))
+    for low, kept in ((0.02, True), (-0.02, False)):
+        errors = Estimate(0.07, low, 0.12)
+        monkeypatch.setattr(Judgement, "relative_error", lambda self, name, other, errors=errors: errors)
+        found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})
+        assert found.fitted.gain.low > 0.0
+        assert (found.advised.name == "imm") == kept
 
 
 def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):

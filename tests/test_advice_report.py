@@ -75,7 +75,7 @@ def test_the_sentence_comes_first_and_tables_hold_what_was_fitted(advice, page):
     for sentence in further_sentences(advice, []):
         assert sentence.replace("'", "&#39;") in text
     assert "10 scans have no row: they missed the target" in text
-    assert re.search(r"longest gap</th><td>11 s<", text)
+    assert re.search(r"longest time between measurements</th><td>11 s<", text)
     assert "filtergym advise log.csv" in text
 
 
@@ -92,6 +92,16 @@ def test_pictures_are_of_the_replay_in_seconds(advice, page):
     missed = (seconds >= FIRST_MISSED) & (seconds < LAST_MISSED)
     np.testing.assert_array_equal([x is None for x in episode["measured"][0]], missed)
     np.testing.assert_allclose(episode["estimates"][0], run["estimate"].values[:, :2].T, rtol=1e-5, atol=1e-5)
+
+
+def test_outliers_are_drawn_where_they_were_measured(advice):
+    outliers = np.zeros_like(advice.outliers)
+    outliers[0, [5, 40]] = True
+    (episode,) = figures(page_of(advice._replace(outliers=outliers)))["episodes"]
+    assert episode["outlier_numbers"] == [6, 41]
+    np.testing.assert_allclose(episode["outlier_seconds"], [7.0, 42.0], rtol=1e-5)
+    for outlying, measured in zip(episode["outliers"], episode["measured"], strict=True):
+        assert outlying == [measured[5], measured[40]]
 
 
 def test_mean_nis_is_of_windows_and_its_band_that_of_their_degrees(advice, page):

@@ -83,7 +83,6 @@ REFUSED = {
     "advise": ("missing.csv", "--out", "new/mine.filter.json"),
     "animate": (ENV, "--policy", "known-input-bound", "--out", "new"),
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
-    "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
     "submit": (ENV, "nobody", "--out", "new/mine.json"),
 }
@@ -382,6 +381,23 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     benchmark.run_benchmark(tmp_path / "whole", benchmark.BenchmarkOptions())
     whole, parts = (without_times(tmp_path / folder / "results.json") for folder in ("whole", "parts"))
     assert whole == parts
+
+
+def test_benchmark_runs_until_the_headline_is_narrow(tmp_path, monkeypatch):
+    """As many episodes as the half width needs, which falls with their root; in the training distribution alone."""
+    from filtergym.reports.tables import benchmark
+
+    problem = problem_of(ENV)
+    cells = [benchmark.Cell(problem, name, 40, ("imm", "fixed-best")) for name in ("paper", "random")]
+    monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
+    small = benchmark.run_benchmark(tmp_path / "small", benchmark.BenchmarkOptions(timed=False))
+    width = 100.0 * benchmark.headline_half_width(small[1])
+    options = benchmark.BenchmarkOptions(timed=False, half_width=width / 2.0)
+    found = benchmark.run_benchmark(tmp_path / "large", options)
+    assert [result.records[0].episodes for result in small] == [40, 40]
+    assert found[0].records == small[0].records
+    assert found[1].records[0].episodes >= 4 * 40
+    assert 100.0 * benchmark.headline_half_width(found[1]) <= width / 2.0
 
 
 def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import pytest
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine import programs
 from filtergym.evaluation.competitors.kinds import DRAWN_AT_ONCE, RandomPolicy
 from models import make_model
 
@@ -31,6 +32,7 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
         known = problem.baselines
         kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
         names = [name for kind in kinds for name in list(kind)[:1]]
+    monkeypatch.setattr(programs, "PROGRAM_CACHE_SIZE", len(names))  # what was traced once serves twice
     everyone = evaluate(env_id, names, episodes=13, **short)
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 12)  # and the last one alone
     assert_same(evaluate(env_id, names, episodes=13, **short), everyone)

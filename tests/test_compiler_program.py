@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from filtergym.compiler import cache, functions, namespace, native
+from filtergym.compiler import cache, emission, functions, namespace, native
 from filtergym.compiler.block import block_for, block_of
 from filtergym.compiler.emission import emit
 from filtergym.compiler.functions import Function, Specialised
@@ -292,12 +292,16 @@ def chain(length):
     return function
 
 
+def named(setting):
+    return setting.lanes, setting.part, setting.loops
+
+
 def settings_used(monkeypatch, function, runs):
     """Settings in which the code of a function was made while it ran."""
     used = []
     monkeypatch.setattr(native, "_CODES", {})
     monkeypatch.setattr(
-        native, "emit", lambda *given, emit=emit: (used.append((given[3].lanes, given[4])), emit(*given))[1]
+        native, "emit", lambda *given, emit=emit: (used.append((given[3].lanes, *given[4:])), emit(*given))[1]
     )
     compiled, x = Function(function, Graph()), np.ones((1, 8))
     expected = compiled(x)
@@ -309,13 +313,13 @@ def settings_used(monkeypatch, function, runs):
 def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
     monkeypatch.setattr(native, "HOT", 40)
     features = native.processor()[1]
-    first, better = quick_setting(features, False)[:2], OPTIMISED[:2]
+    first, better = named(quick_setting(features, False)), named(OPTIMISED)
     assert settings_used(monkeypatch, chain(5), runs=3) == [first]
     assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
 
 
 def test_what_is_timed_is_optimised_at_once(monkeypatch):
-    first, better = quick_setting(native.processor()[1], False)[:2], OPTIMISED[:2]
+    first, better = named(quick_setting(native.processor()[1], False)), named(OPTIMISED)
     with native.optimised_code():
         assert settings_used(monkeypatch, chain(7), runs=2) == [better]
     assert settings_used(monkeypatch, chain(8), runs=2) == [first]
@@ -327,6 +331,18 @@ def test_long_programs_stay_as_they_are(monkeypatch):
     assert len(settings_used(monkeypatch, chain(12), runs=12)) == 2
     assert len(settings_used(monkeypatch, chain(13), runs=12)) == 2
     assert len(settings_used(monkeypatch, chain(20), runs=12)) == 1
+
+
+def test_what_is_compiled_quickly_as_loops_becomes_a_straight_line(monkeypatch):
+    monkeypatch.setattr(native, "HOT", 40 * native.IN_LOOPS)
+    monkeypatch.setattr(native, "LONG", 30)
+    monkeypatch.setattr(native, "LONGEST", 50)
+    monkeypatch.setattr(emission, "LONG", 20)
+    loops, straight = (
+        quick_setting(native.processor()[1], False)._replace(loops=how) for how in (True, False)
+    )
+    for length, expected in ((11, [loops, OPTIMISED]), (20, [loops, straight]), (30, [loops])):
+        assert settings_used(monkeypatch, chain(length), runs=12) == [named(each) for each in expected]
 
 
 def test_parts_are_cut_by_results_as_well_as_by_steps():

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
 from filtergym.filters import alpha_beta
 from scipy.stats import chi2
 
@@ -97,6 +97,37 @@ def test_typical_episodes(dataset, found):
     assert found["imm", "median_cost_ratio"].value == 1.0
 
 
+def test_the_headline_is_a_geometric_mean_and_lost_tracks_are_counted(dataset, found):
+    """Of each episode's ratio of costs, with the interval of a bootstrap of its logarithm."""
+    cost = dataset["cost"].mean("time").transpose("episode", "policy").to_pandas()
+    logs = np.log(cost["bptt"] / cost["imm"]).to_numpy()
+    counts = np.rint(Bootstrap(200).weights * 200)
+    expected = np.percentile(np.exp(counts[1:] @ logs / 200) - 1.0, [2.5, 97.5])
+    record = found["bptt", "geometric_cost_difference"]
+    assert record.value == pytest.approx(np.exp(logs.mean()) - 1.0, rel=1e-12)
+    np.testing.assert_allclose([record.low, record.high], expected, rtol=1e-12)
+    assert found["imm", "geometric_cost_difference"][8:11] == (0.0, 0.0, 0.0)
+    assert found["imm", "geometric_cost"].value == pytest.approx(
+        np.exp(np.log(cost["imm"]).mean()), rel=1e-12
+    )
+    assert found["imm", "lost_tracks"].value == (cost["imm"] > 100.0).mean()
+    # Of a thousand resamples each names one.
+    shares = {name: r.value for (name, metric), r in found.items() if metric == "best_share"}
+    assert sum(shares.values()) == pytest.approx(1.0, rel=1e-12)
+    assert max(shares, key=shares.__getitem__) == found["ppo", "behind_best"].component
+
+
+def test_the_interval_of_a_share_is_where_its_score_test_accepts():
+    """Wilson's: the ends solve ``(share - p)^2 = z^2 p (1 - p) / n``; none of n still leaves something."""
+    z = 1.959963984540054
+    for count, number in ((0, 50), (3, 50), (50, 50)):
+        share, low, high = share_interval(count / number, number)
+        assert 0.0 <= low <= share <= high <= 1.0
+        for end in (low, high):
+            spread = z * z * end * (1.0 - end) / number
+            assert (share - end) ** 2 == pytest.approx(spread, abs=1e-15)
+
+
 def test_no_room_unless_the_reference_is_better():
     rng, bootstrap = np.random.default_rng(0), Bootstrap(200)
     paper = rng.gamma(2.0, 1.0, 200)
@@ -112,7 +143,8 @@ def test_no_room_unless_the_reference_is_better():
 def test_who_is_best(dataset, found):
     records = tidy_records(dataset)
     places = ranking(records)
-    cost = dataset["cost"].mean(["episode", "time"]).drop_sel(policy=["known-turn", "known-input-bound"])
+    cost = np.exp(np.log(dataset["cost"].mean("time")).mean("episode"))
+    cost = cost.drop_sel(policy=["known-turn", "known-input-bound"])
     names = cost["policy"].values[np.argsort(cost.values)].tolist()
     assert [p.name for p in places] == names
     assert names[0] == "bptt"
@@ -148,7 +180,8 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
     # References are told what the others are not, and judge nothing.
     assert told([*everyone, "known-turn"], low=0.01) == "learned best"
     swapped = [
-        r._replace(value=1e-9) if (r.policy, r.metric) == (classical[0], "cost") else r for r in records
+        r._replace(value=1e-9) if (r.policy, r.metric) == (classical[0], "geometric_cost") else r
+        for r in records
     ]
     beaten = [r._replace(low=0.01) if (r.policy, r.metric) == ("bptt", "behind_best") else r for r in swapped]
     assert who_is_best(beaten) == "classical best"

@@ -13,7 +13,7 @@ from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuned_values import save_tuned
-from filtergym.baselines.tuning import Candidate, Search, mean_cost, tune
+from filtergym.baselines.tuning import Candidate, Search, episode_costs, geometric_cost, tune
 from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import windows_of
@@ -94,7 +94,7 @@ def test_score_is_zero_for_the_paper_and_one_for_the_reference(dataset):
     records = {r.policy: r for r in tidy_records(dataset) if r.metric == "score"}
     assert records["imm"].value == 0.0
     assert records["known-turn"].value == pytest.approx(1.0)
-    cost = dataset["cost"].mean(["episode", "time"])
+    cost = np.log(dataset["cost"].mean("time")).mean("episode")
     adaptive, paper, bound = (float(cost.sel(policy=p)) for p in ("adaptive", "imm", "known-turn"))
     assert records["adaptive"].value == pytest.approx((paper - adaptive) / (paper - bound), rel=1e-9)
 
@@ -126,15 +126,14 @@ def test_a_class_of_ones_own_and_its_mistakes():
 def test_tuning_improves_on_fresh_episodes_and_is_repeatable():
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 20 * 32 * 100
-    first = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32))
-    again = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32))
+    first = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32, confirming=128))
+    again = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32, confirming=128))
     assert first == again
     assert first.environment_steps <= budget
     assert first.cost < first.untuned_cost
     seeds = episode_seeds("validation", 1, 128)
-    assert mean_cost(Candidate(problem_of(ENV), "random", tunable, tunable.start, seeds)) == pytest.approx(
-        first.untuned_cost
-    )
+    candidate = Candidate(problem_of(ENV), "random", tunable, tunable.start, seeds)
+    assert geometric_cost(episode_costs(candidate)) == pytest.approx(first.untuned_cost, rel=1e-12)
 
 
 def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
@@ -145,9 +144,10 @@ def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
 
     def flattered(candidate, workers):
         value = candidate.values[name]
-        return -value if candidate.seeds == train else 1.0 + abs(value - tunable.start[name])
+        cost = np.exp(-value) if candidate.seeds == train else 1.0 + abs(value - tunable.start[name])
+        return np.full(len(candidate.seeds), cost)
 
-    monkeypatch.setattr(tuning, "mean_cost", flattered)
+    monkeypatch.setattr(tuning, "episode_costs", flattered)
     outcome = tune(problem_of(ENV), "fixed-best", Search(20 * 8 * 100, episodes=8))
     assert outcome.values == pytest.approx(tunable.start, rel=1e-5)
     assert outcome.cost == outcome.untuned_cost == 1.0

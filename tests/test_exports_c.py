@@ -1,5 +1,6 @@
 """Filters as C99: they are what was judged, compile without a warning, and nothing gets in that is no number."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -186,6 +187,31 @@ def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
     assert given.largest_difference(np.moveaxis(own, 0, -1)) < 1e-2
     sigma = estimates.filter(like="sigma_").to_numpy().reshape(3, 30, -1)
     np.testing.assert_allclose(np.moveaxis(sigma, 0, -1), given.sigma, rtol=1e-3)
+    # The same program; a table has nine digits of a float.
+    np.testing.assert_allclose(converse(tmp_path / "run", given), np.moveaxis(own, 0, -1), rtol=1e-8)
+
+
+def converse(program, given):
+    """Means ``(T, C, E)`` that a program answers in the protocol of a competitor, docs/programs.md."""
+    T, C, E = given.mean.shape
+    numbers = {"initial": len(given.initial), "measurement": given.measurements.shape[1], "answer": C + C * C}
+    hello = {
+        "filtergym": 1,
+        "tracks": E,
+        "numbers": numbers,
+        "environment": 3000 * "x",
+    }  # longer than its buffer
+    rows = [given.initial.T, *np.moveaxis(given.measurements, -1, 1)]
+    frames = b"".join(np.ascontiguousarray(row, dtype="<f8").tobytes() for row in rows)
+    spoken = json.dumps(hello).encode() + b"\n"
+    said = subprocess.run([program], input=spoken + frames, capture_output=True, check=True).stdout
+    answer, _, content = said.partition(b"\n")
+    assert json.loads(answer) == {"filtergym": 1, "format": "float64"}
+    refused = subprocess.run(
+        [program], input=spoken.replace(b": 1,", b": 2,"), capture_output=True, check=False
+    )
+    assert "exported from another" in json.loads(refused.stdout)["error"]
+    return np.moveaxis(np.frombuffer(content, dtype="<f8").reshape(T, E, -1)[..., :C], 1, -1)
 
 
 class OwnNetwork:

@@ -110,7 +110,7 @@ def of_bank(bank, seen):
     state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
     total = 0.0
     for said in seen:
-        state = bank.update(state, Input(said))
+        state = bank.step(state, Input(said))
         total += np.nan_to_num(state.likelihood.log_likelihood[0])
     return total, state.mean[0, 0], state.covariance[0, 0, 0]
 
@@ -154,7 +154,7 @@ def test_the_first_fix_gives_the_exact_mixture():
     bank, task = small(levels=(1.0, 6.0), distrust=0.4)
     (first, *_) = measurements(3)
     state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
-    found = bank.update(state, Input(first)).likelihood
+    found = bank.step(state, Input(first)).likelihood
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
     mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
@@ -223,13 +223,13 @@ def steered():
     bank = model.filter
     scans, answers = watch_hypotheses(model, FaultBank(model.task), "fix", np.zeros(6))
     assert 0.0 < np.mean([measurement.available for _, measurement in scans]) < 1.0
-    assert sum(state.memory.pulled.weights.max() > 0.01 for state, _ in scans) > 10
+    assert sum(state.own.memory.pulled.weights.max() > 0.01 for state, _ in scans) > 10
     return bank, scans, answers
 
 
 def weights_after(bank, state, measurement, action):
-    memory = act(bank, state, measurement, action).memory
-    return bank.bank.join([memory.free.weights, memory.pulled.weights], 0)
+    memory = act(bank, state, measurement, action).own.memory
+    return bank.own.join([memory.free.weights, memory.pulled.weights], 0)
 
 
 def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
@@ -245,7 +245,7 @@ def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
 @pytest.mark.parametrize(("index", "factor"), [(0, 1.05), (1, 1.05)])
 def test_hypotheses_multiplies_odds(steered, index, factor):
     bank, scans, _ = steered
-    points = bank.bank.prior.points
+    points = bank.own.prior.points
     for state, measurement in scans[::7]:
         before = weights_after(bank, state, measurement, np.zeros(6))
         after = weights_after(bank, state, measurement, 0.7 * np.eye(6)[index])
@@ -260,7 +260,7 @@ def test_hypotheses_multiplies_odds(steered, index, factor):
 def test_hypotheses_scales_noises(steered):
     """As if the hypotheses had been predicted with other noises, and the fix weighed with other levels."""
     bank, scans, _ = steered
-    inner, action = bank.bank, np.array([0.0, 0.0, 0.6, -0.5, 0.8, -0.9])
+    inner, action = bank.own, np.array([0.0, 0.0, 0.6, -0.5, 0.8, -0.9])
     level, receiver, inertial, wandering = np.array([1.5, 1.25, 2.0, 2.0]) ** action[2:]
     noises = inner.noises._replace(
         coloured_growth=inertial * inner.noises.coloured_growth,
@@ -272,20 +272,20 @@ def test_hypotheses_scales_noises(steered):
     assert len(chosen) > 20
     for k in chosen[::4]:
         state, measurement = scans[k]
-        before = act(bank, *scans[k - 1], np.zeros(6)).memory
+        before = act(bank, *scans[k - 1], np.zeros(6)).own.memory
         free, pulled = inner.change(before.free, before.pulled, measurement.number)
         free = inner.predict_part(free, noises)
         pulled = inner.predict_part(pulled, type(noises)(*(each[1:] for each in noises)))
         variances = np.array(inner.prior.levels)[:, None]
-        levels = state.memory.levels * level ** (np.log(variances) / math.log(variances[-1, 0]))
-        predicted = state.memory._replace(
+        levels = state.own.memory.levels * level ** (np.log(variances) / math.log(variances[-1, 0]))
+        predicted = state.own.memory._replace(
             free=free,
             pulled=pulled,
             levels=levels / levels.sum(axis=0),
-            reported=receiver * state.memory.reported,
+            reported=receiver * state.own.memory.reported,
         )
-        expected = inner.update_bank(predicted, measurement, inner.weigh(predicted, measurement))
-        found = act(bank, state, measurement, action)
+        expected = inner.take(predicted, measurement, inner.weigh(predicted, measurement))
+        found = act(bank, state, measurement, action).own
         np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7, atol=1e-10)
         np.testing.assert_allclose(found.memory.levels, expected.memory.levels, rtol=1e-8, atol=1e-12)
@@ -297,5 +297,5 @@ def test_groups_of_hypotheses_are_probabilities(steered):
         for groups in (state.predicted, state.probabilities):
             assert (groups >= 0.0).all()
             np.testing.assert_allclose(groups[: len(bank.noise_names)].sum(axis=0), 1.0, rtol=1e-12)
-        pulled = state.memory.pulled.weights.sum(axis=(0, 1))
+        pulled = state.own.memory.pulled.weights.sum(axis=(0, 1))
         np.testing.assert_allclose(state.predicted[-2:].sum(axis=0), pulled, rtol=1e-12)

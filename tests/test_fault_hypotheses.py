@@ -24,7 +24,7 @@ def steered():
     model = make_model(ID, "hypotheses", "random", **faults)
     bank = model.filter
     # A leg may end from the start, or no manoeuvre would begin so early.
-    bank.bank, estimator = (FaultHypotheses(model.task, quiet=0.0) for _ in range(2))
+    bank.own, estimator = (FaultHypotheses(model.task, quiet=0.0) for _ in range(2))
     scans, answers = watch_hypotheses(model, estimator, "readings", ZERO)
     assert max(state.expected[3].max() for state, _ in scans) > 0.1
     assert 0.0 < np.mean([state.between for state, _ in scans]) < 1.0
@@ -65,28 +65,29 @@ def test_hypotheses_scales_renewals_levels_and_noises(steered):
     task, S = copy.copy(bank.task), bank.task.satellites
     scale = [pseudoranges] * S + [rates] * S + [accelerometers] * 3 + [1.0] * 3
     task.sensor_variance = [factor * r for factor, r in zip(scale, task.sensor_variance, strict=True)]
-    heights = np.log(bank.bank.prior.levels) / math.log(bank.bank.prior.levels[-1])
+    heights = np.log(bank.own.prior.levels) / math.log(bank.own.prior.levels[-1])
 
     class Other(FaultHypotheses):
         def _move_levels(self, levels):
             q = (level**heights)[:, None] * super()._move_levels(levels)
             return q / q.sum(axis=0)
 
-    other = Other(task, bank.bank.prior)
+    other = Other(task, bank.own.prior)
     other.noise = motion * other.noise
     odds = renewal * other.lost / (1.0 - other.lost)
     other.lost = odds / (1.0 + odds)
     rate = slice(S, 2 * S)
     for state, measurement in scans[::9]:
-        expected = other.update_bank(measurement, state.memory)
-        found = act(bank, state, measurement, action)
+        expected = other.examine(state.own, measurement).after
+        found = act(bank, state, measurement, action).own
         # Pseudoranges of 2e7 m are known to 4e-9 m.
         np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-8, atol=1e-7)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(found.probabilities, expected.memory.probabilities, rtol=1e-7, atol=1e-12)
+        found, expected = found.hypotheses, expected.hypotheses
+        np.testing.assert_allclose(found.probabilities, expected.probabilities, rtol=1e-7, atol=1e-12)
         there = measurement.available[rate] > 0.0
-        levels = np.where(there, expected.memory.levels, 0.0)
-        np.testing.assert_allclose(np.where(there, found.memory.levels, 0.0), levels, rtol=1e-7, atol=1e-12)
+        levels = np.where(there, expected.levels, 0.0)
+        np.testing.assert_allclose(np.where(there, found.levels, 0.0), levels, rtol=1e-7, atol=1e-12)
 
 
 def test_what_the_bank_believes_are_probabilities(steered):

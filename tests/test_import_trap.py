@@ -221,7 +221,7 @@ def agent_ways(folder, command):
 
 
 def settings_ways(folder, command):
-    """YAML of hyperparameters and search spaces, JSON of tuned values."""
+    """YAML of hyperparameters, JSON of tuned values."""
     rest = ("--algo", "ppo", "--steps", 8, "--envs", 2, "--out", "trained")
     for i, text in enumerate(
         (
@@ -233,14 +233,11 @@ def settings_ways(folder, command):
             f"env: !!python/name:{TRAP}.Trap\n",
             f"algo: !!python/object/apply:{TRAP}.Trap []\n",
             f"learning_rate: !!python/module:{TRAP}\n",
-            f"{CLASS}: {{kind: '{CLASS}', low: 0, high: 1}}\nlearning_rate: '{CLASS}'\n",
         )
     ):
         path = folder / f"{i}.yml"
         path.write_text(text)
         yield f"train --config {i}", lambda path=path: command("train", ENV, "--config", path, *rest)
-        search = ("search", ENV, "--space", path, "--trials", 1, "--steps", 8, "--out", "searched")
-        yield f"search --space {i}", lambda search=search: command(*search)
     (folder / "tuned").mkdir(exist_ok=True)
     for content in (
         {CLASS: {"values": {}}, "imm": {"values": {NAME: 1.0}, "command": NAME}},

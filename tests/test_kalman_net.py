@@ -55,7 +55,7 @@ def episodes(id, count, steps, **keywords):
     draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
     truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
     # A loop that is closed by the initial estimate, as no filter is here.
-    found, feedback = [], model.task.feedback(initial.mean, initial) if id in (AIRCRAFT, SATELLITES) else None
+    found, feedback = [], model.task.feedback(initial.mean, initial.covariance, initial)
     for _ in range(steps):
         noise = (
             rng.normal(size=(model.task.noise.normals, count)),
@@ -231,7 +231,7 @@ def test_of_satellites_the_noise_of_the_motion_holds_until_the_next_measurement(
     for measurement in measurements:
         before, state = state, bank.predict(state, measurement)
         for i in range(8):
-            a = before.last_action[names.index("manoeuvre"), i]
+            a = before.action[names.index("manoeuvre"), i]
             motion = gnss_ins.singer_model(
                 p.sampling_interval, p.singer_alpha, p.singer_sigma * satellites.MANOEUVRE_RANGE**a
             )

@@ -13,12 +13,17 @@ import filtergym  # noqa: F401  # registers the environments
 ID = "filtergym/UavAutopilot-v0"
 
 
+def no_action(bank):
+    """Zero."""
+    return np.zeros(bank.action_space.shape)
+
+
 @pytest.fixture(scope="module", params=["U", "P"])
 def steered(request):
     """The bank, for every measurement its state as predicted and the measurement, and the estimator's answers."""
     model = make_model(ID, "hypotheses", "random", plant=request.param, horizon=80, dropout_period=20)
     bank = model.filter
-    scans, answers = watch_hypotheses(model, LevelBank(model.task), "reading", bank.no_action)
+    scans, answers = watch_hypotheses(model, LevelBank(model.task), "reading", no_action(model.filter))
     # Of single sensors or of all.
     assert 0.5 < np.mean([measurement.available for _, measurement in scans]) < 1.0
     return bank, scans, answers
@@ -27,7 +32,7 @@ def steered(request):
 def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
     bank, scans, answers = steered
     for (state, measurement), (mean, covariance, _, likelihood) in zip(scans, answers, strict=True):
-        after = act(bank, state, measurement, bank.no_action)
+        after = act(bank, state, measurement, no_action(bank))
         np.testing.assert_array_equal(bank.mean(after), mean)
         np.testing.assert_array_equal(bank.covariance(after), covariance)
         records = bank.records(after, measurement)
@@ -37,12 +42,12 @@ def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
 
 def test_hypotheses_multiplies_odds(steered):
     bank, scans, _ = steered
-    prior, action = bank.bank.prior, np.array([0.7, -0.4, *bank.no_action[2:]])
+    prior, action = bank.own.prior, np.array([0.7, -0.4, *no_action(bank)[2:]])
     heights = np.log(grid(prior.gusts, prior.gust_points))
     expected = np.array([1.25**-0.4, *1.1 ** (0.7 * heights / heights[-1])])[:, None]
     for state, measurement in scans[::7]:
-        before = act(bank, state, measurement, bank.no_action).memory.probability
-        after = act(bank, state, measurement, action).memory.probability
+        before = act(bank, state, measurement, no_action(bank)).own.hypotheses.probability
+        after = act(bank, state, measurement, action).own.hypotheses.probability
         product = np.where((measurement.available > 0.0).any(axis=0), expected, 1.0) * before
         np.testing.assert_allclose(after, product / product.sum(axis=0), rtol=1e-9, atol=1e-15)
 
@@ -50,14 +55,14 @@ def test_hypotheses_multiplies_odds(steered):
 def test_hypotheses_scales_noises(steered):
     """As if every hypothesis had been predicted with another process noise, and the sensors were others."""
     bank, scans, _ = steered
-    inner, process = bank.bank, 2.0**0.8
+    inner, process = bank.own, 2.0**0.8
     sensors = [0.5, -0.7, 0.9][: len(inner.rows)]
     factors = 1.5 ** np.array(sensors)
     chosen = [k for k in range(1, len(scans)) if (scans[k][1].available > 0.0).any(axis=0).all()]
     assert len(chosen) > 20
     for k in chosen[::6]:
         state, measurement = scans[k]
-        before = inner.switch(act(bank, *scans[k - 1], bank.no_action).memory)
+        before = inner.switch(act(bank, *scans[k - 1], no_action(bank)).own.hypotheses)
         mean, covariance = inner.propagate(before, measurement)
         covariance = covariance + (process - 1.0) * inner.process
         for i, rows in enumerate(inner.rows):
@@ -66,7 +71,7 @@ def test_hypotheses_scales_noises(steered):
                 mean, covariance, measurement.reading[i], rows, noise, measurement.available[i]
             )
             mean, covariance = step.mean, step.covariance
-        found = act(bank, state, measurement, [0.0, 0.0, 0.8, *sensors]).memory
+        found = act(bank, state, measurement, [0.0, 0.0, 0.8, *sensors]).own.hypotheses
         np.testing.assert_allclose(found.mean, mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found.covariance, covariance, rtol=1e-7, atol=1e-9)
 
@@ -74,9 +79,9 @@ def test_hypotheses_scales_noises(steered):
 def test_innovations_are_those_of_the_mixture(steered):
     """Of its moments, and of the noise that the hypotheses expect."""
     bank, scans, _ = steered
-    inner, n = bank.bank, len(bank.task.components)
+    inner, n = bank.own, len(bank.task.components)
     for state, measurement in scans[::9]:
-        h, b = state.memory, 3
+        h, b = state.own.hypotheses, 3
         p = h.probability[:, b] / h.probability[:, b].sum()
         P = packed_covariance.unpack(h.covariance, inner.size)[..., b]
         x = h.mean[..., b] @ p

@@ -18,7 +18,7 @@ from filtergym.baselines.maneuvering_target.estimators import (
 )
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
-from filtergym.baselines.tuning import Candidate, mean_cost
+from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
@@ -280,10 +280,9 @@ def test_untuned_values_are_those_in_force():
         untuned = tunable.apply(tunable.start)[1]
         same = type("Untuned", (), {"control": None, "apply": lambda values, maker=maker: ({}, maker)})
         # Logarithms of the values, there and back; an IMM amplifies that.
-        expected = mean_cost(Candidate(problem_of(ID), "random", same, {}, seeds))
-        assert mean_cost(Candidate(problem_of(ID), "random", tunable, tunable.start, seeds)) == pytest.approx(
-            expected, rel=1e-9
-        ), name
+        expected = episode_costs(Candidate(problem_of(ID), "random", same, {}, seeds))
+        found = episode_costs(Candidate(problem_of(ID), "random", tunable, tunable.start, seeds))
+        assert found == pytest.approx(expected, rel=1e-9), name
         made = maker.func if isinstance(maker, Variant) else maker
         assert isinstance(untuned(make_model(ID, None, "random").task), made)
 

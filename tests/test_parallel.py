@@ -299,7 +299,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
     store = Store(tmp_path / "unfinished")
     list(summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)]))
     calls = []
-    monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
+    monkeypatch.setattr(tuning, "episode_costs", lambda *given: calls.append(1) or np.ones(8))
 
     def interrupted(steps):
         raise KeyboardInterrupt
@@ -523,7 +523,7 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
     asked = (problem_of(ENV), "fixed-best", tuning.Search(budget, episodes=8))
-    calls, own, last = [], tuning.mean_cost, 0
+    calls, own, last = [], tuning.episode_costs, 0
 
     def counted(*arguments):
         calls.append(arguments)
@@ -531,7 +531,7 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return own(*arguments)
 
-    monkeypatch.setattr(tuning, "mean_cost", counted)
+    monkeypatch.setattr(tuning, "episode_costs", counted)
     # A candidate that the search comes back to is kept, so that the budget does not say how many are run.
     whole, all_calls = tuning.tune(*asked, store=Store(tmp_path / "first")), len(calls)
     assert all_calls >= whole.environment_steps // 800

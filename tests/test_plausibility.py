@@ -185,6 +185,13 @@ NOTED = {
         untold(plots(x=lambda x: x - 150.0 * TIME, y=lambda y: y - 0.02 * TIME**2)) | STATED,
         r"all positions lie within \d\d\d m, where errors of 141 m are stated: the target stands still",
     ),
+    "radians with their deviation": (
+        TARGET,
+        polar(
+            azimuth=np.radians, azimuth_sigma=np.full(60, np.radians(0.25)), range_sigma=np.full(60, 100.0)
+        ),
+        "azimuth stays within 2 pi and is taken for degrees, as its deviation",
+    ),
     "a value twice": (
         TARGET,
         plots(**{c: lambda v: np.where(np.arange(60) == 9, v[8], v) for c in "xy"}),
@@ -219,8 +226,19 @@ def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
     short = {name: values[:10] for name, values in plots().items()}
     said = [*reading_lines(read_recording(table(tmp_path / "ten.csv", **short), TARGET))]
     assert any(line.startswith("Fewer than 30 measurements") for line in said)
+    # Kilometres whose deviations are kilometres, too, are a slow target: who knows it sees that.
+    (extent,) = (line for line in said if line.startswith("Positions span"))
+    assert re.fullmatch(
+        r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent
+    )
     said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
     assert not any("guess" in line for line in said)
+
+
+def test_an_empty_file_is_called_empty(tmp_path):
+    (tmp_path / "empty.csv").write_text("")
+    with pytest.raises(ValueError, match="it is empty: a recording needs a line of columns"):
+        read_recording(tmp_path / "empty.csv", TARGET)
 
 
 @pytest.mark.parametrize(

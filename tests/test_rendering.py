@@ -62,7 +62,7 @@ def test_frames_are_images_that_change(control, general, monkeypatch):
     env.close()
 
 
-@pytest.mark.parametrize("name", ["LooselyCoupledNavigation", "TightlyCoupledNavigation", "UavAutopilot"])
+@pytest.mark.parametrize("name", ["TightlyCoupledNavigation", "UavAutopilot"])
 def test_what_a_bank_of_hypotheses_believes_is_drawn(name):
     env = TaskEnv(
         f"filtergym/{name}-v0",

@@ -218,7 +218,7 @@ def test_no_number_is_cut_at_any_width(width, result, command_console):
     text = command_console(width, *tables)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= width
-    for name in ("rmse", "relative_cost_difference"):
+    for name in ("rmse", "geometric_cost_difference"):
         for r in result.records:
             if (r.metric, r.window, r.policy) == (name, "all", "ppo") and r.component in ("", "position"):
                 shown = f"{r.value * (100.0 if name != 'rmse' else 1.0):#.3g}".rstrip(".")
@@ -296,9 +296,9 @@ def test_remarks_follow_from_the_numbers(result):
         ]
         return remarks([result._replace(records=records)])
 
-    helped = changed("relative_cost_difference", value=-0.5, low=-0.6, high=-0.4)
+    helped = changed("geometric_cost_difference", value=-0.5, low=-0.6, high=-0.4)
     assert helped[0].startswith("None of 1 results of learned agents")
-    harmed = changed("relative_cost_difference", value=0.5, low=0.4, high=0.6)
+    harmed = changed("geometric_cost_difference", value=0.5, low=0.4, high=0.6)
     assert harmed[0].startswith("1 of 1 results of learned agents is significantly worse")
     assert "`ppo`" in harmed[0]
     assert not any("learned agents" in sentence for sentence in remarks([result._replace(learned=[])]))
@@ -320,8 +320,8 @@ def made(result, costs, behind):
     for name, (value, low, high, kind, nanoseconds) in costs.items():
         own = {"policy": name, "kind": kind}
         records += [
-            like["cost"]._replace(**own, value=1.0 + value, low=1.0 + low, high=1.0 + high),
-            like["relative_cost_difference"]._replace(**own, value=value, low=low, high=high),
+            like["geometric_cost"]._replace(**own, value=1.0 + value, low=1.0 + low, high=1.0 + high),
+            like["geometric_cost_difference"]._replace(**own, value=value, low=low, high=high),
             like["cost"]._replace(**own, metric="nanoseconds", value=nanoseconds, component="compiled"),
         ]
         if name in behind:
@@ -478,7 +478,7 @@ def test_figures_that_plotly_draws_are_valid(result):
 
 
 def test_an_environment_without_a_paper_or_a_track_has_a_report_too(result, command_console):
-    compared = ("relative_cost_difference", "median_cost_ratio", "win_rate", "score", "behind_best")
+    compared = ("geometric_cost_difference", "relative_cost_difference", "score", "behind_best")
     records = [r for r in result.records if r.metric not in compared]
     alone = result._replace(paper="", reference="", learned=[], records=records, track=None, curves=None)
     html = report_html([alone], SETTINGS)

@@ -112,10 +112,21 @@ def test_every_reading_equals_a_naive_filter(recording: Recording, likelihood: A
     numpy.testing.assert_allclose(error[:, :, episode], expected, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("keywords", [{}, {"polar_measurements": True}, {"maneuver_steps": (51, 56)}])
-def test_the_canonical_reading_equals_the_policy_on_every_step(keywords: dict[str, Any]) -> None:
-    policy = evaluate(ID, ["imm"], "paper", 20, seed=3, **keywords)["error"].values[0]
-    plain = interacting_multiple_model(record_measurements(20, seed=3, **keywords), Reading())
+@pytest.mark.parametrize(
+    ("name", "likelihood", "keywords"),
+    [
+        ("imm", "gains used", {}),
+        ("imm", "gains used", {"polar_measurements": True}),
+        ("imm", "gains used", {"maneuver_steps": (51, 56)}),
+        ("imm-steady-state", "R/(1-alpha)", {}),
+    ],
+)
+def test_both_readings_that_are_policies_equal_them_on_every_step(
+    name: str, likelihood: Any, keywords: dict[str, Any]
+) -> None:
+    policy = evaluate(ID, [name], "paper", 20, seed=3, **keywords)["error"].values[0]
+    recording = record_measurements(20, seed=3, **keywords)
+    plain = interacting_multiple_model(recording, Reading(likelihood=likelihood))
     # Tolerance of the project for an IMM over 100 scans; observed 1e-10.
     numpy.testing.assert_allclose(numpy.moveaxis(plain, -1, 0), policy, rtol=0, atol=1e-7)
 

@@ -6,7 +6,8 @@ import functools
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
-from filtergym.compiler import namespace
+from filtergym.compiler import cache, emission, functions, namespace, native, rolling
+from filtergym.compiler.block import block_of
 from filtergym.compiler.c_source import (
     Arrays,
     Parameter,
@@ -15,14 +16,29 @@ from filtergym.compiler.c_source import (
     helper_functions,
     write_program,
 )
+from filtergym.compiler.emission import emit
 from filtergym.compiler.interpretation import interpret
+from filtergym.compiler.library import portable
 from filtergym.compiler.namespace import Traced
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, Result, program
 from filtergym.compiler.rolling import CONSTANTS, SCRATCH, TURN, roll
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.running.rollout import run_episodes
 from test_c_source import SPECIAL, compiled, random_program
 from test_exports_c import replayed
+from test_native_rollout import SEEDS, model_of
 
 from filtergym.exports.traced_filter import ANSWER, MEASUREMENT, STATE
+
+QUICK = [
+    ("ManeuveringTarget", "imm"),
+    ("ManeuveringTarget", "kalman-imm-turn"),
+    ("UavAutopilot", "mehra"),
+    ("UavAutopilot", "bptt-small"),
+    ("LooselyCoupledNavigation", "time-varying"),
+    ("RadarEsmTracking", "forgetting-joint-type"),
+]
+ENVIRONMENTS = [*sorted({environment for environment, _ in QUICK}), "TightlyCoupledNavigation"]
 
 
 def place_in(length, index):
@@ -178,19 +194,105 @@ def test_a_short_program_stays_a_straight_line():
     assert source.body == ["const double v2 = a[0] + a[1];", "b[0] = v2;"]
 
 
-# --- filters
+# --- code of this processor
 
-QUICK = [
-    ("ManeuveringTarget", "imm"),
-    ("ManeuveringTarget", "kalman-imm-turn"),
-    ("ManeuveringTarget", "semi-markov"),
-    ("UavAutopilot", "mehra"),
-    ("UavAutopilot", "bptt-small"),
-    ("LooselyCoupledNavigation", "time-varying"),
-    ("RadarEsmTracking", "forgetting-joint-type"),
-    ("TightlyCoupledNavigation", "fixed-gain"),
-]
-ENVIRONMENTS = sorted({environment for environment, _ in QUICK})
+
+def addresses(code, lane_first, lanes):
+    """Arrays of a program, of random numbers what it reads, and the table with which code runs on them."""
+    rows = [1] * len(lane_first)
+    for operation, arguments, _ in code.steps:
+        if operation == "input":
+            rows[arguments[0]] = max(rows[arguments[0]], arguments[1] + 1)
+    for argument, row, _ in code.results:
+        rows[argument] = max(rows[argument], row + 1)
+    rng = np.random.default_rng(0)
+    numbers = [rng.normal(scale=2.0, size=(count, lanes)) for count in rows]
+    arrays = [
+        np.ascontiguousarray(each.T if turned else each)
+        for each, turned in zip(numbers, lane_first, strict=True)
+    ]
+    table = [code.constants.ctypes.data]
+    for array in arrays:
+        table += [array.ctypes.data, array.shape[1]]
+    return arrays, np.array(table, dtype=np.int64)
+
+
+def assert_loops_are_the_straight_line(code, lane_first, lanes=16):
+    """In LLVM, of both widths of a block; the results lie in the last arrays."""
+    found = []
+    for width, loops in ((8, False), (8, True), (4, True)):
+        text = emit(code, lane_first, portable(), block_of(width), 150, loops)
+        assert ("%turn" in text) <= loops
+        run = native._load("", lambda text=text: text, native.NATIVE, 0)
+        arrays, table = addresses(code, lane_first, lanes)
+        run(table.ctypes.data, 0, lanes)
+        found.append(arrays)
+    for other in found[1:]:
+        assert_same_bits(other, found[0])
+
+
+@pytest.fixture
+def _everything_in_loops(monkeypatch):
+    pytest.importorskip("llvmlite")
+    monkeypatch.setenv(cache.SWITCH, "off")
+    monkeypatch.setattr(emission, "LONG", 0)
+    monkeypatch.setattr(rolling, "SHORTER", 0.0)
+    for function in portable().functions.values():
+        native.llvm().add_symbol(function.symbol, function.address)
+
+
+@pytest.mark.usefixtures("_everything_in_loops")
+@pytest.mark.parametrize("lane_first", [[False, False], [False, True], [True, False]])
+def test_loops_of_llvm_have_the_bits_of_the_straight_line(lane_first):
+    assert_loops_are_the_straight_line(array_program(), lane_first)
+    assert_loops_are_the_straight_line(random_program(1, 300), [False, *lane_first])
+
+
+def programs_of(monkeypatch, environment, names):
+    """All programs that some competitors run, found without compiling them: their results are zeros."""
+    found = {}
+
+    def collect(code, lane_first, library=None):
+        def clear(table, first, last):
+            entries = (ctypes.c_int64 * (1 + 2 * len(lane_first))).from_address(table)
+            for argument, row, _ in code.results:
+                start, stride = entries[1 + 2 * argument], entries[2 + 2 * argument]
+                if not lane_first[argument]:
+                    ctypes.memset(start + 8 * (row * stride + first), 0, 8 * (last - first))
+                for lane in range(first, last) if lane_first[argument] else ():
+                    ctypes.memset(start + 8 * (lane * stride + row), 0, 8)
+
+        found[native._text_of(code), *lane_first] = code, lane_first
+        return native.Code(native.NATIVE(clear))
+
+    monkeypatch.setattr(functions, "native", collect)
+    for name in names:
+        scenario = next(iter(catalogue()[f"filtergym/{environment}-v0"].scenarios))
+        model, maker, kind, report = model_of(environment, name, scenario, horizon=20)
+        run_episodes(model, maker, kind, SEEDS, report)
+    return found.values()
+
+
+@pytest.mark.usefixtures("_everything_in_loops")
+@pytest.mark.parametrize(
+    ("environment", "names"),
+    [
+        ("UavAutopilot", ["mehra"]),
+        ("ManeuveringTarget", ["kalman-imm"]),
+        *(pytest.param(environment, None, marks=pytest.mark.slow) for environment in ENVIRONMENTS),
+    ],
+)
+def test_programs_in_loops_have_the_bits_of_their_straight_lines(environment, names, monkeypatch):
+    known = problem_of(f"filtergym/{environment}-v0").baselines
+    everybody = [name for name in known.names if name not in ("random", *known.smoothers)]
+    programs = programs_of(monkeypatch, environment, names or everybody)
+    long = [each for each in programs if len(each[0].steps) >= (0 if names is None else 200)]
+    assert long
+    for code, lane_first in long:
+        assert_loops_are_the_straight_line(code, lane_first)
+
+
+# --- filters
 
 
 def rest():

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR, SemiMarkov
+from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE, SemiMarkov
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
@@ -88,15 +88,15 @@ def squared_pace(x):
 def begun(filter, kind, x, P):
     """State of a mode that begins, of position and velocity."""
     if kind == "thrust":
-        return np.append(x, [0.0, 0.0]), padded(P, [filter.thrust**2] * 2)
+        return np.append(x, [0.0, 0.0]), padded(P, [filter.prior.thrust**2] * 2)
     pace = math.sqrt(squared_pace(x))
-    return np.append(x, kind / pace), padded(P, [(filter.turn_spread / pace) ** 2])
+    return np.append(x, kind / pace), padded(P, [(filter.prior.turn_spread / pace) ** 2])
 
 
 def predicted(filter, kind, x, P, dt):
     step = np.array([dt**2 / 2, dt])
-    Q = filter.noise**2 * np.kron(np.outer(step, step), np.eye(2))
-    change = filter.change**2 * dt / T
+    Q = filter.prior.noise**2 * np.kron(np.outer(step, step), np.eye(2))
+    change = filter.prior.change**2 * dt / T
     if kind == "rest":
         F = block_transition(dt, 2)
     elif kind == "thrust":
@@ -110,8 +110,8 @@ def predicted(filter, kind, x, P, dt):
 def enumerated(filter, initial, measurements, b):
     """Posterior moments and log-likelihoods of all sequences of kinds and durations, none merged."""
     hazard = filter.hazard[:, 0]
-    kinds = {"thrust": (1.0 - filter.turning) * filter.begin}
-    kinds |= {turn: filter.turning * filter.begin / len(filter.turns) for turn in filter.turns}
+    kinds = {"thrust": (1.0 - filter.prior.turning) * filter.prior.begin}
+    kinds |= {turn: filter.prior.turning * filter.prior.begin / len(filter.turns) for turn in filter.turns}
     found = [(0.0, "rest", 0, initial.mean[:, b], initial.covariance[..., b])]
     answers = []
     for m in measurements:
@@ -125,7 +125,7 @@ def enumerated(filter, initial, measurements, b):
                 if ends == 0.0:
                     continue
                 free, x, P = log_weight + math.log(ends), x[:4], P[:4, :4]
-            branches.append((free + math.log(1.0 - filter.begin), "rest", 0, x, P))
+            branches.append((free + math.log(1.0 - filter.prior.begin), "rest", 0, x, P))
             for other, probability in kinds.items():
                 branches.append((free + math.log(probability), other, 1, *begun(filter, other, x, P)))
         found = []
@@ -216,7 +216,7 @@ def test_stays_near_the_enumeration_where_it_merges(model):
 def test_survives_what_its_prior_rules_out():
     # Jumps of 3000 sigma leave no hypothesis a weight that a float64 can hold.
     model = make_model(ID, None, "random", detection_probability=(1.0, 1.0), scan_jitter=(0.0, 0.0))
-    for settings in ({}, {"hazards": (0.0, 1.0)}, VAGUE_PRIOR):
+    for settings in ({}, {"hazards": (0.0, 1.0)}, VAGUE._asdict()):
         filter = SemiMarkov(model.task, **settings)
         initial, measurements, _ = answers_of(model, filter, 12)
         asked = Asked(filter)
@@ -262,14 +262,14 @@ def test_zero_hypotheses_is_the_estimator_bit_for_bit(steered):
 
 def probabilities_after(bank, state, measurement, action):
     after = bank.act(state, measurement, np.array(action)[:, None] + np.zeros(LANES))
-    return np.concatenate([table.probability for table in after.track])
+    return np.concatenate([table.probability for table in after.own.track])
 
 
 @pytest.mark.parametrize(("index", "factor"), [(0, 3.0), (1, 9.0), (2, 1.5)])
 def test_hypotheses_multiplies_odds(steered, index, factor):
     bank, scans, _ = steered
-    ages, straight = bank.filter.ages, bank.filter.straight_ages
-    end = straight + ages * (1 + len(bank.filter.turns))
+    ages, straight = bank.own.ages, bank.own.straight_ages
+    end = straight + ages * (1 + len(bank.own.turns))
     raised = [range(straight, end, ages), [0], range(straight + ages, end)][index]
     for state, measurement in scans[:6]:
         action = 0.7 * np.eye(6)[index]
@@ -289,14 +289,14 @@ def test_hypotheses_scales_what_is_weighed(steered):
         after = bank.act(state, measurement, action)
         there = measurement.available > 0.0
         for i, exponent in enumerate((0.5, -0.4, -0.4)):
-            before, found = state.track[i].unpack(), after.track[i].unpack()
+            before, found = state.own.track[i].unpack(), after.own.track[i].unpack()
             result = contaminated_normal.update_position(
                 before.mean,
                 1.25**exponent * before.covariance,
                 measurement.position[:, None],
                 1.25**0.8 * measurement.variance[:, None],
-                bank.filter.outliers,
-                bank.filter.outlier_factor,
+                bank.own.prior.outliers,
+                bank.own.prior.outlier_factor,
             )
             np.testing.assert_allclose(found.mean, np.where(there, result.mean, before.mean), rtol=1e-12)
             expected = np.where(there, result.covariance, before.covariance)

@@ -20,11 +20,11 @@ from filtergym.compiler import namespace as traced_namespace
 from filtergym.compiler.functions import Function
 from filtergym.compiler.program import Graph
 from filtergym.compiler.vector_functions import VectorFunction
-from filtergym.envs.engine import registration
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.linear.state_space import Measurement
 from gymnasium.utils.env_checker import check_env
+from own_models import forget, make_models, simulate
 
 import filtergym
 from filtergym.exports.c_source import export_c
@@ -42,16 +42,7 @@ PLAIN = {"f": F, "h": H, "Q": Q, "R": R, "mean": [0, 1], "covariance": np.eye(2)
 @pytest.fixture
 def make():
     """Make an environment with a name of this test's own; forgotten afterwards."""
-    made = []
-
-    def state_space(**keywords):
-        id = f"mine/Model{len(made)}-v0"
-        made.append(id)
-        return filtergym.state_space(id, **{**PLAIN, **keywords})
-
-    yield state_space
-    for id in made:
-        forget(id)
+    yield from make_models(PLAIN)
 
 
 @pytest.fixture
@@ -71,11 +62,6 @@ def example(request, tmp_path_factory):
     forget(id)
 
 
-def forget(id):
-    for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
-        table.pop(id, None)
-
-
 def lorenz(x, order=5, T=0.02):
     """KalmanNet's transition: the Taylor series of the matrix exponential, applied to the state."""
     A = [[-10.0, 10.0, 0.0], [28.0 - x[2], -1.0, 0.0], [x[1], 0.0, -8.0 / 3.0]]
@@ -84,23 +70,6 @@ def lorenz(x, order=5, T=0.02):
         term = [sum(A[i][k] * term[k] for k in range(3)) * (T / j) for i in range(3)]
         answer = [a + b for a, b in zip(answer, term, strict=True)]
     return answer
-
-
-def simulate(cls, steps, episodes, seed=0, backend="numpy", control=None, **keywords):
-    """Truths and measurements of some episodes and the final state of the bank's filter at every one."""
-    model = make_model(cls, control, backend=backend, **keywords)
-    rng = np.random.default_rng(seed)
-    noise = model.task.noise
-    episode = model.begin(
-        rng.random((noise.uniforms, episodes)), rng.standard_normal((noise.initial_normals, episodes))
-    )
-    start, kept = episode, []
-    action = np.zeros((*model.action_space.shape, episodes))
-    for _ in range(steps):
-        row = [rng.standard_normal((noise.normals, episodes)), rng.random((noise.row_uniforms, episodes))]
-        episode = model.act(model.measure(episode, np.concatenate(row)), action)
-        kept.append((episode.truth, episode.measurement, model.mean(episode), model.covariance(episode)))
-    return start, kept
 
 
 def begin(cls):
@@ -540,12 +509,16 @@ def test_what_is_no_timed_model_is_refused(make, wrong, sentence):
         make(**wrong)
 
 
-def test_the_page_on_time_runs(capsys):
+@pytest.mark.parametrize(
+    ("block", "id", "lines"),
+    [(3, "mine/Irregular-v0", 4), (4, "mine/Pendulum-v0", 0), (5, "mine/Cell-v0", 2), (6, "mine/Boat-v0", 1)],
+)
+def test_the_pages_models_run(capsys, block, id, lines):
     try:
-        exec(compile(BLOCKS[3][1], "page", "exec"), {})
+        exec(compile(BLOCKS[block][1], "page", "exec"), {})
     finally:
-        forget("mine/Irregular-v0")
-    assert len(capsys.readouterr().out.splitlines()) == 4
+        forget(id)
+    assert len(capsys.readouterr().out.splitlines()) == lines
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no compiler")
@@ -584,7 +557,7 @@ def test_another_interval_than_the_models_is_refused(make, time):
         ({"R": np.eye(2)}, r"R must be finite numbers of shape \(1, 1\)"),
         ({"names": ["one"]}, "names and units must be 2 each"),
         ({"weights": [0.0, 0.0]}, "weights must not be negative, nor all zero"),
-        ({"filter_model": {"F": F}}, "filter_model says f, h, Q or R, got 'F'"),
+        ({"filter_model": {"F": F}}, "filter_model says f, Q, h or R, got 'F'"),
         ({"hypotheses": [{"h": np.eye(2), "R": np.eye(2)}]}, "all models must measure as many numbers"),
         ({"hypotheses": [{"Q": Q}], "transition": [[0.9, 0.2], [0.5, 0.5]]}, "transition must hold probabilities"),
         ({"horizon": 0}, "horizon must be"),
@@ -593,7 +566,7 @@ def test_another_interval_than_the_models_is_refused(make, time):
         ({"mean": ["x", 1]}, "mean must be numbers, got"),
         ({"names": 5}, "names must be a sequence of words, got 5"),
         ({"hypotheses": [5]}, "hypotheses must be a sequence of models"),
-        ({"filter_model": 5}, "filter_model says f, h, Q or R by name, got 5"),
+        ({"filter_model": 5}, "filter_model says f, Q, h or R, got 5"),
         ({"sampling_interval": "x"}, "sampling_interval must be a finite number"),
         ({"switching": np.eye(2)}, "switching must be True or False"),
     ],
@@ -608,7 +581,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
     """Its commands, on a simulated drive whose odometer speaks at every second measurement."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "car.py").write_text(BLOCKS[4][1], encoding="utf-8")
+    (tmp_path / "car.py").write_text(BLOCKS[7][1], encoding="utf-8")
     try:
         made = filtergym.record(importlib.import_module("car").Car.id, episodes=1, horizon=150, jitter=0.9)
         gps, odometry = made.measurements["values"][0].T
@@ -620,7 +593,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
         ):
             text = "\n".join([header, *(",".join(map(str, row)).replace("nan", "") for row in rows.tolist())])
             (tmp_path / file).write_text(text, encoding="utf-8")
-        for line in BLOCKS[5][1].splitlines():
+        for line in BLOCKS[8][1].splitlines():
             code, shown, errors = command(*shlex.split(line)[1:])
             assert (code, bool(shown)) == (0, True), errors
     finally:

@@ -217,7 +217,13 @@ def test_commands_take_a_table(make, tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as end:
             main()
         assert end.value.code in (0, None), capsys.readouterr()
-    assert "measurement noise" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "measurement noise" in shown
+    assert f"filtergym evaluate {problem_of(ID).name} --policy" in shown.replace("\n", " ")
+    monkeypatch.setattr(sys, "argv", ["filtergym", "tune", ID, "--policy", "extended", "--truth", "log.csv"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "--truth is for a recording" in capsys.readouterr().err
     for words in (["--rename", "t"], ["--rename", "t=time,"], ["--rename", "t=time=x"]):
         monkeypatch.setattr(sys, "argv", ["filtergym", "evaluate", ID, "--recording", "log.csv", *words])
         with pytest.raises(SystemExit) as end:

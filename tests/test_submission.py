@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import shlex
 import shutil
 import sys
@@ -13,6 +14,7 @@ import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.competitors import isolated_estimator
 from filtergym.evaluation.running.parallel import Workers
 
 from filtergym import submission as submissions
@@ -28,6 +30,7 @@ from filtergym.submission import (
     write_submission,
 )
 
+WALL = isolated_estimator.landlock_version() > 0
 ID = "filtergym/ManeuveringTarget-v0"
 AGENTS = PRETRAINED / "ManeuveringTarget-v0"
 ROOT = Path(__file__).parent.parent
@@ -106,7 +109,7 @@ def test_results_are_those_of_an_evaluation(honest):
         if r.policy == "bptt-small" and r.window == "all"
     }
     figures = [f for f in read_submission(honest / "agent.json")[0].results if f.metric != TIME]
-    assert {f.metric for f in figures} >= {"cost", "relative_cost_difference", "anees", "rmse"}
+    assert {f.metric for f in figures} >= {"cost", "geometric_cost_difference", "anees", "rmse"}
     for figure in figures:
         assert (figure.value, figure.low, figure.high) == pytest.approx(
             known[figure.metric, figure.component], rel=1e-12
@@ -136,7 +139,7 @@ def narrower(figure):
     figure["high"] -= 1e-3 * (figure["high"] - figure["low"])
 
 
-@pytest.mark.parametrize("metric", ["cost", "relative_cost_difference", "win_rate", "anees", "rmse"])
+@pytest.mark.parametrize("metric", ["cost", "geometric_cost_difference", "anees", "rmse"])
 @pytest.mark.parametrize("change", [lower, narrower])
 def test_an_edited_number_does_not_hold(metric, change, edited, command, run_once):
     def edit(content):
@@ -178,6 +181,18 @@ def test_rounding_holds_and_times_are_not_compared(honest):
     slower = [msgspec.structs.replace(f, value=3.0 * f.value) if f.metric == TIME else f for f in known]
     assert slower != list(known)
     assert deviation(slower, known) == (0.0, "")
+
+
+def test_what_is_no_number_never_holds(found):
+    import msgspec
+
+    for number in (math.nan, None):
+        for name in ("value", "low"):
+            odd = [msgspec.structs.replace(f, **{name: number}) for f in found]
+            assert not deviation(found, odd).holds
+    assert not deviation(odd, found).holds
+    nothing = [msgspec.structs.replace(f, value=None, low=None, high=None) for f in found]
+    assert not deviation(nothing, nothing).holds
 
 
 # --- arrays swapped
@@ -291,8 +306,9 @@ def test_source_runs_only_when_it_is_trusted(trap, edited, command):
     assert "its class Mine" in shown
     assert Path("read_me.py").read_text(encoding="utf-8") == SPRING.format(str(trap)) + MINE
     assert not trap.exists()
-    assert command("verify", path, "--trust")[0] == 0
-    assert trap.exists()
+    # It runs where nothing can be written, or where the system has no such wall, it has written what it wants.
+    assert command("verify", path, "--trust")[0] == (0 if trap.exists() else 2)
+    assert trap.exists() == (not WALL)
 
 
 @pytest.mark.parametrize(
@@ -322,15 +338,12 @@ def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, comman
 @pytest.mark.parametrize(
     ("further", "sentence"),
     [
-        ("Mine.kind = 'reference'\n", "holds a reference, which may know what no sensor says"),
-        ("Mine.kind = 'bound'\n", "may know what no sensor says"),
-        ("Mine.kind = 'smoother'\nMine.smooth = Mine.update\n", "only policies and estimators"),
-        ("Mine.task_keywords = {'range_sigma': 1.0}\n", "asks for parameters of its own"),
-        ("del Mine\n", "has no 'Mine'"),
-        ("Mine = 3\n", "'Mine' is no competitor"),
-        ("1 / 0\n", "cannot run the source of edited.json: ZeroDivisionError"),
-        ("import another_file_of_mine\n", "cannot run the source of edited.json: ModuleNotFoundError"),
-        ("def (\n", "cannot run the source of edited.json: SyntaxError"),
+        ("Mine.kind = 'reference'\n", "only an estimator"),
+        ("Mine.task_keywords = {'range_sigma': 1.0}\n", "in the environment as it is"),
+        ("del Mine\n", "'Mine' is no estimator"),
+        ("1 / 0\n", "'source of edited.json' takes no part: ZeroDivisionError"),
+        ("import filtergym\n", "'source of edited.json' takes no part: ModuleNotFoundError"),
+        ("def (\n", "'source of edited.json' takes no part: SyntaxError"),
     ],
 )
 def test_source_that_cannot_compete_is_refused(further, sentence, edited, command):

@@ -13,6 +13,7 @@ from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE, FaultHypotheses
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from filtergym.envs.tightly_coupled_navigation.satellite_faults import SatelliteFaults
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -228,6 +229,47 @@ def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
     others = numpy.ones((4, 8), dtype=bool)
     others[place, lanes] = False
     assert abs(errors - before)[others].max() < 3.0
+
+
+def test_the_bank_over_satellite_faults_believes_the_fault_that_is_there():
+    """Before it begins, nothing; then that of the satellite. Its mean is that of the members it believes."""
+    keywords = {"ramp_start": (0.4, 0.4), "ramp_jump": (30.0, 30.0), "horizon": 50}
+    model = make_model(ID, scenario="satellite-bias", **keywords)
+    found = []
+
+    class Watched(SatelliteFaults):
+        def update(self, state, given):
+            answer = super().update(state, given)
+            found.append(answer)
+            return answer
+
+    estimator = Watched(model.task)
+    for episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
+        truth = episode.truth
+    place, lanes = truth.faults.ramp_satellite.astype(int), numpy.arange(8)
+    assert found[38].weights[0].min() > 0.9
+    last = found[-1]
+    assert last.weights.sum(axis=0) == pytest.approx(1.0, rel=1e-12)
+    assert last.weights[1 + place, lanes].min() > 0.9
+    expected = sum(w * member.mean for w, member in zip(last.weights, last.members, strict=True))
+    numpy.testing.assert_allclose(estimator.mean(last), expected, rtol=1e-12)
+    apart = [member.mean - expected for member in last.members]
+    spread = sum(
+        w * (member.covariance + d[:, None] * d[None])
+        for w, member, d in zip(last.weights, last.members, apart, strict=True)
+    )
+    # Positions of millions of metres differ by metres.
+    numpy.testing.assert_allclose(estimator.covariance(last), spread, rtol=1e-6, atol=1e-6)
+
+
+def test_without_faults_the_bank_over_satellite_faults_is_its_first_member():
+    model = make_model(ID, scenario="random", horizon=10)
+    both = [SatelliteFaults(model.task, begins=0.0), FaultHypotheses(model.task)]
+    ends = []
+    for estimator in both:
+        *_, (episode, _) = rollout(model, estimator, episode_seeds("test", 4, 4), kind="estimator")
+        ends.append(episode.filter.own)
+    numpy.testing.assert_array_equal(ends[0].mean, ends[1].mean)
 
 
 def test_levels_of_a_rate_find_the_noisy_one():

@@ -214,7 +214,7 @@ def test_what_the_sensors_hide_is_not_measured(hidden):
 def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     model = make("paper", control)
     *_, (_, _, _, state) = drive(model, 8, 7, 5)
-    expected = model.filter.feedback(state.filter, state.measurement)
+    expected = model.feedback(state.filter, state.measurement)
     row = numpy.zeros((model.task.noise.normals, 8))
     far = expected.copy()
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture

@@ -445,7 +445,6 @@ def test_step_metrics_by_hand() -> None:
     assert found["mean_output", "steady"] == pytest.approx(1.0)
     assert found["output_variance", "steady"] == pytest.approx(2 * 0.03**2)
     assert found["tracking_rmse", "steady"] == pytest.approx(0.03)
-    assert found["lost_loops", "all"] == 0.0
 
 
 def test_times_never_reached_are_cut_off_not_nan() -> None:
@@ -505,8 +504,8 @@ def test_lost_loops_are_counted_and_every_number_stays_finite() -> None:
     assert numpy.isfinite(dataset["cost"].values).all()
     assert numpy.abs(dataset["output"].values).max() == 1e4
     found = {(r.policy, r.metric, r.window): r for r in tidy_records(dataset)}
-    assert found["raw-sensors", "lost_loops", "all"].value == pytest.approx(1.0)
-    assert found["kalman", "lost_loops", "all"].value == 0.0
+    assert found["raw-sensors", "lost_tracks", "all"].value == pytest.approx(1.0)
+    assert found["kalman", "lost_tracks", "all"].value == 0.0
     skipped = ("score", "peak_rmse")
     assert all(r.value is not None for r in found.values() if r.metric not in skipped)
 

@@ -36,8 +36,6 @@ FALSE_ALARM = 1e-4
 """Probability of an alarm at a measurement of a filter whose covariance is right."""
 RISK = 1e-3
 """Integrity risk: how often the error may be beyond the protection level."""
-LOST = 10.0
-"""Error over the nominal standard deviation of a measurement, for each axis, beyond which the track is lost."""
 UNITS = {
     "recovery_time": "s",
     "not_recovered": "1",
@@ -46,7 +44,6 @@ UNITS = {
     "false_alarms": "1",
     "protection_level": "m",
     "beyond_protection_level": "1",
-    "lost_tracks": "1",
 }
 """Of the metrics."""
 
@@ -136,7 +133,6 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     found = {
         "recovery_time": times[:, None] * T,
         "not_recovered": numpy.where(numpy.isnan(times), math.nan, times == longest)[:, None],
-        "lost_tracks": (size > LOST * nominal).any(axis=1)[:, None].astype(float),
     }
     nees = run["nees"].values
     quantile = float(chi_square_quantile(1.0 - RISK, p.axes))
@@ -163,7 +159,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     ``recovery_time`` after an outage and the share of runs that do not recover within a second (``not_recovered``).
     ``detection_time`` of spoofing that is detected, the share that is not while it lasts (``missed_spoofing``), and
     the share of measurements with an alarm before anything is wrong (``false_alarms``). Mean ``protection_level`` and
-    the share of measurements with an error beyond it; the share of episodes in which the track is ever lost.
+    the share of measurements with an error beyond it.
     """
     present = {name: sums for name, sums in gathered.averaged.items() if sums[0, 1]}
     return [

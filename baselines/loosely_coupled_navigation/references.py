@@ -42,14 +42,11 @@ class ErrorState(NamedTuple):
     """``(N,)`` each, the same for every axis."""
 
 
-class Matched:
-    """The Kalman filter told the draw of the episode: the noise levels of INS and receiver, sample by sample, the
-    coloured error's, and when the receiver is pulled off, and how fast.
-
-    The errors of every episode are Gaussian once these are known, so this is the filter of least mean square error.
+class _Matched:
+    """The Kalman filter told the draw of the episode. Errors are Gaussian once that is known, so it is the filter of
+    least mean square error.
     """
 
-    kind = "reference"
     traceable = True
     knows = (
         "the true intensities of all noises, every change of the receiver's, each outlier, and onset, end and rate of "
@@ -108,6 +105,14 @@ class Matched:
         )
         return state, likelihood
 
+
+class Matched(_Matched):
+    """The Kalman filter told the draw of the episode, the estimate of least mean square error: the noise levels of INS
+    and receiver, sample by sample, the coloured error's, and when the receiver is pulled off, and how fast.
+    """
+
+    kind = "reference"
+
     def update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
@@ -116,14 +121,12 @@ class Matched:
         return measurement.ins - memory.delta, self.eye * memory.covariance.ins.position, memory, likelihood
 
 
-class MatchedCovariance(Matched):
+class MatchedCovariance(_Matched):
     """The variance of ``matched``: least mean square error of an estimator that takes the motion from the INS."""
 
     kind = "bound"
 
-    def update(  # type: ignore[override]  # a bound gives mean squares in place of an estimate
-        self, measurement: Measurement, truth: Truth, memory: ErrorState
-    ) -> tuple[Array, ErrorState]:
+    def update(self, measurement: Measurement, truth: Truth, memory: ErrorState) -> tuple[Array, ErrorState]:
         """Variance of every axis, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

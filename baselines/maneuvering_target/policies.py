@@ -5,7 +5,7 @@ Equation numbers and readings are those of the task's paper (Bakulev, Sychev, Ng
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy
 
@@ -24,7 +24,11 @@ from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
 
 
 class InteractingMultipleModel(Policy):
-    """The paper's algorithm: weights by Bayes' rule, equations (12)-(14)."""
+    """The paper's algorithm: weights by Bayes' rule, equations (12)-(14).
+
+    Reading: S = P + R in the likelihood (11), P the covariance that belongs to the gains in use. Of five readings it is
+    the one that reproduces the paper's claim about the best gains, and not the strongest.
+    """
 
     control = "weights"
     traceable = True
@@ -42,6 +46,15 @@ class InteractingMultipleModel(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """State the posterior probabilities as weights."""
         return self.probabilities(observation), None
+
+
+class SteadyStateInteractingMultipleModel(InteractingMultipleModel):
+    """The paper's algorithm under the stronger reading: S = R / (1 - alpha) in the likelihood (11).
+
+    The paper does not print this covariance. It is that of a Kalman filter that has settled to the gain alpha.
+    """
+
+    task_keywords: ClassVar[dict[str, Any]] = {"likelihood_covariance": "steady-state"}
 
 
 class HardInteractingMultipleModel(InteractingMultipleModel):
@@ -109,7 +122,7 @@ class AdaptiveGain(Policy):
     alpha falls linearly from the larger gain to the smaller one over seven scans, at the start (scans 1 to
     8) and after every alarm. Reading: the paper does not describe the detector; here the normalised
     innovation squared of one scan, both axes, against the chi-square limit of ``false_alarm_probability``,
-    and no alarm while a ramp runs, which is what the one complete ramp of its figure 3 shows.
+    and no alarm while a ramp runs, the first one included, which is what the one complete ramp of its figure 3 shows.
     """
 
     control = "gain"
@@ -136,7 +149,11 @@ class AdaptiveGain(Policy):
 
 
 class RearmingAdaptiveGain(AdaptiveGain):
-    """The same with an alarm during the ramp starting it again: an equally ordinary detector."""
+    """The same with an alarm during the ramp starting it again: an equally ordinary detector.
+
+    Reading: the paper sets alpha to the larger gain "if a manoeuvre is detected" and makes no exception for the first
+    ramp, so an alarm restarts that one, too. At the first scan an alarm changes nothing: the ramp begins there.
+    """
 
     rearm = True
 
@@ -179,6 +196,7 @@ BASELINES = Baselines(
     environment="filtergym/ManeuveringTarget-v0",
     policies={
         "imm": InteractingMultipleModel,
+        "imm-steady-state": SteadyStateInteractingMultipleModel,
         "zero": ZeroEvidence,
         "hard-imm": HardInteractingMultipleModel,
         "adaptive": AdaptiveGain,
@@ -193,6 +211,7 @@ BASELINES = Baselines(
     references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
+    stronger_paper="imm-steady-state",
     score_reference="known-turn",
     log_families=log_families,
     tunable=TUNABLE,
@@ -202,6 +221,7 @@ BASELINES = Baselines(
     best_constant="fixed-best",
     benchmark=(
         "imm",
+        "imm-steady-state",
         "adaptive",
         "adaptive-rearm",
         "fixed-low",

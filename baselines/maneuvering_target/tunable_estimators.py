@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import log10
 from typing import Any
 
-from ...envs.maneuvering_target.semi_markov import TRAINING_PRIOR, VAGUE_PRIOR, SemiMarkov
+from ...envs.maneuvering_target.semi_markov import TRAINING, VAGUE, SemiMarkov, SemiMarkovPrior
 from ..table import Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .data_association import (
@@ -24,12 +24,12 @@ SEMI_MARKOV_VAGUE = Variant(
     SemiMarkov,
     "The semi-Markov Gaussian sum with one vague prior for all flights: manoeuvres twice as often as in training, of "
     "any length, disturbed, and measurements that may be outliers.",
-    **VAGUE_PRIOR,
+    prior=VAGUE,
 )
 SEMI_MARKOV_VAGUE_DATA_ASSOCIATION = Variant(
     SemiMarkovDataAssociation,
     "`semi-markov-vague`, each of whose hypotheses weighs all plots of a scan; without clutter it is that filter.",
-    **VAGUE_PRIOR,
+    prior=VAGUE,
 )
 
 ESTIMATORS = {
@@ -81,17 +81,17 @@ def _semi_markov(
     return apply
 
 
-def _semi_markov_limits(prior: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
+def _semi_markov_limits(prior: SemiMarkovPrior) -> dict[str, tuple[float, float, float]]:
     return {
-        "log10_begin": (-3.0, log10(prior["begin"]), -1.0),
-        "turning": (0.1, prior["turning"], 0.9),
-        "log10_leave": (-1.5, log10(prior["hazards"][-1]), -0.3),
-        "log10_thrust": (0.0, log10(prior["thrust"]), 1.0),
-        "turn_gentle": (0.5, prior["turns"][0], 3.0),
-        "turn_steep": (3.0, prior["turns"][1], 7.0),
-        "turn_spread": (0.3, prior["turn_spread"], 2.0),
-        "log10_noise": (-3.0, log10(prior["noise"]), 0.0),
-        "log10_change": (-3.0, log10(prior["change"]), 0.0),
+        "log10_begin": (-3.0, log10(prior.begin), -1.0),
+        "turning": (0.1, prior.turning, 0.9),
+        "log10_leave": (-1.5, log10(prior.hazards[-1]), -0.3),
+        "log10_thrust": (0.0, log10(prior.thrust), 1.0),
+        "turn_gentle": (0.5, prior.turns[0], 3.0),
+        "turn_steep": (3.0, prior.turns[1], 7.0),
+        "turn_spread": (0.3, prior.turn_spread, 2.0),
+        "log10_noise": (-3.0, log10(prior.noise), 0.0),
+        "log10_change": (-3.0, log10(prior.change), 0.0),
     }
 
 
@@ -125,23 +125,23 @@ TUNABLE = {
     ),
     "semi-markov": tunable(
         SemiMarkov,
-        _semi_markov(SemiMarkov, TRAINING_PRIOR["hazards"]),
-        **_semi_markov_limits(TRAINING_PRIOR),
+        _semi_markov(SemiMarkov, TRAINING.hazards),
+        **_semi_markov_limits(TRAINING),
     ),
     "semi-markov-pda": tunable(
         SemiMarkovDataAssociation,
-        _semi_markov(SemiMarkovDataAssociation, TRAINING_PRIOR["hazards"]),
-        **_semi_markov_limits(TRAINING_PRIOR),
+        _semi_markov(SemiMarkovDataAssociation, TRAINING.hazards),
+        **_semi_markov_limits(TRAINING),
     ),
     "semi-markov-vague": tunable(
         SEMI_MARKOV_VAGUE,
-        _semi_markov(SEMI_MARKOV_VAGUE, VAGUE_PRIOR["hazards"]),
-        **_semi_markov_limits(VAGUE_PRIOR),
+        _semi_markov(SEMI_MARKOV_VAGUE, VAGUE.hazards),
+        **_semi_markov_limits(VAGUE),
     ),
     "semi-markov-vague-pda": tunable(
         SEMI_MARKOV_VAGUE_DATA_ASSOCIATION,
-        _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE_PRIOR["hazards"]),
-        **_semi_markov_limits(VAGUE_PRIOR),
+        _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE.hazards),
+        **_semi_markov_limits(VAGUE),
     ),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
     "sage-husa": tunable(

@@ -81,7 +81,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
         measurement = measurement._replace(readings=readings)  # the bank weighs each by its availability
         filters = self.bank.predict(state.filters, measurement)
-        filters = self.bank.weigh_by_bayes(filters, state.filters.last_action)
+        filters = self.bank.weigh_by_bayes(filters, state.filters.action)
         return HuberState(filters, Likelihood.told(self.bank.records(filters, measurement)))
 
     def mean(self, state: HuberState) -> Array:

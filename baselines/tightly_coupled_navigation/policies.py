@@ -19,6 +19,7 @@ from ...envs.tightly_coupled_navigation.fault_hypotheses import (
     FaultPrior,
 )
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from ...envs.tightly_coupled_navigation.satellite_faults import SatelliteFaults
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import SensorAlarm
@@ -264,11 +265,13 @@ BASELINES = Baselines(
         "huber": Huber,
         "huber-stuck-check": HuberStuckCheck,
         **HYPOTHESES_ON_FAULTS,
+        "satellite-fault-bank": SatelliteFaults,
     },
     references={"known-mode": KnownMode},
     bounds={"known-mode-bound": KnownModeBound},
     score_paper="multi-hypothesis",
     score_reference="known-mode",
+    headline_episodes=5000,
     tunable=TUNABLE,
     fallback="stuck-exclusion",
     alarm=SensorAlarm,

@@ -19,9 +19,6 @@ from .theory import stationary
 if TYPE_CHECKING:
     import xarray
 
-LOST_SIGMAS = 100.0
-"""Tracking error, over the nominal sigma of the output's sensor, beyond which a loop counts as lost."""
-
 FALSE_ALARMS = 0.02
 """False alarms that an episode of consistent innovations may have on average, which sets the limit of the alarm."""
 
@@ -52,7 +49,6 @@ def gather(run: "xarray.Dataset") -> MetricInputs:
     squares = [(tracking[:, times] ** 2).mean(axis=1) for times in slices.values()]
     each = {
         "tracking_square": numpy.stack(squares, axis=1),
-        "far": (numpy.abs(tracking) > LOST_SIGMAS * math.sqrt(task.cost_unit)).any(axis=1),
     }
     if "steady" in slices:
         each["settled"] = output[:, slices["steady"]].mean(axis=1)
@@ -115,8 +111,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
     measurement, mean over the window. ``tracking_rmse``: root mean square of output minus command.
     ``innovation_autocorrelation``: at lag one, of the output sensor's normalised innovation (node 4); zero
-    for a consistent filter. ``lost_loops``: share of episodes whose tracking error ever exceeds
-    ``LOST_SIGMAS``. In window "steady" of a stationary linear loop ``*_theory``: the same by the Lyapunov
+    for a consistent filter. In window "steady" of a stationary linear loop ``*_theory``: the same by the Lyapunov
     equation. With a step command ``overshoot``, ``rise_time`` (to 90 %), ``settling_time`` (to 5 %) of the
     response averaged over episodes, whose noise falls with the root of their number, and ``mean_output``
     when settled; times that are not reached are cut off at the end of the window "transient".
@@ -167,7 +162,6 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
             if each["detection"][:, i + 1].any():
                 share = bootstrap.interval(factor * shares[i] / numpy.maximum(shares[i + 1], 1e-300))
                 found.append(Measure(metric, "", "all", share, unit_of))
-    found.append(Measure("lost_loops", "", "all", bootstrap.estimate(each["far"].astype(float)), "1"))
     if task.parameters.step_size:
         found += _step_response(task, gathered, windows, unit, bootstrap)
     return found

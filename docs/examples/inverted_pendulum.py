@@ -207,7 +207,7 @@ class InvertedPendulum(Task):
         self.H = self.constant([[1.0, 0.0]])
         self.R = self.constant([[p.angle_sigma**2]])
 
-    def feedback(self, mean: Array, measurement: Any) -> Array:
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
         """Torque over the moment of inertia, rad/s^2, ``(N,)``."""
         angle_gain, rate_gain = self.parameters.gains
         return -(angle_gain * mean[0] + rate_gain * mean[1])

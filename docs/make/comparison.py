@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import Problem
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
@@ -15,6 +14,7 @@ from records import BenchmarkRecords, ResultRecord
 
 from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
 from filtergym.reports.tables.terminal_tables import (
+    HEADLINE,
     INCONSISTENT,
     against_paper,
     consistency,
@@ -24,7 +24,6 @@ from filtergym.reports.tables.terminal_tables import (
 
 STRONGEST = 4
 """Classical competitors that the page shows."""
-DIFFERENCE = "relative_cost_difference"
 
 
 class Comparison(NamedTuple):
@@ -35,24 +34,28 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def compared_policies(problem: Problem, records: Sequence[Record]) -> list[str]:
+def compared_policies(measured: BenchmarkRecords) -> list[str]:
     """Names that the page shows, of those in the records, in the order of its columns.
 
     Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
-    algorithm; it and the best constant action, tuned; the reference whose score is 1. The others stand in the records.
-    On a narrow screen only the first columns are seen without scrolling.
+    algorithm in all its readings; it and the best constant action, tuned; the reference whose score is 1. The others
+    stand in the records. On a narrow screen only the first columns are seen without scrolling.
     """
-    known = problem.baselines
+    problem, records = measured
+    known, paper = problem.baselines, measured.paper
     of_default = [record for record in records if record.scenario == problem.task.default_scenario]
     classical = [
         place.name
         for place in ranking(of_default or records)
-        if place.role != "learned" and place.name != known.score_paper
+        if place.role != "learned" and place.name != paper
     ]
+    readings = [paper, known.score_paper]
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
-    strongest, paper = classical[:STRONGEST], known.score_paper
-    wanted = dict.fromkeys((*pretrained_agents(problem.id), *strongest, paper, *tuned, known.score_reference))
+    strongest = classical[:STRONGEST]
+    wanted = dict.fromkeys(
+        (*pretrained_agents(problem.id), *strongest, *readings, *tuned, known.score_reference)
+    )
     return [name for name in wanted if name in present]
 
 
@@ -62,10 +65,10 @@ def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
 
 
 def _cells(name: str, records: Sequence[Record]) -> list[str]:
-    """Cost against the paper's algorithm, median, wins, ANEES and time of a competitor in one scenario."""
+    """Cost against the paper's algorithm, lost tracks, means, ANEES and time of a competitor in one scenario."""
     values = _by_name(records)
     return [
-        with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
+        with_interval(values.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005),
         *against_paper(values, name),
         consistency(values.get((name, "anees", "state", "all"))),
         column_of_times(records).get(name, "-"),
@@ -96,7 +99,15 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
                     score_text(values.get((name, "score", "", "all"))),
                 ]
             )
-    header = ["environment", "name", "origin", "cost against the paper's, %", "median, %", "wins, %", "ANEES"]
+    header = [
+        "environment",
+        "name",
+        "origin",
+        "cost against the paper's, %",
+        "lost tracks, %",
+        "means, %",
+        "ANEES",
+    ]
     header.append(TIME_TITLE)
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
@@ -106,7 +117,7 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     rows = []
     for problem, records in found:
         for name in pretrained_agents(problem.id):
-            own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
+            own = [r for r in records if (r.policy, r.metric) == (name, HEADLINE) and r.value is not None]
             if not own:
                 continue
             worst = max(own, key=lambda record: record.value or 0.0)
@@ -120,9 +131,24 @@ def harm(found: Sequence[BenchmarkRecords]) -> Grid:
                     f"{sum((record.low or 0.0) > HARM for record in own)} of {len(own)}",
                 ]
             )
-    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "median, %"]
+    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "lost tracks, %"]
     last = f"scenarios more than {100.0 * HARM:g} % above the paper"
-    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", TIME_TITLE, last], rows)
+    return Grid("Where learned agents do worst", [*header, "means, %", "ANEES", TIME_TITLE, last], rows)
+
+
+def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
+    """Whose covariance does not fit the errors on the training distribution, of all ranked but random actions."""
+    rows = []
+    for measured in found:
+        records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
+        values = _by_name(records)
+        for place in ranking(records) if records else ():
+            both = [values.get((place.name, metric, "state", "all")) for metric in ("anees", "median_anees")]
+            texts = [consistency(record) for record in both]
+            if place.name != "random" and any(INCONSISTENT in text for text in texts):
+                rows.append([bare_name(measured.problem.id), f"`{place.name}`", *texts])
+    title = "Covariances that do not fit the errors on the training distribution"
+    return Grid(title, ["environment", "name", "ANEES, mean", "ANEES, median episode"], rows)
 
 
 def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
@@ -137,7 +163,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
     """
     problem, records = measured
     cls, known = problem.task, problem.baselines
-    paper, columns = problem.paper, compared_policies(problem, records)
+    paper, columns = measured.paper, compared_policies(measured)
     if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     others = [name for name in columns if name != paper]
@@ -173,16 +199,16 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             ],
         )
 
-    def typical(scenario: str, name: str) -> str:
-        median, wins = against_paper(by_window, name, (scenario,))
-        return "-" if median == "-" else f"{median}<br>{wins}"
+    def tail(scenario: str, name: str) -> str:
+        lost, means = against_paper(by_window, name, (scenario,))
+        return "-" if means == "-" else f"{lost}<br>{means}"
 
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
     grids = [
         grid(
             f"Cost against `{paper}`, %",
             others,
-            lambda scenario, name: _two_lines(found.get((scenario, name, DIFFERENCE, "")), 100.0),
+            lambda scenario, name: _two_lines(found.get((scenario, name, HEADLINE, "")), 100.0),
             judged=True,
         ),
         grid(
@@ -191,10 +217,9 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             lambda scenario, name: _two_lines(found.get((scenario, name, metric, component)), 1.0),
         ),
         grid(
-            f"Episode by episode: median difference of the cost to `{paper}`, %, and share of episodes with a lower "
-            "cost, %",
+            f"The tail: share of lost tracks, %, and difference of the mean cost to that of `{paper}`, %",
             columns,
-            typical,
+            tail,
         ),
         grid(
             "Consistency: mean NEES over the dimension; 1 is consistent, "
@@ -215,7 +240,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
             scenario + ("\n(training)" if cls.scenarios[scenario].training else ""), {}
         )
         for name in others:
-            record = found.get((scenario, name, DIFFERENCE, ""))
+            record = found.get((scenario, name, HEADLINE, ""))
             interval = () if record is None else (record.value, record.low, record.high)
             percent = tuple(100.0 * x for x in interval if x is not None)
             if len(percent) == 3:
@@ -242,12 +267,12 @@ def _two_lines(record: Record | None, scale: float) -> str:
 
 
 def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
-    """Table over all environments, in Markdown: "best" of every origin, or where agents do "harm".
+    """Table over all environments, in Markdown: "best" of every origin, where agents do "harm", or "covariances".
 
     Raises:
         ValueError: for another word.
     """
-    tables = {"best": summary, "harm": harm}
+    tables = {"best": summary, "harm": harm, "covariances": covariances}
     if which not in tables:
         raise ValueError(f"no table {which!r}: there are {', '.join(tables)}")
     grid = tables[which](found)
@@ -256,7 +281,7 @@ def overview_markdown(found: Sequence[BenchmarkRecords], which: str) -> str:
 
 def comparison_markdown(comparison: Comparison, measured: BenchmarkRecords, record: ResultRecord) -> str:
     """Sentences and tables of one environment, with the command that made the records."""
-    records, paper = measured.records, measured.problem.paper
+    records, paper = measured.records, measured.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"

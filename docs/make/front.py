@@ -13,6 +13,8 @@ from filtergym.evaluation.running.times import points_of_records, times_of_recor
 from filtergym.papers.grid import markdown_table
 from records import BenchmarkRecords
 
+from filtergym.reports.tables.terminal_tables import HEADLINE
+
 BUDGETS = (100, 300, 1000, 5000)
 """Nanoseconds that a measurement may take."""
 
@@ -20,12 +22,13 @@ BUDGETS = (100, 300, 1000, 5000)
 def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
     """Return what is drawn of each environment that the records have times of, in its training distribution."""
     panels = []
-    for problem, records in found:
+    for measured in found:
+        problem, records = measured
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
             panels.append(
-                Panel(bare_name(problem.id), points, known.score_paper, known.score_reference, learned)
+                Panel(bare_name(problem.id), points, measured.paper, known.score_reference, learned)
             )
     return panels
 
@@ -58,11 +61,7 @@ def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
     for problem, records in found:
         own = [r for r in records if r.scenario == problem.task.default_scenario]
         times, learned = times_of_records(own), pretrained_agents(problem.id)
-        costs = [
-            r
-            for r in own
-            if r.metric == "relative_cost_difference" and r.kind in RANKED and r.value is not None
-        ]
+        costs = [r for r in own if r.metric == HEADLINE and r.kind in RANKED and r.value is not None]
         best: list[list[Record | None]] = [[], []]
         for budget in BUDGETS:
             quick = [r for r in costs if r.policy in times and times[r.policy].nanoseconds <= budget]

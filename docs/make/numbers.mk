@@ -57,7 +57,7 @@ numbers: tuned trained shipped evaluated
 tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
-evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark \
+evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
   $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
@@ -96,8 +96,14 @@ $(DONE)/seeds-%: $(DONE)/ship-%
 
 # The second command alone makes the records of all environments anew from a finished benchmark, wherever it lies.
 $(DONE)/benchmark: $(shipped)
-	$(BIN)/filtergym benchmark --full --jobs $(JOBS) --out results/full
+	$(BIN)/filtergym benchmark --full --half-width 2 --jobs $(JOBS) --out results/full
 	$(record) results/full/results.json
+	$(finish)
+
+$(DONE)/coverage: $(DONE)/ship-ManeuveringTarget $(DONE)/ship-LooselyCoupledNavigation $(DONE)/ship-TightlyCoupledNavigation
+	$(BIN)/python benchmarks/interval_coverage.py > build/coverage.txt
+	$(table) build/coverage.txt --name interval_coverage \
+	  --command "python benchmarks/interval_coverage.py"
 	$(finish)
 
 $(DONE)/flights: $(DONE)/ship-ManeuveringTarget

@@ -27,6 +27,11 @@ BENCHMARK, SEEDS = "benchmark", "seeds"
 METRICS = (
     *(
         "cost",
+        "geometric_cost",
+        "geometric_cost_difference",
+        "lost_tracks",
+        "best_share",
+        "median_anees",
         "relative_cost_difference",
         "median_cost_ratio",
         "win_rate",
@@ -66,6 +71,11 @@ class BenchmarkRecords(NamedTuple):
 
     problem: Problem
     records: list[Record]
+
+    @property
+    def paper(self) -> str:
+        """Name of the paper's algorithm that costs are compared with."""
+        return self.problem.paper_among({record.policy for record in self.records})
 
 
 def environment_id(name: str) -> str:

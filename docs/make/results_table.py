@@ -10,6 +10,8 @@ from records import BenchmarkRecords, ResultRecord
 
 from filtergym.reports.tables.ranking import ranking_sentence
 from filtergym.reports.tables.terminal_tables import (
+    COST_NOTE,
+    HEADLINE,
     INCONSISTENT,
     against_paper,
     consistency,
@@ -19,7 +21,7 @@ from filtergym.reports.tables.terminal_tables import (
     with_interval,
 )
 
-COLUMNS = ("difference", "median", "wins", "ns", "control", "cost", "rmse", "anees", "score")
+COLUMNS = ("difference", "lost", "means", "ns", "control", "cost", "rmse", "anees", "score")
 """Of the table, in their order; a page may choose."""
 
 
@@ -72,11 +74,11 @@ def results_grid(
     titles: dict[str, dict[str, Callable[[str], str]]] = {
         "difference": {
             f"cost against `{paper}`, %": lambda name: with_interval(
-                found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+                found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
             )
         },
-        "median": {"median, %": lambda name: against_paper(found, name)[0]},
-        "wins": {"wins, %": lambda name: against_paper(found, name)[1]},
+        "lost": {"lost tracks, %": lambda name: against_paper(found, name)[0]},
+        "means": {"means, %": lambda name: against_paper(found, name)[1]},
         "ns": {TIME_TITLE: lambda name: times.get(name, "-")},
         "control": {"control": lambda name: controls[name]},
         "cost": {"mean cost": number("cost")},
@@ -95,12 +97,12 @@ def results_grid(
 
 def results_markdown(found: BenchmarkRecords, record: ResultRecord, scenario: str = "") -> str:
     """Return the whole table of one environment and scenario, who is best, and what the columns are, in Markdown."""
-    records, paper = scenario_records(found, scenario), found.problem.paper
+    records, paper = scenario_records(found, scenario), found.paper
     note = (
-        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. "
-        f"ANEES is the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a "
-        f"factor of two. {TIME_NOTE}\n\n{_where(records)} {record.origin}"
+        f"{ranking_sentence(records, paper)} Lowest cost first. {COST_NOTE} ANEES is the mean NEES over the dimension; "
+        f"{INCONSISTENT} marks a covariance that is off by more than a factor of two. {TIME_NOTE}\n\n{_where(records)} "
     )
+    note += record.origin
     return "\n".join([*markdown_table(*results_grid(records, paper)), "", note])
 
 
@@ -121,7 +123,7 @@ def chosen_markdown(
     Raises:
         ValueError: for an unknown column, one that several environments cannot share, and if there is nothing.
     """
-    columns = columns or ("difference", "median", "wins", "ns", "anees", "score")
+    columns = columns or ("difference", "lost", "means", "ns", "anees", "score")
     if wrong := [column for column in columns if column not in COLUMNS]:
         raise ValueError(f"no column {wrong[0]!r}: there are {', '.join(COLUMNS)}")
     if "rmse" in columns and len(found) > 1:
@@ -133,11 +135,10 @@ def chosen_markdown(
     for name, (own, record) in found.items():
         records = scenario_records(own, scenario, policies)
         # With everybody's records, so that the front and the best are those of the whole table.
-        titles, lines = results_grid(scenario_records(own, scenario), own.problem.paper, columns)
+        titles, lines = results_grid(scenario_records(own, scenario), own.paper, columns)
         wanted = {f"`{record.policy}`" for record in records}
         header = [
-            title if len(found) == 1 else title.replace(f"`{own.problem.paper}`", "the paper's")
-            for title in titles
+            title if len(found) == 1 else title.replace(f"`{own.paper}`", "the paper's") for title in titles
         ]
         first = [name] if len(found) > 1 else []
         rows += [[*first, *line] for line in lines if line[0] in wanted]

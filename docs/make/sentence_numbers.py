@@ -25,14 +25,16 @@ class Number(NamedTuple):
 
 
 QUANTITIES = {
-    "difference": ("relative_cost_difference", 100.0, "%"),
+    "difference": ("geometric_cost_difference", 100.0, "%"),
+    "means": ("relative_cost_difference", 100.0, "%"),
+    "lost": ("lost_tracks", 100.0, "%"),
     "behind": ("behind_best", 100.0, "%"),
     "wins": ("win_rate", 100.0, "%"),
     "cost": ("cost", 1.0, ""),
     "anees": ("anees state", 1.0, ""),
     "score": ("score", 1.0, ""),
 }
-"""Key in the record, scale and unit, by the word in a path; beside them ``median``, ``ns`` and ``rmse COMPONENT``."""
+"""Key in the record, scale and unit, by the word in a path; beside them ``ns`` and ``rmse COMPONENT``."""
 
 
 def record_of(path: str) -> str:
@@ -68,8 +70,6 @@ def _of_benchmark(data: Any, path: str, interval: bool) -> str:
     _, scenario, competitor, quantity = [*path.split("/", 3), *("",) * 4][:4]
     try:
         metrics = data["scenarios"][scenario]["competitors"][competitor]["metrics"]
-        if quantity == "median":
-            return f"{100.0 * (metrics['median_cost_ratio'][0] - 1.0):+.1f} %"
         if quantity == "ns":
             [(value, compiled)] = [
                 (m[0], k.endswith("compiled")) for k, m in metrics.items() if k.startswith("nanos")
@@ -82,7 +82,7 @@ def _of_benchmark(data: Any, path: str, interval: bool) -> str:
     except (KeyError, ValueError):
         raise ValueError(
             f"{path!r} leads nowhere: a path is ENVIRONMENT/SCENARIO/COMPETITOR/QUANTITY, with a quantity of "
-            f"{', '.join(QUANTITIES)}, median, ns, rmse COMPONENT"
+            f"{', '.join(QUANTITIES)}, ns, rmse COMPONENT"
         ) from None
 
 

@@ -1,12 +1,17 @@
-"""What an action means to a bank of filters: mode, weights, evidence."""
+"""What an action means to a bank of filters: mode, weights, evidence; or factors of a filter's settings."""
 
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
 from types import ModuleType
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
+from .filter import Bank, Filter, Input, Measurement, State, TaskT
 from .observation import Array
 
 
@@ -50,3 +55,81 @@ def bank_probabilities(
         uniform = 1.0 / weights.shape[0]
         return xp.where(positive, weights / xp.where(positive, total, 1.0), uniform)
     return imm.mode_posterior(log_predicted, log_likelihood + evidence_scale * xp.clip(action, -1.0, 1.0))
+
+
+class Steerable(Filter[TaskT, Measurement, State]):
+    """A filter with settings that an action multiplies, at one measurement: :meth:`update` is given the logarithms of
+    their factors as action, ``(n, N)``. Without an action it is an estimator.
+    """
+
+    settings: Mapping[str, float]
+    """Factor by which an action of one multiplies each setting: so small that white noise of deviation one, with which
+    a new policy explores, costs a twentieth at most."""
+
+    def heeds(self, measurement: Measurement) -> Array:
+        """One where an action does something, zero where nothing is measured, ``(N,)``."""
+        return 1.0
+
+    def examine(self, state: State, measurement: Measurement) -> Any:
+        """What it makes of a measurement without an action, of which a bank shows something; here its state after it.
+
+        Args:
+            state: after :meth:`predict`.
+            measurement: the same.
+        """
+        return self.update(state, Input(measurement))
+
+
+class SteeredBank(Bank[Any, Any, Any]):
+    """A filter, steered by factors of its settings.
+
+    The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where r_k is what the filter declares. All zero is
+    the filter itself, bit for bit: an agent begins where the strongest classical filter ends.
+
+    The state is a NamedTuple with ``own``, the state of the filter, ``likelihood``, how well that has predicted the
+    measurement, ``action``, the last one, ``(n, N)``, and what else is shown.
+    """
+
+    strong: ClassVar[type[Steerable[Any, Any, Any]]]
+    """Class of the filter."""
+
+    def __init__(self, task: Any, control: str) -> None:
+        super().__init__(task, control)
+        self.own = self.strong(task)
+        factors = self.own.settings.values()
+        self.log_reach = task.constant([math.log(factor) for factor in factors])[:, None]
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number for each setting."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
+
+    @abstractmethod
+    def look(self, state: Any, found: Any, measurement: Any) -> Any:
+        """Return the state with what is shown of a measurement.
+
+        Args:
+            state: with that of the filter after :meth:`predict`.
+            found: what the filter makes of the measurement, see :meth:`Steerable.examine`.
+            measurement: that arrives.
+        """
+
+    def predict(self, state: Any, measurement: Any) -> Any:
+        """Predict as the filter does, and see what it would make of the measurement."""
+        own = self.own.predict(state.own, measurement)
+        return self.look(state._replace(own=own), self.own.examine(own, measurement), measurement)
+
+    def act(self, state: Any, measurement: Any, action: Array) -> Any:
+        """Update as the filter does, with its settings multiplied."""
+        shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
+        logarithms = self.own.heeds(measurement) * self.log_reach * shown
+        own = self.own.update(state.own, Input(measurement, None, logarithms))
+        return state._replace(own=own, action=shown)
+
+    def mean(self, state: Any) -> Array:
+        """That of the filter."""
+        return self.own.mean(state.own)
+
+    def covariance(self, state: Any) -> Array:
+        """That of the filter."""
+        return self.own.covariance(state.own)

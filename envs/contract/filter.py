@@ -153,14 +153,14 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return covariance
 
     def feedback(self, state: State, measurement: Any) -> Any:
-        """Report what a closed loop gives back to the world, by default what follows from the estimate; None in an
-        open loop.
+        """Report what a filter gives back to the world that does not follow from its estimate; None, as by default,
+        where it does, see :meth:`.Task.feedback`.
 
         Args:
             state: after :meth:`start` or :meth:`update`.
             measurement: that it has taken in, or the initial estimate.
         """
-        return self.task.filter_feedback(self, state, measurement)  # type: ignore[attr-defined]
+        return None
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for

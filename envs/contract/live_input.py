@@ -1,11 +1,6 @@
-"""Measurements that come one by one from outside, in place of a simulated world.
-
-A :class:`Feed` stands in a task where a recording would; what comes is made into the task's ``Measurement`` by its
-:class:`LiveInput`.
-"""
+"""Measurements that come one by one from outside: values by their names, made into the task's ``Measurement``."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy
@@ -19,53 +14,6 @@ LARGEST = 1e15
 """Of what a sensor says: nothing in SI units is larger here, and its square is still a number."""
 Memory = dict[str, Any]
 """What an input remembers of the measurements before: arrays ``(..., N)`` by name."""
-
-
-@dataclass(frozen=True)
-class Feed:
-    """Stands in a task in a recording's place: what is measured comes from outside, and nobody knows the truth.
-
-    Args:
-        regular: whether every measurement comes, one sampling interval after the one before.
-        second_sensor: whether a measurement has the fields that only recordings hold.
-        deviations: of measurements that come without, in the names and units of the columns of a log.
-        scan_interval: s; where more time passes between two measurements, scans between have missed the target; None:
-            the time between is one step.
-    """
-
-    regular: bool = False
-    second_sensor: bool = False
-    deviations: tuple[tuple[str, float], ...] = ()
-    scan_interval: float | None = None
-    truth: ClassVar[None] = None
-    has_whole_truth: ClassVar[bool] = False
-
-    def has_interval(self, seconds: float) -> bool:
-        """Whether measurements come that many seconds apart; where times do not matter to the filters, they do."""
-        return True
-
-    def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
-        """No episodes: it goes on as long as measurements come."""
-        return ()
-
-    def world(self, task: "Task") -> Any:
-        """Return the task's own world, whose numbers nobody looks at."""
-        return _WithRecordedFields(task) if self.second_sensor else task.World(task)
-
-
-class _WithRecordedFields:
-    """A task's own world, whose measurements have the fields that only recordings hold."""
-
-    def __init__(self, task: "Task") -> None:
-        self._world: Any = task.World(task)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._world, name)
-
-    def advance(self, *arguments: Any) -> tuple[Any, Any]:
-        """Measure, with zeros in these fields."""
-        truth, measurement = self._world.advance(*arguments)
-        return truth, self._world.add_recorded_fields(measurement)
 
 
 class LiveInput:

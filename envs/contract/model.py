@@ -140,6 +140,15 @@ class Model:
         """State of the filter when the measurement is taken in, by a bank with the action."""
         return self.filter.update(state, Input(measurement, truth, action))
 
+    def feedback(self, state: Any, measurement: Any) -> Any:
+        """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
+        if not self.task.closes_loop:
+            return None
+        own = self.filter.feedback(state, measurement)
+        if own is not None:
+            return own
+        return self.task.feedback(self.filter.mean(state), self.filter.covariance(state), measurement)
+
     # --- what the engine calls
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
@@ -154,7 +163,7 @@ class Model:
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
-        feedback = self.filter.feedback(episode.filter, episode.measurement)
+        feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 

@@ -251,6 +251,38 @@ class Blocks:
         )
 
 
+class DecisionMeans:
+    """The fields that are shown as their means over the measurements for which a decision holds.
+
+    Args:
+        fields: of the observation.
+        interval: measurements for which a decision holds.
+
+    Attributes:
+        columns: positions of these fields; none where a decision holds for one measurement.
+    """
+
+    def __init__(self, fields: Sequence[Field], interval: int) -> None:
+        self.interval = interval
+        self.columns = [i for i, f in enumerate(fields) if f.over_interval == "mean"] if interval > 1 else []
+
+    def add(self, total: Array, observation: Array) -> Array:
+        """Add these fields of an observation, ``(fields, N)``, to their sum since the last decision."""
+        return total + observation[self.columns]
+
+    def show(self, observation: Array, total: Array, xp: ModuleType) -> Array:
+        """Return an observation, ``(fields, N)``, with the means of these fields in their places.
+
+        Args:
+            observation: of the last measurement.
+            total: sum over all measurements since the last decision.
+            xp: array namespace.
+        """
+        means = {column: total[i] / self.interval for i, column in enumerate(self.columns)}
+        rows = range(observation.shape[0])
+        return xp.stack([means.get(i, observation[i]) for i in rows]) if means else observation
+
+
 def _field_names(block: Block) -> list[str]:
     return [f"{block.name}_{part}" for part in block.parts] if block.parts else [block.name]
 

@@ -33,14 +33,19 @@ Arrays inside a task have the batch as their last axis and belong to the namespa
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
 in place.
 
-A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Filter.feedback`
+A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Task.feedback`
 returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
 """
 
+import ast
 import importlib
+import inspect
+import re
+import textwrap
 from abc import ABC
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
@@ -154,6 +159,8 @@ class Task(ABC):
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
+    lost_cost: float | None = None
+    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
     log_reward_unit: float | None = None
     """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below
     ``reward_unit``; None where it is the same."""
@@ -202,6 +209,8 @@ class Task(ABC):
         self.xp = xp
         self.device = device
         self.set_up()
+        self.closes_loop = recording is None and self.is_closed_loop()
+        """Whether an estimate decides what is measured next."""
         if recording is None:
             self.world = self.World(self)
         else:
@@ -284,25 +293,22 @@ class Task(ABC):
             return numpy.full(uniforms.shape[1], self.horizon)
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
-    def feedback(self, mean: Array, measurement: Any) -> Any:
-        """Report what an estimate gives back to the world; None in an open loop. A filter may give back something
-        else, see :meth:`Filter.feedback`.
+    def is_closed_loop(self) -> bool:
+        """Whether an estimate gives something back to the simulated world; by default where :meth:`feedback` is
+        written.
+        """
+        return type(self).feedback is not Task.feedback
+
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
+        """Report what an estimate gives back to the world, in a closed loop. A filter may give back something else, see
+        :meth:`.Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.
+            covariance: that is reported for it, ``(C, C, N)``.
             measurement: that it has taken in, or the initial estimate.
         """
         return None
-
-    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Any:
-        """Report what a filter gives back to the world, by default what follows from its mean (:meth:`feedback`).
-
-        Args:
-            filter: a :class:`~.filter.Filter` that does not say it itself.
-            state: its state, see :meth:`.Filter.feedback`.
-            measurement: that it has taken in, or the initial estimate.
-        """
-        return self.feedback(filter.mean(state), measurement)
 
     def records(self, model: Any, episode: Any, kept: dict[str, Array]) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement, beside what filter and world report; here nothing.
@@ -336,3 +342,24 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
             yield from named_arrays(value, f"{prefix}{name}_")
         elif value is not None:
             yield prefix + name, value
+
+
+def field_words(cls: type) -> dict[str, str]:
+    """What a NamedTuple's text says below each of its fields; nothing where there is no text."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):
+        return {}
+    lines = tree.body if isinstance(tree, ast.ClassDef) else []
+    return {
+        field.target.id: _without_shapes(below.value.value)
+        for field, below in pairwise(lines)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        and isinstance(below.value.value, str)
+    }  # fmt: skip
+
+
+def _without_shapes(text: str) -> str:
+    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
+    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")

@@ -60,7 +60,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         Args:
             truth: at the measurement before.
             noise: ``(normals + row_uniforms, N)``.
-            feedback: of a closed loop, what :meth:`Filter.feedback` returned; else None.
+            feedback: of a closed loop, what :meth:`.Task.feedback` returned; else None.
         """
 
     def state(self, truth: Truth) -> Array:

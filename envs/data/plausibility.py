@@ -31,6 +31,8 @@ SPEED_UNITS = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e
 """Numbers of a unit in one m/s."""
 DEVIATIONS = ("sigma", "std", "stddev", "deviation", "variance", "var", "accuracy", "uncertainty", "rms")
 """Words in the names of columns that say how large errors are."""
+WIDE_BEARINGS = 0.5
+"""Range of bearings from which on those within 2 pi may be radians."""
 
 
 def speeds_of(time: numpy.ndarray, position: numpy.ndarray) -> numpy.ndarray:
@@ -134,8 +136,8 @@ def check_degrees(name: str, values: numpy.ndarray, most: float) -> None:
         )
 
 
-def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma: float) -> None:
-    """Check that bearings are degrees.
+def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma: float) -> list[str]:
+    """Check that bearings are degrees, and return what is noteworthy of them.
 
     Args:
         name: of the column.
@@ -149,13 +151,19 @@ def check_bearings(name: str, time: numpy.ndarray, values: numpy.ndarray, sigma:
     check_degrees(name, values, 360.0)
     there = numpy.isfinite(values)
     if there.sum() < FEWEST or numpy.nanmax(numpy.abs(values)) > 2.0 * math.pi:
-        return
+        return []
     scatter = float(numpy.median(numpy.abs(_deviations(time[there], values[there, None])))) * 1.4826
     if 0.25 < math.degrees(scatter) / sigma < 4.0:
         raise ValueError(
             f"{name} scatters by {scatter:.2g} degrees where {sigma:g} are stated, and stays within 2 pi: is it "
             "radians? else state its deviation"
         )
+    # Whose deviation is in radians, too, scatters as is stated: only a wide range gives it away.
+    if numpy.nanmax(values) - numpy.nanmin(values) > WIDE_BEARINGS:
+        return [
+            f"{name} stays within 2 pi and is taken for degrees, as its deviation: if they are radians, convert both"
+        ]
+    return []
 
 
 def check_extents(names: tuple[str, str], one: numpy.ndarray, other: numpy.ndarray) -> None:

@@ -297,9 +297,11 @@ def read_columns(
         read, names = _rename_aliases(read, names)
     original = {new: old for old, new in zip(in_file, names, strict=True) if new != old}
     time_name = next((name for name in TIME if name in read), None)
+    if not names:
+        raise ValueError("it is empty: a recording needs a line of columns, and rows below it")
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
-            f"it has the columns {list_names(names) or 'none'}, and {cls.id} reads time and "
+            f"it has the columns {list_names(names)}, and {cls.id} reads time and "
             f"{', '.join(log_format.columns)}{_suggest(names, ['time'] * (time_name is None), log_format.columns)}"
         )
     if not len(read):

@@ -1,7 +1,11 @@
-"""The world that replays a recording, in place of a task's own; and what a task measures, asked by measuring once."""
+"""Worlds that replay a recording or take what comes from outside, in place of a task's own; and what a task measures,
+asked by measuring once.
+"""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy
 
@@ -41,9 +45,8 @@ class Tables(NamedTuple):
     last: numpy.ndarray
 
 
-def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, Any]:
-    """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
-    episodes side by side.
+def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
+    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
 
     Args:
         task: on NumPy arrays.
@@ -53,14 +56,14 @@ def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, A
     world = task.World(task)
     draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
     truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
-    bank = Model(task, task.controls[0]).filter
-    feedback = bank.feedback(bank.start(initial), initial)
+    model = Model(task, task.controls[0])
+    feedback = model.feedback(model.start_filter(initial), initial)
     row = numpy.zeros((world.normals + world.row_uniforms, 8))
     row[world.normals :] = 0.5
     measurement = world.advance(truth, row, feedback)[1]
     whole = world.add_recorded_fields(measurement)
     further = {name for name, _ in named_arrays(whole)} - {name for name, _ in named_arrays(measurement)}
-    return initial, whole if further & {*names} else measurement, feedback
+    return initial, whole if further & {*names} else measurement
 
 
 def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
@@ -69,14 +72,13 @@ def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
     Raises:
         ValueError: if what is measured depends on what is estimated.
     """
-    initial, measurement, feedback = measure_examples(task, names)
-    if feedback is not None:
+    if task.closes_loop:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
             "what the sensors said to one estimate is not what they would have said to another, and can be neither "
             "recorded nor replayed"
         )
-    return initial, measurement
+    return measure_examples(task, names)
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
@@ -98,7 +100,35 @@ def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
     return map_arrays(fill, like)
 
 
-class RecordedWorld(World[Task, Replayed, Any]):
+class _ForeignWorld(World[Task, Any, Any]):
+    """What real sensors say, in place of a task's own world.
+
+    Attributes:
+        simulated: the task's own world, which knows what an error costs.
+    """
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.simulated = task.World(task)
+
+    def mask_missing(self, measurement: Any) -> Any:
+        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
+        return self.simulated.mask_missing(measurement)
+
+    def component_readings(self, measurement: Any) -> Array | None:
+        """What it says of the components, as in the task's own world."""
+        return self.simulated.component_readings(measurement)
+
+    def component_deviations(self, measurement: Any) -> Array | None:
+        """What is stated of the errors of that, likewise."""
+        return self.simulated.component_deviations(measurement)
+
+    def error_cost(self, error: Array) -> Array:
+        """What it costs in the task's own world."""
+        return self.simulated.error_cost(error)
+
+
+class RecordedWorld(_ForeignWorld):
     """What the sensors said, in place of a task's own world."""
 
     initial_normals = 1
@@ -107,8 +137,6 @@ class RecordedWorld(World[Task, Replayed, Any]):
     def __init__(self, task: Task, recording: "Recording") -> None:
         super().__init__(task)
         self.recording = recording
-        self.simulated = task.World(task)
-        """The task's own world, which knows what an error costs."""
         plain = type(task)(task.parameters)
         self._initial, self._measurement = measure_once(plain, recording.measurements)
         tables = recording.tables
@@ -134,18 +162,6 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Go on to the next measurement; at the end the last one is said again."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
-
-    def mask_missing(self, measurement: Any) -> Any:
-        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
-        return self.simulated.mask_missing(measurement)
-
-    def component_readings(self, measurement: Any) -> Array | None:
-        """What it says of the components, as in the task's own world."""
-        return self.simulated.component_readings(measurement)
-
-    def component_deviations(self, measurement: Any) -> Array | None:
-        """What is stated of the errors of that, likewise."""
-        return self.simulated.component_deviations(measurement)
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
         """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
@@ -182,10 +198,6 @@ class RecordedWorld(World[Task, Replayed, Any]):
             )
         return self._at(self.tables.truth, self._column(truth))
 
-    def error_cost(self, error: Array) -> Array:
-        """What it costs in the task's own world."""
-        return self.simulated.error_cost(error)
-
     def records(self, truth: Replayed) -> dict[str, Array]:
         """Time since the start of the track, s."""
         return {"seconds": self._at(self.tables.seconds, self._column(truth))}
@@ -193,3 +205,86 @@ class RecordedWorld(World[Task, Replayed, Any]):
     def context(self, truth: Replayed) -> dict[str, Array]:
         """Which recording it is."""
         return {"recording": truth.number}
+
+
+@dataclass(frozen=True)
+class Feed:
+    """Stands in a task in a recording's place: what is measured comes from outside, and nobody knows the truth.
+
+    Args:
+        regular: whether every measurement comes, one sampling interval after the one before.
+        second_sensor: whether a measurement has the fields that only recordings hold.
+        deviations: of measurements that come without, in the names and units of the columns of a log.
+        scan_interval: s; where more time passes between two measurements, scans between have missed the target; None:
+            the time between is one step.
+    """
+
+    regular: bool = False
+    second_sensor: bool = False
+    deviations: tuple[tuple[str, float], ...] = ()
+    scan_interval: float | None = None
+    truth: ClassVar[None] = None
+    has_whole_truth: ClassVar[bool] = False
+
+    def has_interval(self, seconds: float) -> bool:
+        """Whether measurements come that many seconds apart; where times do not matter to the filters, they do."""
+        return True
+
+    def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
+        """No episodes: it goes on as long as measurements come."""
+        return ()
+
+    def world(self, task: Task) -> "LiveWorld":
+        """Return the world of what comes."""
+        return LiveWorld(task, self.second_sensor)
+
+
+class Unknown(NamedTuple):
+    """Truth that nobody knows."""
+
+
+class LiveWorld(_ForeignWorld):
+    """What comes from outside, in place of a task's own world: numbers of a measurement stand in place of its noise.
+
+    Args:
+        task: whose world it is.
+        second_sensor: whether a measurement has the fields that only recordings hold.
+
+    Attributes:
+        initial: an initial estimate, for its names, shapes and types.
+        measurement: a measurement, likewise.
+    """
+
+    def __init__(self, task: Task, second_sensor: bool) -> None:
+        super().__init__(task)
+        self.initial, measurement = measure_examples(type(task)(task.parameters))
+        self.measurement = self.simulated.add_recorded_fields(measurement) if second_sensor else measurement
+        self.initial_normals, self.normals = _count_numbers(self.initial), _count_numbers(self.measurement)
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Unknown, Any]:
+        """Make an initial estimate of its numbers."""
+        return Unknown(), self._fill(self.initial, normals)
+
+    def advance(self, truth: Unknown, noise: Array, feedback: None) -> tuple[Unknown, Any]:
+        """Make a measurement of its numbers."""
+        return truth, self._fill(self.measurement, noise)
+
+    def _fill(self, like: Any, numbers: Array) -> Any:
+        """A NamedTuple of arrays as another, of their numbers one array after the other, ``(numbers, N)``."""
+        parts, first = {}, 0
+        for name, array in named_arrays(like):
+            last = first + math.prod(array.shape[:-1])
+            parts[name] = self.xp.reshape(numbers[first:last], (*array.shape[:-1], numbers.shape[-1]))
+            first = last
+        return fill_arrays(like, parts.__getitem__, self.xp)
+
+    def state(self, truth: Unknown) -> Array:
+        """Raise ValueError: nobody knows it."""
+        raise ValueError(
+            "nobody knows the truth of what comes from outside, so there is no error and no cost"
+        )
+
+
+def _count_numbers(like: Any) -> int:
+    """Numbers of a NamedTuple of arrays in one lane."""
+    return sum(math.prod(array.shape[:-1]) for _, array in named_arrays(like))

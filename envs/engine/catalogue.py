@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import functools
 import importlib
+import importlib.machinery
 import pkgutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -140,6 +141,23 @@ def import_user_module(module: str, refusal: str) -> ModuleType:
         if folder not in FOUND_IN and any(Path(place).is_relative_to(folder) for place in places)
     )
     return found
+
+
+def find_user_module(module: str, refusal: str) -> Path:
+    """Return the file of a module that a user has named, and import nothing.
+
+    Args:
+        module: its name, without dots.
+        refusal: beginning of the error.
+
+    Raises:
+        ValueError: if there is no such file.
+    """
+    with on_path(_SEARCH_FOLDERS):
+        found = importlib.machinery.PathFinder.find_spec(module) if module.isidentifier() else None
+    if found is None or not found.has_location or not str(found.origin).endswith(".py"):
+        raise ValueError(f"{refusal}: there is no file {module}.py where Python looks for modules")
+    return Path(str(found.origin))
 
 
 def import_task(id: str) -> "type[Task]":

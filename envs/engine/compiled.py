@@ -21,7 +21,7 @@ from ..contract.filter import Filter
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 from ..contract.task import Task
-from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, feedback_of, start_filter
+from .programs import PROGRAM_CACHE_SIZE, Programs, Report, begin_world, start_filter
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -123,6 +123,12 @@ class CompiledModel(Model):
             return super().update_filter(state, measurement, action, truth)
         return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
 
+    def feedback(self, state: Any, measurement: Any) -> Any:
+        """What a filter gives back to the world."""
+        if self.filter.in_python:
+            return super().feedback(state, measurement)
+        return self.run(Model.feedback, state, measurement)
+
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
         truth, initial = self.run(begin_world, uniforms, normals)
@@ -130,8 +136,7 @@ class CompiledModel(Model):
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
-        given = episode.filter, episode.measurement
-        feedback = self.filter.feedback(*given) if self.filter.in_python else self.run(feedback_of, *given)
+        feedback = self.feedback(episode.filter, episode.measurement)
         truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 

@@ -21,7 +21,7 @@ from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode, Model
-from ..contract.observation import Array
+from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
@@ -107,12 +107,30 @@ class ModelStepper:
             turned = xp.concat([turned, padding], axis=-1)
         self._action = turned
 
-    def step(self, noise: EpisodeNoise) -> None:
-        """Apply the action and go on to the next measurement."""
-        after = self.model.act(self._episode, self._action)
+    def answer(self) -> None:
+        """Apply the action to the measurement at hand, and report on it."""
+        self._episode = self.model.act(self._episode, self._action)
         if self.report_function is not None:
-            self._report = self.model.run(self.report_function, after)
-        self.load(self.model.measure(after, noise.row))
+            self._report = self.model.run(self.report_function, self._episode)
+
+    def arrive(self, noise: Any) -> None:
+        """Go on to the next measurement, see :meth:`.Stepper.arrive`."""
+        self.load(self.model.measure(self._episode, noise.row))
+
+    def step(self, noise: EpisodeNoise) -> None:
+        """Answer and go on to the next measurement."""
+        self.answer()
+        self.arrive(noise)
+
+    @property
+    def filter_state(self) -> Any:
+        """State of the filter."""
+        return self._episode.filter
+
+    @filter_state.setter
+    def filter_state(self, state: Any) -> None:
+        before = self._episode or Episode((), None, None)
+        self._episode = before._replace(filter=state)
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)``."""
@@ -128,20 +146,20 @@ class ModelStepper:
         """What is shown where it was computed, else None."""
         return self._shown
 
-    def show_means(self, fields: Sequence[int], means: Array) -> None:
-        """Show other values of some fields, ``(fields, width)``."""
-        model, xp = self.model, self.model.task.xp
-        fresh = model.task.constant([[1.0 if i in fields else 0.0] for i in range(len(model.fields))])
-        spread = [
-            means[list(fields).index(i)] if i in fields else 0.0 * means[0] for i in range(len(model.fields))
-        ]
-        self._shown = xp.where(fresh > 0.0, xp.stack(spread), self.observation_by_field())
+    def show(self, observation: Array) -> None:
+        """Show something else, ``(fields, width)``."""
+        self._shown = observation
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
+
+
+def make_stepper(model: Model, report: Report, width: int) -> Stepper | ModelStepper:
+    """Return what steps episodes of a model in its fastest way; arguments as of :class:`ModelStepper`."""
+    return Stepper(model, report, width) if can_step(model, report) else ModelStepper(model, width, report)
 
 
 class Lanes:
@@ -153,6 +171,7 @@ class Lanes:
         beside: what the reward is relative to, run beside it on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
+        report: that will be made of them, in whose code they then begin; default: not known.
 
     Attributes:
         decisions: actions taken in each lane's current episode, ``(count,)``.
@@ -166,6 +185,7 @@ class Lanes:
         beside: RewardBaseline | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
+        report: Report | None = None,
     ) -> None:
         self.model = model
         self.task = task = model.task
@@ -173,7 +193,7 @@ class Lanes:
         self.width = round_up_lanes(count)
         self.beside = beside
         self._models = [model] if beside is None else [model, beside.model]
-        self._on_start = on_start
+        self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
@@ -186,9 +206,7 @@ class Lanes:
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
         self._lengths = numpy.full(count, self.decisions_per_episode)
         """Decisions of each lane's episode."""
-        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
-        self._averaged = averaged if task.decision_interval > 1 else []
-        """Fields that are shown as their means over a decision."""
+        self._means = DecisionMeans(model.fields, task.decision_interval)
 
     # --- episodes
 
@@ -221,6 +239,8 @@ class Lanes:
         if self._on_start is not None:
             self._on_start(self.model.begin(*start))
         if everyone:
+            if not self._moving and self._report is not None:
+                self._reporting(self._report)
             self._moving = self._moving or self._by_functions()
             for stepper in self._moving:
                 stepper.begin(*start, noise)
@@ -269,10 +289,10 @@ class Lanes:
             for stepper in steppers:
                 stepper.step(self.noise)
             answers.append((own.report(), steppers[1].report() if self.beside else None))
-            if self._averaged:
-                total = total + own.observation_by_field()[self._averaged]
-        if self._averaged:
-            own.show_means(self._averaged, total / self.task.decision_interval)
+            if self._means.columns:
+                total = self._means.add(total, own.observation_by_field())
+        if self._means.columns:
+            own.show(self._means.show(own.observation_by_field(), total, self.task.xp))
         self.decisions += 1
         return answers
 
@@ -338,7 +358,7 @@ class Lanes:
             for stepper in self._moving:
                 stepper.report_function = report
             return self._moving
-        for i, (old, new) in enumerate(zip(before, after, strict=True)):
+        for i, (old, new) in enumerate(zip(before, after, strict=bool(before))):
             new.load(old.episode(), old.observation_by_field() if i == 0 else None)
         self._moving = after
         return after
@@ -348,7 +368,7 @@ class Lanes:
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
-                averaged = i == 0 and self._averaged
+                averaged = i == 0 and self._means.columns
                 new.load(old.episode(), old.observation_by_field().copy() if averaged else None)
 
     @property

@@ -31,7 +31,7 @@ Report = Callable[[Model, Episode], Any]
 def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
     """Filter after the measurement, and what it gives back to the world."""
     after = model.filter.update(state, Input(measurement, truth, action))
-    return after, model.filter.feedback(after, measurement)
+    return after, model.feedback(after, measurement)
 
 
 def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
@@ -58,12 +58,7 @@ def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
     state = model.filter.initialise(Input(initial, truth))
-    return state, model.filter.feedback(state, initial)
-
-
-def feedback_of(model: Model, state: Any, measurement: Any) -> Any:
-    """What a filter gives back to the world."""
-    return model.filter.feedback(state, measurement)
+    return state, model.feedback(state, initial)
 
 
 class Parts(NamedTuple):

@@ -18,14 +18,15 @@ from ...compiler.functions import (
     run_over,
 )
 from ...compiler.sequence import CallSequence, Moving, moving_array
-from ..contract.model import Episode, Model
+from ..contract.model import Episode
 from ..contract.observation import Array
-from .compiled import can_step
 from .episode_noise import EpisodeNoise
 from .programs import Report
 
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
+ANSWERING = 2
+"""Of the four parts of a step the first ones: update and report; the others let a measurement arrive."""
 MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
 
@@ -52,6 +53,9 @@ class Stepper:
         self._world_of, self._shared = world_of, 0 if world_of is None else truths + measured
         count = itertools.count()
         self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
+        count = itertools.count()
+        self._filter_template = map_arrays(lambda _: next(count), episode.filter)
+        self._filter_kinds = self._kinds[truths + measured :]
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
 
         def memory(outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
@@ -80,9 +84,13 @@ class Stepper:
             kept, own = iter(staying), iter(going)
             self._copies.append([*world[: self._shared], *(next(kept if s else own) for s in stays)])
         first, second = self._copies
-        written = memory(update.outputs)
+        written = self._written = memory(update.outputs)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
+        self._updated: list[list[numpy.ndarray]] = []
+        """State of the filter after the update, of each copy."""
+        self._is_put = False
+        """Whether it is not that of the last update, but one that was put in its place."""
         world, start = model.programs.start
         begun = model.programs.first
         self._drawn = memory(world.inputs)
@@ -93,6 +101,7 @@ class Stepper:
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
             updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
+            self._updated.append(updated[:states])
             ahead, predicted = then[: truths + measured], then[truths + measured :]
             step = [
                 update.bound(given, written),
@@ -180,8 +189,33 @@ class Stepper:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
+    def answer(self) -> None:
+        """Apply the action to the measurement at hand, and report on it."""
+        for call in self._calls[self._now][:ANSWERING]:
+            call(0, self.width)
+
+    def arrive(self, noise: Any) -> None:
+        """Go on to the next measurement, whose numbers are those of an :class:`EpisodeNoise`, or a
+        :class:`.MeasurementRow`.
+        """
+        calls = self._begin if self._is_put else self._calls
+        self._is_put = False
+        self._run(calls[self._now][ANSWERING:], noise)
+
+    @property
+    def filter_state(self) -> Any:
+        """State of the filter after the last :meth:`answer`, in arrays that stay as they are."""
+        arrays = self._written if self._is_put else self._updated[self._now]
+        return _copy_numbers(self._filter_template, arrays, self._filter_kinds)
+
+    @filter_state.setter
+    def filter_state(self, state: Any) -> None:
+        for memory, values in zip(self._written, leaves(state), strict=False):
+            memory[...] = values
+        self._is_put = True
+
     def step(self, noise: EpisodeNoise) -> None:
-        """Apply the action and go on to the next measurement."""
+        """Answer and go on to the next measurement, some lanes after the others through both."""
         self._stepped += self.width
         if self._stepped > UNCOUNTED:
             for call in itertools.chain(*self._calls):
@@ -189,11 +223,11 @@ class Stepper:
             self._stepped = 0
         self._run(self._calls[self._now], noise)
 
-    def _run(self, calls: Sequence[Call], noise: EpisodeNoise) -> None:
+    def _run(self, calls: Sequence[Call], noise: Any) -> None:
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         if self._world_of is None:
-            calls[2].table[self._row_entry] = noise.address
+            calls[-2].table[self._row_entry] = noise.address
         calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
         if self.width <= TILE:
@@ -264,9 +298,9 @@ class Stepper:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
 
-    def show_means(self, fields: Sequence[int], means: numpy.ndarray) -> None:
-        """Show other values of some fields, ``(fields, width)``."""
-        self._shown[:, fields] = means.T
+    def show(self, observation: numpy.ndarray) -> None:
+        """Show something else, ``(fields, width)``."""
+        self._shown[...] = observation.T
 
     def observation(self, count: int) -> numpy.ndarray:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -280,116 +314,6 @@ class Stepper:
         self._shown, self._given = memory, False
         for *_, predict in (*self._calls, *self._begin):
             predict.replace(len(predict.arrays) - 1, memory)
-
-
-class FilterStepper:
-    """The filter of a compiled model in memory of its own, to which measurements come from outside.
-
-    Args:
-        model: compiled.
-        report: made of measurement and filter after every update.
-        width: lanes, a multiple of eight.
-    """
-
-    def __init__(self, model: Any, report: Report, width: int) -> None:
-        update, _, predict, episode = model.programs.later
-        tell = model.programs.report_program(report)
-        truths, measured, states = (len(leaves(part)) for part in episode)
-        count = itertools.count()
-        self._template, self._kinds = (
-            map_arrays(lambda _: next(count), episode.filter),
-            _kinds(leaves(episode.filter)),
-        )
-        self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
-        self.width = width
-
-        def memory(arrays: Sequence[Leaf]) -> list[numpy.ndarray]:
-            return [empty_lanes(leaf.shape, width) for leaf in arrays]
-
-        unknown = memory(tell.inputs[:truths])
-        self._measurement = memory(tell.inputs[truths : truths + measured])
-        predicted, self._shown = (
-            memory(predict.outputs[:-1]),
-            numpy.empty((width, *predict.outputs[-1].shape)),
-        )
-        written, self._reported = memory(update.outputs), memory(tell.outputs)
-        self._state, self._action = written[:states], empty_lanes(update.inputs[-1].shape, width)
-        self._action[...] = 0.0
-        given = [*predicted, *self._measurement, self._action]
-        self._kept = [(own, given[i]) for own, i in zip(written, update.same, strict=True) if i is not None]
-        self._predict = predict.bound([*self._state, *self._measurement], [*predicted, self._shown])
-        self._update = update.bound(given, written)
-        self._tell = tell.bound([*unknown, *self._measurement, *self._state], self._reported)
-
-    @property
-    def state(self) -> Any:
-        """State of the filter, in arrays that stay as they are."""
-        return _copy_numbers(self._template, self._state, self._kinds)
-
-    @state.setter
-    def state(self, state: Any) -> None:
-        for memory, values in zip(self._state, leaves(state), strict=True):
-            memory[...] = values
-
-    def predict(self, measurement: Any) -> None:
-        """Let a measurement come."""
-        for memory, values in zip(self._measurement, leaves(measurement), strict=True):
-            memory[...] = values
-        self._predict(0, self.width)
-
-    def observe(self) -> Array:
-        """What is shown, ``(fields, width)``, until the next measurement."""
-        return self._shown.T
-
-    def update(self, action: Array) -> None:
-        """Take the measurement in."""
-        self._action[...] = action
-        self._update(0, self.width)
-        for memory, values in self._kept:
-            memory[...] = values
-
-    def report(self) -> Any:
-        """Return the report, in arrays ``(..., width)`` that stay as they are."""
-        self._tell(0, self.width)
-        return _copy_numbers(self._report_template, self._reported, self._report_kinds)
-
-
-class ModelFilterStepper:
-    """The same for any model, by its functions, in arrays that never change.
-
-    Args:
-        model: any.
-        report: as of :class:`FilterStepper`.
-        width: likewise.
-    """
-
-    def __init__(self, model: Model, report: Report, width: int) -> None:
-        self._model, self._report, self.width = model, report, width
-        self.state: Any = None
-        self._measurement: Any = None
-
-    def predict(self, measurement: Any) -> None:
-        """Let a measurement come."""
-        self._measurement = measurement
-        self.state = self._model.predict_filter(self.state, measurement)
-
-    def observe(self) -> Array:
-        """What is shown, ``(fields, width)``."""
-        return self._model.observe(Episode(None, self._measurement, self.state))
-
-    def update(self, action: Array) -> None:
-        """Take the measurement in."""
-        self.state = self._model.update_filter(self.state, self._measurement, action)
-
-    def report(self) -> Any:
-        """Return the report, in arrays ``(..., width)``."""
-        return self._model.run(self._report, Episode(None, self._measurement, self.state))
-
-
-def filter_stepper(model: Model, report: Report, width: int) -> FilterStepper | ModelFilterStepper:
-    """Return what steps the filter of a model alone."""
-    kind = FilterStepper if can_step(model, report) else ModelFilterStepper
-    return kind(model, report, width)
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:

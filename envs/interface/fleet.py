@@ -22,7 +22,7 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import reference
+from ..engine.reward import OWN_PAY, reference
 from .specification import plain
 
 ROOM = 8
@@ -163,7 +163,8 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        return Lanes(model, count, reference(self._kind, model), longest=self._longest)
+        beside, report = reference(self._kind, model), OWN_PAY[self._kind]
+        return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
         """Lanes of a task, made when they are first asked for."""

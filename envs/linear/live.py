@@ -15,22 +15,41 @@ UNEVEN = 0.01
 
 
 class StateSpaceInput(LiveInput):
-    """Values of the sensors. A timed model takes any interval, also none where it then stands still; any other says the
-    state one sampling interval later, and nothing else.
+    """Values of the sensors and inputs, by their names or those of the sensors together. A timed model takes any
+    interval, also none where it then stands still; any other says the state one sampling interval later, and nothing
+    else.
     """
 
     def __init__(self, task: "StateSpace", initial: Any, measurement: Any, tracks: int) -> None:
+        self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
+        self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
-        self.fuses = all(model.stands_still for model in task.definition.filters)
+        own = task.definition
+        self.fuses = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return what the sensors say; the interval follows from the times."""
+        """Return what the sensors and inputs say; the interval follows from the times."""
         values, at_start = super().describe()
-        return {name: text for name, text in values.items() if name != "interval"}, at_start
+        found = {name: text for name, text in values.items() if name not in ("interval", "inputs")}
+        sensors = {channel.name: f"shape ({channel.count},)" for channel in self.groups}
+        names = {**sensors, **dict.fromkeys(self.measured, "a number")}
+        held = dict.fromkeys(
+            self.inputs, "an input that acted since the last measurement; the last one holds on"
+        )
+        return {**names, **held, **found}, at_start
+
+    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Start with inputs that nobody knows yet."""
+        initial, memory = super().start(time, given)
+        return initial, {**memory, "inputs": numpy.full((len(self.inputs), self.tracks), numpy.nan)}
 
     def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Make the measurement; refuse an interval that the model does not know."""
         interval, own = time - memory["time"], self.parameters.sampling_interval
+        values = self._by_name(values)
+        if self.inputs:
+            memory = {**memory, "inputs": self._hold(memory["inputs"], values)}
+            values["inputs"] = memory["inputs"]
         if self.measurement.interval is not None:
             return super().measure(memory, time, {**values, "interval": interval})
         wrong = numpy.abs(interval - own) > UNEVEN * own
@@ -41,3 +60,40 @@ class StateSpaceInput(LiveInput):
                 "came, or write f(x, dt) and Q(dt)"
             )
         return super().measure(memory, time, values)
+
+    def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values with what the sensors say in one array, ``(m, N)``.
+
+        Raises:
+            ValueError: where it is said twice.
+        """
+        whole = ["values", *(channel.name for channel in self.groups), *self.measured]
+        named = [name for name in whole if values.get(name) is not None]
+        if named in ([], ["values"]):
+            return dict(values)
+        rows = numpy.stack([self.read(values, name) for name in self.measured])
+        for channel in self.groups:
+            given, own = self.read(values, channel.name, (channel.count,)), rows[channel.places]
+            if (numpy.isfinite(given) & numpy.isfinite(own)).any():
+                raise ValueError(
+                    f"{channel.name} has {self.measured[channel.first]} already: give one of them"
+                )
+            rows[channel.places] = numpy.where(numpy.isfinite(given), given, own)
+        if "values" in named:
+            raise ValueError(f"values has {named[1]} already: give one of them")
+        return {**values, "values": rows}
+
+    def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
+        """Inputs, ``(p, N)``: what came, and else what came before.
+
+        Raises:
+            ValueError: where nothing has come so far.
+        """
+        given = numpy.stack([self.read(values, name) for name in self.inputs])
+        found = numpy.where(numpy.isfinite(given), given, before)
+        if not numpy.isfinite(found).all():
+            lacking = self.inputs[int((~numpy.isfinite(found)).any(axis=1).argmax())]
+            raise ValueError(
+                f"{self.task.id} needs {lacking} at the first measurement; later the last one holds on"
+            )
+        return found

@@ -1,10 +1,11 @@
-"""Tables of measurements as those of a state-space model: a column for each number that h returns.
+"""Tables of measurements as those of a state-space model: a column for each number that h returns, and for each input.
 
-The track starts with the model's mean and covariance one interval before the first row, as in the simulation.
+An input acted since the row before; where a cell is empty the last one held on. The track starts with the model's mean
+and covariance one interval before the first row, as in the simulation.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy
@@ -13,7 +14,7 @@ from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..data.recorded_tables import UNEVEN, Columns
 
 if TYPE_CHECKING:
-    from .state_space import StateSpaceDefinition
+    from .equations import StateSpaceDefinition
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""
@@ -21,33 +22,27 @@ OF_EPISODES = ("horizon", "decision_interval", "jitter", "process_noise", "measu
 """Parameters of a simulation, which a log has not."""
 
 
-def state_space_log_format(
-    definition: "StateSpaceDefinition",
-    names: Sequence[str],
-    units: Sequence[str],
-    defaults: Mapping[str, Any],
-) -> LogFormat:
+def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping[str, Any]) -> LogFormat:
     """Tables of a state-space model.
 
     Args:
         definition: the models.
-        names: of the m numbers that are measured.
-        units: of each.
         defaults: parameters that the author has set.
     """
     one = len(definition.filters) == 1
+    columns = {name.lower(): unit for name, unit in definition.measured.items()}
+    acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
     return LogFormat(
-        {name.lower(): unit for name, unit in zip(names, units, strict=True)},
-        functools.partial(_read, definition, tuple(name.lower() for name in names), dict(defaults)),
+        {**columns, **acting},
+        functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,
-        predicted=tuple(Predicted(name, unit, name) for name, unit in zip(names, units, strict=True)),
+        predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
     )
 
 
 def _read(
     definition: "StateSpaceDefinition",
-    names: tuple[str, ...],
     defaults: Mapping[str, Any],
     columns: Columns,
 ) -> TrackLog:
@@ -56,11 +51,12 @@ def _read(
     Raises:
         ValueError: for what lacks or cannot be.
     """
-    lacking = [name for name in names if not columns.has(name)]
+    names, inputs = ([name.lower() for name in part] for part in (definition.measured, definition.inputs))
+    lacking = [name for name in (*names, *inputs) if not columns.has(name)]
     if lacking:
         raise ValueError(
-            f"it lacks the column {', '.join(lacking)}; it needs time, {', '.join(names)}, empty where nothing came; "
-            f"if it has another name, say --rename 'NAME={lacking[0]}'"
+            f"it lacks the column {', '.join(lacking)}; it needs time, {', '.join((*names, *inputs))}, empty where "
+            f"nothing came; if it has another name, say --rename 'NAME={lacking[0]}'"
         )
     known = {name: value for name, value in defaults.items() if name not in OF_EPISODES}
     parameters = {name: value for name, value in known.items() if name not in columns.given}
@@ -85,8 +81,24 @@ def _read(
     measurements = {"values": numpy.where(there, values[rows], 0.0), "available": there.astype(float)}
     if timed:
         measurements["interval"] = numpy.diff(time, prepend=start)
+    if inputs:
+        measurements["inputs"] = numpy.stack([_hold(name, columns[name], rows) for name in inputs], axis=1)
     initial = {"mean": definition.mean, "covariance": definition.covariance}
     return TrackLog(measurements, initial, rows, parameters, start, time, notes, typical)
+
+
+def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
+    """An input at every measurement, ``(T,)``: where the rows do not say it the last one, and before all the first.
+
+    Raises:
+        ValueError: where no row says it.
+    """
+    there = numpy.isfinite(given)
+    if not there.any():
+        raise ValueError(f"no row has a value of {name}")
+    known = (rows >= 0) & there[rows]
+    last = numpy.maximum.accumulate(numpy.where(known, numpy.arange(len(rows)), -1))
+    return given[rows[numpy.maximum(last, int(known.argmax()))]]
 
 
 def _fill_gaps(time: numpy.ndarray, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
@@ -121,10 +133,18 @@ def _start(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, pa
 def _predict(
     definition: "StateSpaceDefinition", mean: numpy.ndarray, measurement: Any, parameters: Any
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each."""
+    """Measurement that the filters' model predicts from an estimate, and what was received, ``(m, ...)`` each; angles
+    by whole turns near what was predicted.
+    """
     model = definition.filters[0]
-    given = numpy.reshape(mean, (len(mean), -1))
-    if model.timed:
-        given = numpy.concatenate([given, numpy.reshape(measurement.interval, (1, -1))])
+    rows = [mean]
+    rows += [measurement.interval[None]] if model.timed else []
+    rows += [measurement.inputs] if definition.inputs else []
+    given = numpy.concatenate([numpy.reshape(row, (len(row), -1)) for row in rows])
     predicted = model.h.value(model.f.value(given, numpy), numpy).reshape(-1, *mean.shape[1:])
-    return predicted, numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
+    measured = numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
+    for channel in definition.channels:
+        if channel.period is not None:
+            turns = numpy.round((measured - predicted)[channel.places] / channel.period)
+            measured[channel.places] -= channel.period * turns
+    return predicted, measured

@@ -2,8 +2,9 @@ r"""A task made of a state-space model that somebody gives: what is declared, th
 
     x(k) = f(x(k-1)) + w,  w ~ N(0, Q)          z(k) = h(x(k)) + v,  v ~ N(0, R)          x(0) ~ N(mean, covariance)
 
-A model may know the time: then f and Q are of the interval dt since the measurement before, ``x(k) = f(x(k-1), dt) +
-w``, ``w ~ N(0, Q(dt))``, and a measurement says its interval.
+A model may know the time, then f and Q are of the interval dt since the measurement before, and known inputs u, which
+are drawn with the episode and acted in this interval: ``x(k) = f(x(k-1), dt, u) + w``, ``w ~ N(0, Q(dt))``. A
+measurement then says both (:mod:`.equations`, :mod:`.inputs`).
 
 The world obeys one model, or several between which it switches as a Markov chain from measurement to measurement. The
 filters may believe others. Functions are traced once, on vectors of symbols, and differentiated exactly
@@ -17,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ...compiler.vector_functions import VectorFunction
-from ...filters.small_matrices import apply, product, transpose
+from ...filters.small_matrices import apply
 from ...filters.smoothing import semidefinite_root
 from ..contract.causes import MISSED, OUTLIER
 from ..contract.draws import Draws, category, draw_between
@@ -26,67 +27,11 @@ from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
+from .equations import Equations, Passage, StateSpaceDefinition
+from .inputs import InputCourses
 from .live import StateSpaceInput
 from .logs import state_space_log_format
-
-
-@dataclass(frozen=True, eq=False)
-class StateSpaceModel:
-    """Equations of a state-space model."""
-
-    f: VectorFunction
-    h: VectorFunction
-    Q: numpy.ndarray | VectorFunction
-    """``(n, n)``; or a function from the interval, s, to the n^2 numbers of it, row by row: then f takes the interval
-    after the state, and the model is timed."""
-    R: numpy.ndarray
-    """``(m, m)``."""
-
-    @property
-    def timed(self) -> bool:
-        """Whether f and Q are functions of the interval between measurements."""
-        return isinstance(self.Q, VectorFunction)
-
-    @property
-    def stands_still(self) -> bool:
-        """Whether nothing happens in no time, as far as some states show: measurements may then come at one time."""
-        if not isinstance(self.Q, VectorFunction):
-            return False
-        x = numpy.linspace(-1.0, 2.0, 3 * self.f.size).reshape(self.f.size, 3)
-        moved = self.f.value(numpy.concatenate([x, numpy.zeros((1, 3))]), numpy)
-        return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.process_noise(0.0).any()
-
-    def process_noise(self, interval: float) -> numpy.ndarray:
-        """Q of an interval, s, ``(n, n)``; without time the same for all."""
-        if not isinstance(self.Q, VectorFunction):
-            return self.Q
-        return numpy.reshape(self.Q.value(numpy.array([[interval]]), numpy), (self.f.size, self.f.size))
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether both functions are matrices."""
-        maps = (self.f, self.h)
-        return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
-
-
-@dataclass(frozen=True, eq=False)
-class StateSpaceDefinition:
-    """All that makes a task of state-space models."""
-
-    world: tuple[StateSpaceModel, ...]
-    """Models that the world obeys, M of them."""
-    filters: tuple[StateSpaceModel, ...]
-    """What the filters believe of each."""
-    transition: tuple[tuple[float, ...], ...]
-    """Probabilities that one model follows another from a measurement to the next (row = from), ``(M, M)``."""
-    switching: bool
-    """Whether the world does so; else it obeys the first model."""
-    mean: numpy.ndarray
-    """``(n,)``."""
-    covariance: numpy.ndarray
-    """``(n, n)``."""
-    weights: numpy.ndarray
-    """Of the squared error of each component in the cost, ``(n,)``."""
+from .sensors import Receptions, SensorStates, silence_causes
 
 
 @dataclass(frozen=True)
@@ -103,6 +48,12 @@ class StateSpaceParameters(TaskParameters):
     """Likewise of R."""
     availability: float = parameter(1.0, at_least=0.0, at_most=1.0)
     """Probability that a measurement is received."""
+    gaps: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Probability at a measurement that a gap of a sensor begins, in which it says nothing; of each sensor."""
+    gap_length: float = parameter(10.0, at_least=1.0)
+    """Measurements in a gap, on average."""
+    bias: float = parameter(0.0, at_least=0.0)
+    """Offset of one sensor, up or down, in standard deviations of its noise."""
     noise_decades: float = parameter(2.0, above=0.0)
     """Decades by which an action of one scales Q or R (control ``noise``)."""
     gain_factor: float = parameter(4.0, above=1.0)
@@ -122,6 +73,10 @@ class Truth(NamedTuple):
     """True Q over the model's, ``(N,)``."""
     measurement_noise: Array
     """True R over the model's, ``(N,)``."""
+    inputs: Array | None = None
+    """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
+    sensors: SensorStates | None = None
+    """Where the sensors stand; None where nothing is to be remembered."""
 
 
 class Measurement(NamedTuple):
@@ -133,70 +88,8 @@ class Measurement(NamedTuple):
     """1 where a value was received, 0 where not, ``(m, N)``."""
     interval: Array | None = None
     """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
-
-
-class Equations:
-    """A model on the arrays of a task.
-
-    Args:
-        task: whose arrays they are.
-        model: the equations.
-    """
-
-    def __init__(self, task: Task, model: StateSpaceModel) -> None:
-        self.model, self.xp = model, task.xp
-        self.R = task.constant(model.R)
-        self._Q = None if model.timed else task.constant(model.Q)
-        self._F, self._H = (
-            None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
-        )
-
-    def move(self, x: Array, interval: Array | None) -> Array:
-        """State without noise at the next measurement, ``(n, ...)``.
-
-        Args:
-            x: ``(n, ...)``.
-            interval: until then, s, ``(N,)``; None where the model is not timed.
-        """
-        if interval is None:
-            return self._value(self.model.f, x)
-        return self._value(self.model.f, self._with_interval(x, interval))
-
-    def _with_interval(self, x: Array, interval: Array) -> Array:
-        """State with the interval as its last row, ``(n + 1, ...)``."""
-        return self.xp.concat([x, (0.0 * x[0] + interval)[None]])
-
-    def process_noise(self, interval: Array | None) -> Array:
-        """Q of an interval, ``(n, n, N)``, without time ``(n, n, 1)``."""
-        if self._Q is not None:
-            return self._Q[:, :, None]
-        assert isinstance(self.model.Q, VectorFunction)
-        assert interval is not None
-        n = self.model.f.size
-        return self.xp.reshape(self.model.Q.value(interval[None], self.xp), (n, n, *interval.shape))
-
-    def measure(self, x: Array) -> Array:
-        """Measurement without noise, ``(m, ...)``."""
-        return self._value(self.model.h, x)
-
-    def _value(self, function: VectorFunction, x: Array) -> Array:
-        flat = self.xp.reshape(x, (x.shape[0], -1))
-        return self.xp.reshape(function.value(flat, self.xp), (function.size, *x.shape[1:]))
-
-    def transition_matrix(self, x: Array, interval: Array | None) -> Array:
-        """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
-        if interval is not None:
-            return self.model.f.jacobian(self._with_interval(x, interval), self.xp)
-        return self.model.f.jacobian(x, self.xp) if self._F is None else self._F[:, :, None]
-
-    def measurement_matrix(self, x: Array) -> Array:
-        """Jacobian of h, likewise."""
-        return self.model.h.jacobian(x, self.xp) if self._H is None else self._H[:, :, None]
-
-    def carry(self, mean: Array, covariance: Array, interval: Array | None) -> tuple[Array, Array]:
-        """Mean and covariance at the next measurement, without process noise; ``interval`` as of :meth:`move`."""
-        F = self.transition_matrix(mean, interval)
-        return self.move(mean, interval), product(product(F, covariance), transpose(F))
+    inputs: Array | None = None
+    """What is told of the inputs that acted in that time, ``(p, N)``; None where the model has none."""
 
 
 class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
@@ -213,6 +106,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.process_roots = [
             None if isinstance(model.Q, VectorFunction) else self._root(model.Q) for model in own.world
         ]
+        self.courses = InputCourses(tuple(own.inputs.values()), task.xp)
         self.timed, self.jitters = own.world[0].timed, self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
             raise ValueError(
@@ -220,11 +114,15 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             )
         self.initial_root = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         n, m = len(own.mean), own.world[0].h.size
-        self.initial_normals, self.normals = n, n + m
+        self.states, self.noises = n, n + m
+        self.initial_normals = n + self.courses.initial_normals
+        self.normals = self.noises + self.courses.normals
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
-        self.row_uniforms = int(self.switches) + int(self.jitters) + int(self.loses)
-        self.places = _components_measured(own.world[0].h)
+        self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
+        self.row_uniforms = self.drawn + self.receptions.row_uniforms
+        self.places = components_measured(own.world[0].h)
 
     def _root(self, covariance: numpy.ndarray) -> Array:
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
@@ -241,34 +139,74 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         ]
         count = len(own.world)
         first = draws.integer("hypothesis", (0, count - 1)) if self.switches else zero
-        mean = self.task.constant(own.mean)[:, None] + 0.0 * normals
+        mean = self.task.constant(own.mean)[:, None] + zero
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
-        state = mean + apply(self.initial_root[:, :, None], normals)
-        return Truth(state, first, *factors), Initial(mean, covariance)
+        state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
+        inputs = self.courses.begin(normals[self.states :])
+        sensors = self.receptions.begin(draws, zero)
+        return Truth(state, first, *factors, inputs, sensors), Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
         """Switch, move, measure."""
-        xp, n = self.xp, self.initial_normals
+        xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
         hypothesis = truth.hypothesis
         if self.switches:
             hypothesis = self._switch(hypothesis, uniforms[0])
         interval = self._interval(truth, uniforms[int(self.switches)] if self.jitters else None)
         process = xp.sqrt(truth.process_noise) * noise[:n]
-        sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.normals]
+        sensors = xp.sqrt(truth.measurement_noise) * noise[n : self.noises]
+        inputs, told = self._inputs(truth, interval, noise[self.noises : self.normals])
+        passed = Passage(interval, inputs)
         moved, measured = [], []
         for equations, q, r in zip(self.equations, self.process_roots, self.sensor_roots, strict=True):
-            root = semidefinite_root(equations.process_noise(interval)) if q is None else q[:, :, None]
-            state = equations.move(truth.state, interval) + apply(root, process)
+            state = equations.move(truth.state, passed)
+            root = semidefinite_root(equations.process_noise(state, passed)) if q is None else q[:, :, None]
+            state = state + apply(root, process)
             moved.append(state)
             measured.append(equations.measure(state) + apply(r[:, :, None], sensors))
         state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
-        available = 1.0 + 0.0 * values
+        here = None
         if self.loses:
-            here = xp.where(uniforms[-1] < self.parameters.availability, 1.0, 0.0)
-            available = available * here
-            values = xp.where(here > 0.0, values, 0.0)
-        return truth._replace(state=state, hypothesis=hypothesis), Measurement(values, available, interval)
+            here = xp.where(uniforms[self.drawn - 1] < self.parameters.availability, 1.0, 0.0)
+        sensors, due = self.receptions.advance(
+            truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
+        )
+        truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
+        return truth, Measurement(*self._receive(truth, values, (here, due)), interval, told)
+
+    def _receive(self, truth: Truth, values: Array, here: Sequence[Array | None]) -> tuple[Array, Array]:
+        """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
+
+        Args:
+            truth: at this measurement.
+            values: ``(m, N)``.
+            here: where something is received, ``(N,)`` or ``(m, N)`` each.
+        """
+        available = 1.0 + 0.0 * values
+        if truth.sensors is not None and truth.sensors.bias is not None:
+            values = values + truth.sensors.bias
+        if self.equations[0].wraps:
+            values = self.equations[0].subtract(values, 0.0 * values)
+        for part in here:
+            if part is not None:
+                available = available * part
+                values = self.xp.where(part > 0.0, values, 0.0)
+        return values, available
+
+    def _seconds(self, truth: Truth, interval: Array | None) -> Array:
+        """Time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
+        usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
+        return usual if interval is None else interval
+
+    def _inputs(
+        self, truth: Truth, interval: Array | None, normals: Array
+    ) -> tuple[Array | None, Array | None]:
+        """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
+        if truth.inputs is None:
+            return None, None
+        inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
+        return inputs, self.courses.report(inputs, normals)
 
     def _interval(self, truth: Truth, uniform: Array | None) -> Array | None:
         """Time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
@@ -329,7 +267,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         }
 
 
-def _components_measured(h: VectorFunction) -> list[int | None]:
+def components_measured(h: VectorFunction) -> list[int | None]:
     """Of each component the place of its measurement, where h hands it on as it is."""
     if h.matrix is None or numpy.any(h.offset):
         return [None] * (0 if h.matrix is None else h.matrix.shape[1])
@@ -404,7 +342,6 @@ def state_space_attributes(
     definition: StateSpaceDefinition,
     names: Sequence[str],
     units: Sequence[str],
-    measured: Sequence[str],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
     """Attributes of a task's class that follow from what its author gives.
@@ -413,7 +350,6 @@ def state_space_attributes(
         definition: the models.
         names: of the components.
         units: of each.
-        measured: names of what h returns.
         defaults: parameters in the training distribution, where they are not those of every such task.
     """
     from .state_space_banks import KalmanNetBank, bank_tables
@@ -421,29 +357,29 @@ def state_space_attributes(
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]
-    jitter = Scenario(
-        "jitter", "Held out: intervals from a tenth to 1.9 times the usual.", {**defaults, "jitter": 0.9}
-    )
-    places = _components_measured(definition.world[0].h)
-    measured_units = [units[places.index(j)] if j in places else "1" for j in range(len(measured))]
+    held_out = {
+        "rough": ("ten times the process noise", {"process_noise": (10.0, 10.0)}),
+        "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
+        "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
+        "biased": ("one sensor is off by three standard deviations", {"bias": 3.0}),
+    }
+    if definition.world[0].timed:
+        held_out["jitter"] = ("intervals from a tenth to 1.9 times the usual", {"jitter": 0.9})
+    several = len(definition.channels) > 1
     return {
         "definition": definition,
-        "log_format": state_space_log_format(definition, measured, measured_units, defaults),
+        **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
+        "log_format": state_space_log_format(definition, defaults),
         "components": tuple(map(Component, names, units)),
         "banks": banks,
         "actions": actions,
         "trained_banks": {"kalman-net": KalmanNetBank},
         "scenarios": {
             "random": Scenario("random", "The model as it is given.", defaults, training=True),
-            "rough": Scenario(
-                "rough", "Held out: ten times the process noise.", {**defaults, "process_noise": (10.0, 10.0)}
-            ),
-            "noisy": Scenario(
-                "noisy",
-                "Held out: ten times the measurement noise.",
-                {**defaults, "measurement_noise": (10.0, 10.0)},
-            ),
-            **({"jitter": jitter} if definition.world[0].timed else {}),
+            **{
+                name: Scenario(name, f"Held out: {words}.", {**defaults, **changed})
+                for name, (words, changed) in held_out.items()
+            },
         },
         "paper_policy": PaperPolicy(control, (0.0,) * count),
     }

@@ -17,7 +17,7 @@ import gymnasium
 import numpy
 
 from ...filters import imm
-from ...filters.innovation_update import Received, kalman_gain, keep_received, update_with_gain
+from ...filters.innovation_update import Received, update_with_gain
 from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import outer, product, transpose
 from ..contract.controls import bank_action_space, bank_probabilities
@@ -32,7 +32,8 @@ from ..contract.observation import (
     Array,
     Block,
 )
-from .state_space import Equations, Measurement, StateSpace, StateSpaceParameters
+from .equations import Equations
+from .state_space import Measurement, StateSpace, StateSpaceParameters
 
 AVERAGED = 0.1
 """Weight of the newest measurement in the averages that are shown."""
@@ -114,9 +115,9 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
             self.xp.stack([zero] * len(self.answers)),
         )
 
-    def process_noise(self, action: Array, interval: Array | None) -> Array:
-        """Covariance of the process noise under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
-        return self.equations.process_noise(interval)
+    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+        """Covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
+        return self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, action: Array) -> Array:
         """Likewise of the measurement."""
@@ -124,14 +125,14 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
 
     def predict(self, state: Any, measurement: Measurement) -> Any:
         """Predict, and compare under the noises of the last action."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement.interval)
+        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def compare(self, state: Any, measurement: Measurement) -> Any:
         """What is known of the measurement as it was predicted."""
         xp = self.xp
         received = self.received(state, measurement, state.action)
-        P = state.covariance + self.process_noise(state.action, measurement.interval)
+        P = state.covariance + self.process_noise(state.mean, measurement, state.action)
         S = product(product(received.H, P), transpose(received.H)) + received.R
         sigma = xp.sqrt(xp.stack([S[j, j] for j in range(self.sensors)]))
         result = update_with_gain(state.mean, P, received, 0.0 * transpose(received.H))
@@ -147,9 +148,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
 
     def received(self, state: Any, measurement: Measurement, action: Array) -> Received:
         """What was received, under the noises of an action."""
-        nu = measurement.values - self.equations.measure(state.mean)
-        H = self.equations.measurement_matrix(state.mean)
-        return keep_received(nu, H, self.sensor_noise(action), measurement.available)
+        return self.equations.receive(measurement, state.mean, self.sensor_noise(action))
 
     def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
         """How likely the measurement was; NaN where nothing was received."""
@@ -170,9 +169,9 @@ class NoiseBank(KalmanBank):
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
-    def process_noise(self, action: Array, interval: Array | None) -> Array:
+    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
         """Scaled Q."""
-        return self._scale(action, 0) * self.equations.process_noise(interval)
+        return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
     def sensor_noise(self, action: Array) -> Array:
         """Scaled R."""
@@ -182,8 +181,8 @@ class NoiseBank(KalmanBank):
         """Update with the noises that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
-        P = state.covariance + self.process_noise(action, measurement.interval)
-        result = update_with_gain(state.mean, P, received, kalman_gain(P, received))
+        P = state.covariance + self.process_noise(state.mean, measurement, action)
+        result = update_with_gain(state.mean, P, received, self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
@@ -199,9 +198,9 @@ class GainBank(KalmanBank):
         """Update with the gain that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
-        P = state.covariance + self.process_noise(action, measurement.interval)
+        P = state.covariance + self.process_noise(state.mean, measurement, action)
         factor = self.xp.exp(math.log(self.parameters.gain_factor) * action)
-        result = update_with_gain(state.mean, P, received, factor[:, None] * kalman_gain(P, received))
+        result = update_with_gain(state.mean, P, received, factor[:, None] * self.equations.gain(P, received))
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
@@ -237,7 +236,7 @@ class KalmanNetBank(KalmanBank):
 
     def __init__(self, task: StateSpace, control: str) -> None:
         super().__init__(task, control)
-        usual = self.equations.model.process_noise(self.parameters.sampling_interval)
+        usual = task.definition.usual_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
         self.deviations = task.constant(sigma)[:, None]
         self.scales = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
@@ -285,9 +284,10 @@ class KalmanNetBank(KalmanBank):
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
-    def process_noise(self, action: Array, interval: Array | None) -> Array:
+    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
         """Q under the action."""
-        return self._scaled(self.equations.process_noise(interval), NOISE_RANGE, self._part(action, 0))
+        Q = self.equations.process_noise(mean, measurement)
+        return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
     def sensor_noise(self, action: Array) -> Array:
         """R under the action."""
@@ -300,18 +300,18 @@ class KalmanNetBank(KalmanBank):
 
     def predict(self, state: KalmanNetTrack, measurement: Measurement) -> KalmanNetTrack:
         """Predict with the offset that was answered, and compare."""
-        mean, carried = self.equations.carry(state.mean, state.covariance, measurement.interval)
+        mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
     def act(self, state: KalmanNetTrack, measurement: Measurement, action: Array) -> KalmanNetTrack:
         """Update as the network answers."""
         action = self.xp.clip(action, -1.0, 1.0)
-        Q = self.process_noise(action, measurement.interval)
+        Q = self.process_noise(state.mean, measurement, action)
         received = self.received(state, measurement, action)
         agile = state.covariance + self._scaled(Q, AGILITY, self._part(action, 2))
         cautious = self._scaled(received.R, AGILITY, self._part(action, 3))
-        K = kalman_gain(agile, received._replace(R=cautious))
+        K = self.equations.gain(agile, received._replace(R=cautious))
         result = update_with_gain(state.mean, state.covariance + Q, received, K)
         return state._replace(
             mean=result.mean,
@@ -352,16 +352,22 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         control: its name.
         process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
         measurement_noise: likewise on R.
+        **sensor_noises: factors on R of some sensors, by their names.
     """
 
     parameters: StateSpaceParameters
 
     def __init__(
-        self, task: StateSpace, control: str, process_noise: Any = 1.0, measurement_noise: Any = 1.0
+        self,
+        task: StateSpace,
+        control: str,
+        process_noise: Any = 1.0,
+        measurement_noise: Any = 1.0,
+        **sensor_noises: Any,
     ) -> None:
         super().__init__(task, control)
-        self.count = len(task.believed)
-        self.factors = process_noise, measurement_noise
+        self.count, self.factor = len(task.believed), process_noise
+        self.R = [one.sensor_noise(measurement_noise, sensor_noises) for one in task.believed]
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -429,15 +435,10 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         means, covariances = imm.mix(state.means, state.covariances, chain.mixing)
         updates = []
         for j, equations in enumerate(self.task.believed):
-            mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement.interval)
-            P = carried + self.factors[0] * equations.process_noise(measurement.interval)
-            received = keep_received(
-                measurement.values - equations.measure(mean),
-                equations.measurement_matrix(mean),
-                self.factors[1] * equations.R[:, :, None],
-                measurement.available,
-            )
-            updates.append(update_with_gain(mean, P, received, kalman_gain(P, received)))
+            mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
+            P = carried + self.factor * equations.process_noise(mean, measurement)
+            received = equations.receive(measurement, mean, self.R[j])
+            updates.append(update_with_gain(mean, P, received, equations.gain(P, received)))
         return state._replace(
             means=xp.stack([u.mean for u in updates], axis=1),
             covariances=xp.stack([u.covariance for u in updates], axis=2),

@@ -14,20 +14,34 @@ like a slow pull. So there are J + (J - 1) B filters.
 
 Reading: one pull and one chain of levels serve all axes, but the rate of the pull is estimated on each axis alone.
 
-It is the estimator ``fault-bank`` of the baselines, and what the control ``hypotheses`` steers.
+It is the estimator ``fault-bank`` of the baselines, and what the control ``hypotheses`` steers. H hypotheses predict to
+the fix with weights p' and covariances P', and the levels of the receiver have probabilities q'. Factors f of its
+settings change what the fix is weighed with, this once:
+
+    p'(h) <- p'(h) f1^pulled(h) f2^modelled(h)                                              renormalised by Bayes' rule
+    q'(l) <- q'(l) f3^s(l),    R <- R f4
+    P'(h) <- P'(h) + (f5 - 1) Q(h) + (f6 - 1) W(h)
+
+pulled: the receiver is pulled off, whenever that began; modelled: all noises are as modelled; s(l): how far the level
+lies above the reported variance, logarithmically, one for the highest. So f1 multiplies the odds of a pull as other
+hazards would, f2 is the prior of a fault, f3 says that the receiver has become worse or better and f4 that it errs now.
+Q is what the coloured and the white rate error of the INS add in a step and W what the receiver's coloured error gains:
+a prediction with ``f5 Q`` and ``f6 W``, as these only add. Without a fix nothing changes.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
 from ...filters import imm
 from ...filters import receiver_faults as faults
-from ...filters.loosely_coupled import AugmentedCovariance
+from ...filters.array_namespace import namespace
+from ...filters.loosely_coupled import AugmentedCovariance, Sampling
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.controls import Steerable
+from ..contract.filter import Initial, Input, Likelihood
 from ..contract.observation import Array
 from ..contract.task import Task
 from .world import Measurement
@@ -167,16 +181,6 @@ class Weighing(NamedTuple):
     """What their innovations say."""
 
 
-class Posterior(NamedTuple):
-    """What a measurement leaves of the hypotheses."""
-
-    mean: Array
-    """Position of all together, m, ``(A, N)``."""
-    covariance: Array
-    """m^2, ``(A, A, N)``."""
-    memory: Memory
-
-
 class FaultState(NamedTuple):
     """State of the bank over faults."""
 
@@ -188,7 +192,7 @@ class FaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class FaultBank(Filter[Task, Measurement, FaultState]):
+class FaultBank(Steerable[Task, Measurement, FaultState]):
     """Kalman filters over the noises of INS and receiver and since when the receiver is pulled off.
 
     Args:
@@ -196,6 +200,10 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         prior: what it expects.
         **changed: fields of the prior.
     """
+
+    settings: ClassVar[dict[str, float]] = {
+        "pull": 1.05, "modelled": 1.05, "level": 1.5, "receiver": 1.25, "inertial": 2.0, "wandering": 2.0
+    }  # fmt: skip
 
     def __init__(self, task: Task, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
@@ -213,6 +221,12 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         exact = numpy.isclose(prior.levels, 1.0).astype(float)
         self.uniform = task.constant(uniform)[:, None]
         self.fresh = task.constant((1.0 - prior.distrust) * exact + prior.distrust * uniform)[:, None]
+        every = range((1 + prior.points) + prior.points * prior.onsets)
+        raised = [[float(h > prior.points) for h in every], [float(h == 0) for h in every]]
+        self.raised = task.constant(raised)[:, :, None]
+        """Whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
+        highest = math.log(prior.levels[-1]) or 1.0
+        self.heights = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
         self.onsets = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
 
     def draw_noises(self) -> Noises:
@@ -240,25 +254,6 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
 
     def start(self, initial: Initial) -> FaultState:
         """Start where INS and reference agree, without a pull."""
-        unknown = Likelihood.unknown(initial.mean[0])
-        return FaultState(initial.mean, initial.covariance, self.start_bank(initial), unknown)
-
-    def update(self, state: FaultState, given: Input) -> FaultState:
-        """Change hypotheses, predict, update, and report the moments of all."""
-        measurement = given.measurement
-        predicted = self.predict_bank(state.memory, measurement)
-        weighing = self.weigh(predicted, measurement)
-        found = self.update_bank(predicted, measurement, weighing)
-        there = measurement.available > 0.0
-        likelihood = Likelihood(
-            self.xp.where(there, weighing.log_likelihood, math.nan),
-            self.xp.where(there, weighing.nis, math.nan),
-            self.parameters.axes * measurement.available,
-        )
-        return FaultState(found.mean, found.covariance, found.memory, likelihood)
-
-    def start_bank(self, initial: Initial) -> Memory:
-        """Start where INS and reference agree, without a pull."""
         xp, noises = self.xp, self.noises
         none = 0.0 * initial.mean[0]
         zero = none + 0.0 * noises.drift
@@ -271,7 +266,8 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
             xp.stack([values[..., 0, :]] * self.prior.onsets, axis=-2) for values in (born.mean, *_flat(born))
         ]
         pulled = Hypotheses(others[0], _covariance(others[1:]), 0.0 * others[0][0, 0])
-        return Memory(free, pulled, self.fresh + none, none)
+        memory = Memory(free, pulled, self.fresh + none, none)
+        return FaultState(initial.mean, initial.covariance, memory, Likelihood.unknown(none))
 
     def give_birth(self, free: Hypotheses) -> Hypotheses:
         """Hypotheses of all noises but the modelled ones that are pulled from here on, ``(J - 1, 1)``."""
@@ -347,16 +343,63 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         moments = weighted_sum(shares, P + spread / mean.shape[1])
         return Hypotheses(centre[:, :, :, None], faults.from_matrix(moments[:, :, :, None]), total[:, None])
 
-    def predict_bank(self, memory: Memory, measurement: Measurement) -> Memory:
+    def predict(self, state: FaultState, measurement: Measurement) -> FaultState:
         """Change hypotheses and predict them, and the receiver's levels, to the time of a measurement."""
+        memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
         changing = 1.0 - math.exp(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
         changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
         chain = self.xp.where(changed, self.fresh, chain)
-        return Memory(
+        memory = Memory(
             self.predict_part(free, self.noises), self.predict_part(pulled, self.others), chain, reported
+        )
+        return state._replace(memory=memory)
+
+    def heeds(self, measurement: Measurement) -> Array:
+        """Where there is a fix."""
+        return measurement.available
+
+    def examine(self, state: FaultState, measurement: Measurement) -> Weighing:
+        """How a fix weighs the predicted hypotheses."""
+        return self.weigh(state.memory, measurement)
+
+    def steer(
+        self, predicted: Memory, measurement: Measurement, logarithms: Array
+    ) -> tuple[Memory, Weighing]:
+        """Hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``, and how a fix
+        weighs them with all factors.
+        """
+        xp = self.xp
+        receiver, *noises = xp.exp(logarithms[3:])
+        free = add_noise(predicted.free, noise_of_a_step(self.noises, self.parameters.sampling, 0), noises)
+        pulled = add_noise(
+            predicted.pulled, noise_of_a_step(self.others, self.parameters.sampling, 1), noises
+        )
+        predicted = predicted._replace(free=free, pulled=pulled)
+        evidence, levels = (
+            ordered_sum(self.raised * logarithms[:2, None]),
+            xp.exp(self.heights * logarithms[2]),
+        )
+        return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
+
+    def update(self, state: FaultState, given: Input) -> FaultState:
+        """Weigh the predicted hypotheses by a fix, update them, and report the moments of all."""
+        predicted, measurement = state.memory, given.measurement
+        if given.action is None:
+            weighing = self.weigh(predicted, measurement)
+        else:
+            predicted, weighing = self.steer(predicted, measurement, given.action)
+        return self.take(predicted, measurement, weighing)
+
+    def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:
+        """How well a fix was predicted; NaN where there is none."""
+        there = measurement.available > 0.0
+        return Likelihood(
+            self.xp.where(there, weighing.log_likelihood, math.nan),
+            self.xp.where(there, weighing.nis, math.nan),
+            self.parameters.axes * measurement.available,
         )
 
     def predict_part(self, h: Hypotheses, noises: Noises) -> Hypotheses:
@@ -382,7 +425,7 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         """Weigh predicted hypotheses and levels by a measurement.
 
         Args:
-            predicted: by :meth:`predict_bank`.
+            predicted: by :meth:`predict`.
             measurement: that arrives.
             evidence: added to the logarithms of the hypotheses' weights, nats, ``(H, N)`` or a number.
             variance_factors: multiply the variance of every level, ``(N,)`` or a number.
@@ -459,7 +502,7 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         )
         return expected, innovation, along, noise
 
-    def update_bank(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> Posterior:
+    def take(self, predicted: Memory, measurement: Measurement, weighing: Weighing) -> FaultState:
         """Update predicted hypotheses as they are weighed, and report the moments of all."""
         xp = self.xp
         there = measurement.available > 0.0
@@ -483,7 +526,8 @@ class FaultBank(Filter[Task, Measurement, FaultState]):
         offsets = delta - mean[:, None]
         spread = weighted_sum(weights, offsets[:, None] * offsets[None])
         memory = Memory(free, pulled, weighing.levels, predicted.reported)
-        return Posterior(measurement.ins - mean, self.eye * own + spread, memory)
+        likelihood = self.likelihood(weighing, measurement)
+        return FaultState(measurement.ins - mean, self.eye * own + spread, memory, likelihood)
 
     def update_part(
         self,
@@ -518,3 +562,35 @@ def _flat(h: Hypotheses) -> list[Array]:
 def _covariance(arrays: list[Array]) -> faults.FaultCovariance:
     """Undo :func:`_flat`."""
     return faults.FaultCovariance(AugmentedCovariance(*arrays[:6]), arrays[6], arrays[7])
+
+
+def noise_of_a_step(noises: Noises, s: Sampling, pulls: int) -> tuple[faults.FaultCovariance, ...]:
+    """What a step adds to the covariance of hypotheses by the INS, Q, and by the receiver's coloured error, W.
+
+    Args:
+        noises: of the hypotheses.
+        s: sampling of the INS error.
+        pulls: errors of the receiver beside the coloured one.
+    """
+    none = 0.0 * noises.decay
+    ins = AugmentedCovariance(none, none, none, none, none, none)
+    xp = namespace(none)
+    rows = xp.stack([none] * (1 + pulls))
+    nothing = faults.FaultCovariance(ins, xp.stack([rows] * 3), xp.stack([rows] * (1 + pulls)))
+    gained = noises.wandering**2 * (1.0 - noises.decay**2)
+    errors = xp.stack([gained, *[none] * pulls])
+    return (
+        faults.predict_fault(nothing, s, noises.coloured_growth, noises.white_growth, rows, rows),
+        faults.predict_fault(nothing, s, none, none, rows, errors),
+    )
+
+
+def add_noise(h: Hypotheses, steps: Sequence[faults.FaultCovariance], factors: Sequence[Array]) -> Hypotheses:
+    """Predicted hypotheses with the noises of a step multiplied, each by its factor, ``(N,)``."""
+    inertial, wandering = steps
+    more, further = (factor - 1.0 for factor in factors)
+    ins = (P + more * Q for P, Q in zip(h.covariance.ins, inertial.ins, strict=True))
+    P = faults.FaultCovariance(
+        AugmentedCovariance(*ins), h.covariance.cross, h.covariance.faults + further * wandering.faults
+    )
+    return h._replace(covariance=P)

@@ -452,7 +452,10 @@ class FilterBank(RadarBank):
         covariance = alpha_beta.predict_joint_covariance(covariance, interval)
         innovation = self.where_detected(measurement, measurement.position[:, None] - mean[:2], 0.0)
         identity = xp.eye(2, dtype=mean.dtype, device=mean.device)[:, :, None, None]
-        S = covariance[:2, :2] + identity * measurement.variance[:, None]
+        if self.parameters.likelihood_covariance == "carried":
+            S = covariance[:2, :2] + identity * measurement.variance[:, None]
+        else:
+            S = identity * (measurement.variance[:, None] / (1.0 - bank.alpha))
         log_likelihood, squared = log_density(innovation, S)
         normalised = innovation / xp.sqrt(xp.stack([S[0, 0], S[1, 1]]))
         log_squared = xp.log1p(squared)

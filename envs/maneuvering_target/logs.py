@@ -12,10 +12,10 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.live_input import Feed
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..data.plausibility import check_bearings, scatter_of
 from ..data.recorded_tables import Columns
+from ..data.recorded_world import Feed
 from ..data.recording import Recording
 from .parameters import ManeuveringTargetParameters
 
@@ -247,7 +247,7 @@ def _positions(columns: Columns) -> numpy.ndarray:
     sigma = (
         float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
     )
-    check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
+    columns.notes += check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
     return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
 
 

@@ -30,6 +30,10 @@ class ManeuveringTargetParameters(TaskParameters):
     azimuth, converted to x and y."""
     gains: tuple[float, ...] = parameter((0.3, 0.7), above=0.0, below=1.0)
     """Position gains alpha of the bank's filters (paper)."""
+    likelihood_covariance: str = parameter("carried", choices=("carried", "steady-state"))
+    """Innovation covariance in the likelihood (11) of the bank's filters. The paper prints none. "carried": S = P + R,
+    P by the Joseph form with the gains in use. "steady-state": S = R / (1 - alpha), as of a Kalman filter that has
+    settled to the gain (ours, both)."""
     transition: tuple[tuple[float, ...], ...] = parameter(
         ((0.9, 0.1), (0.1, 0.9)), at_least=0.0, at_most=1.0, stochastic=True
     )

@@ -2,19 +2,30 @@
 
 Equations: ``filters/semi_markov.py``. Constant thrust and coordinated turns are what the target flies in the training
 distribution; the filter's parameters are its prior of them. It is the estimator ``semi-markov`` of the baselines, and
-what the control ``hypotheses`` steers.
+what the control ``hypotheses`` steers. H hypotheses of kind and age predict to the scan with weights p', means x' and
+covariances P'. Factors f of its settings change what the measurement is weighed with, this once:
+
+    p'(h) <- p'(h) f1^begun(h) f2^ended(h) f3^turning(h)                                    renormalised by Bayes' rule
+    P'(h) <- P'(h) f4 in straight flight, P'(h) f5 in manoeuvres,    R <- R f6
+
+begun: a manoeuvre of the first age; ended: straight flight of the first age; turning: a turn of any age. So f1 and f2
+multiply the odds that a manoeuvre has just begun, or ended, as other hazards would; f3 those of a turn against all
+else; f4 and f5 say that the prediction is worse or better than the filter believes, as in a filter of fading memory (H.
+W. Sorenson and J. E. Sacks, Recursive fading memory filtering, Information Sciences 3, 1971, 101-119). A scan that
+missed the target is prediction only.
 """
 
 import functools
 import itertools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
-from ...filters.ordered_sums import weighted_sum
+from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.semi_markov import Hypotheses
 from ...filters.small_matrices import mirror_lower
-from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.controls import Steerable
+from ..contract.filter import Initial, Input, Likelihood
 from ..contract.observation import Array
 from .constant_velocity import ConstantVelocityModel
 from .world import Measurement
@@ -26,32 +37,46 @@ SLOWEST = 30.0
 """m/s: turns of what is slower are no sharper, as in the training distribution."""
 
 
-TRAINING_PRIOR: dict[str, Any] = {
-    "begin": 0.0157,
-    "turning": 0.5,
-    "hazards": tuple(semi_markov.hazards([0.0] * 2 + [1.0] * 10, 4)),
-    "thrust": 2.56,
-    "turns": (1.875, 4.625),
-    "turn_spread": 0.8,
-    "noise": 0.01,
-    "change": 0.01,
-    "outliers": 1e-4,
-}
+class SemiMarkovPrior(NamedTuple):
+    """What a semi-Markov filter expects of flights."""
+
+    begin: float = 0.0157
+    """Probability that a manoeuvre begins before a scan."""
+    turning: float = 0.5
+    """Share of turns among manoeuvres."""
+    hazards: tuple[float, ...] = tuple(semi_markov.hazards([0.0] * 2 + [1.0] * 10, 4))
+    """Probability that a manoeuvre ends after each age in scans; the last one for all ages beyond."""
+    thrust: float = 2.56
+    """Standard deviation of the acceleration of thrust along x and y, m/s^2."""
+    turns: tuple[float, ...] = (1.875, 4.625)
+    """Mean acceleration in gentle, steep, ... turns, m/s^2."""
+    turn_spread: float = 0.8
+    """Its standard deviation in each, m/s^2."""
+    noise: float = 0.01
+    """Standard deviation of what disturbs all flight, an acceleration that changes from scan to scan, m/s^2."""
+    change: float = 0.01
+    """Of the change of a manoeuvre's acceleration in a scan period, m/s^2."""
+    outliers: float = 1e-4
+    """Probability that a measurement is one."""
+    outlier_factor: float = 5.0
+    """Standard deviation of its errors over the stated one."""
+
+
+TRAINING = SemiMarkovPrior()
 """Of the flights of ``random``: on average 1.5 manoeuvres of 3 to 12 scans, all durations alike, in 100 scans; half of
 them turns; accelerations uniform from 0.5 to 6 m/s^2, whose halves have these means and deviations, and whose mean
 square on each axis is that of the thrust. Nothing disturbs them, and there are no outliers: numbers for these are
 small, so that what is impossible there can still be survived."""
-VAGUE_PRIOR: dict[str, Any] = {
-    "begin": 0.03,
-    "turning": 0.5,
-    "hazards": (0.1, 0.1, 0.1, 0.1),
-    "thrust": 3.0,
-    "turns": (1.5, 4.5),
-    "turn_spread": 1.2,
-    "noise": 0.05,
-    "change": 0.1,
-    "outliers": 0.02,
-}
+VAGUE = SemiMarkovPrior(
+    begin=0.03,
+    hazards=(0.1, 0.1, 0.1, 0.1),
+    thrust=3.0,
+    turns=(1.5, 4.5),
+    turn_spread=1.2,
+    noise=0.05,
+    change=0.1,
+    outliers=0.02,
+)
 """Ours, for flights of which little is known: a manoeuvre every few minutes, of any duration, ten scans on average."""
 
 
@@ -70,22 +95,6 @@ Tables = tuple[Hypotheses, Hypotheses, Hypotheses]
 """Of straight flight, thrust and turns, with whole covariances."""
 
 
-class Posterior(NamedTuple):
-    """What a measurement leaves of the hypotheses."""
-
-    mean: Array
-    """Of all together, ``(4, N)``."""
-    covariance: Array
-    """``(4, 4, N)``."""
-    track: SemiMarkovTrack
-    probabilities: Array
-    """Of all hypotheses, those of straight flight, of thrust, of turns, ``(H, N)``."""
-    log_likelihood: Array
-    """Of the measurement, or zero where there is none, ``(N,)``."""
-    nis: Array
-    """Likewise its normalised innovation squared."""
-
-
 class SemiMarkovState(NamedTuple):
     """State of the semi-Markov filter."""
 
@@ -97,7 +106,7 @@ class SemiMarkovState(NamedTuple):
     track: SemiMarkovTrack
 
 
-class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement, SemiMarkovState]):
+class SemiMarkov(ConstantVelocityModel, Steerable["ManeuveringTarget", Measurement, SemiMarkovState]):
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
@@ -106,58 +115,34 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
 
     Args:
         task: the problem.
-        begin: probability that a manoeuvre begins before a scan.
-        turning: share of turns among manoeuvres.
-        hazards: probability that a manoeuvre ends after each age in scans; the last one for all ages beyond.
-        thrust: standard deviation of the acceleration of thrust along x and y, m/s^2.
-        turns: mean acceleration in gentle, steep, ... turns, m/s^2.
-        turn_spread: its standard deviation in each, m/s^2.
-        noise: standard deviation of what disturbs all flight, an acceleration that changes from scan to scan, m/s^2.
-        change: of the change of a manoeuvre's acceleration in a scan period, m/s^2.
-        outliers: probability that a measurement is one.
-        outlier_factor: standard deviation of its errors over the stated one.
+        prior: what it expects.
+        **changed: fields of the prior.
     """
 
     straight_ages = 12
     """Straight flights after different manoeuvres stay apart so long; with one, what has hardly been a manoeuvre
     spoils the long memory of straight flight in every scan."""
 
-    def __init__(
-        self,
-        task: "ManeuveringTarget",
-        begin: float = TRAINING_PRIOR["begin"],
-        turning: float = TRAINING_PRIOR["turning"],
-        hazards: Sequence[float] = TRAINING_PRIOR["hazards"],
-        thrust: float = TRAINING_PRIOR["thrust"],
-        turns: Sequence[float] = TRAINING_PRIOR["turns"],
-        turn_spread: float = TRAINING_PRIOR["turn_spread"],
-        noise: float = TRAINING_PRIOR["noise"],
-        change: float = TRAINING_PRIOR["change"],
-        outliers: float = TRAINING_PRIOR["outliers"],
-        outlier_factor: float = 5.0,
-    ) -> None:
+    settings: ClassVar[dict[str, float]] = {
+        "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25
+    }  # fmt: skip
+
+    def __init__(self, task: "ManeuveringTarget", prior: SemiMarkovPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.ages, self.hazard = len(hazards), task.constant(hazards)[:, None]
-        self.begin, self.turning = begin, turning
-        self.thrust, self.turn_spread = thrust, turn_spread
-        self.turns = [side * size for size in turns for side in (1.0, -1.0)]
+        self.prior = prior = prior._replace(**changed)
+        self.ages, self.hazard = len(prior.hazards), task.constant(prior.hazards)[:, None]
+        self.turns = [side * size for size in prior.turns for side in (1.0, -1.0)]
         """Mean acceleration of each kind of turn, to the left positive, m/s^2."""
-        self.noise, self.change = noise, change
-        self.outliers, self.outlier_factor = outliers, outlier_factor
+        kinds, first = 1 + len(self.turns), self.straight_ages
+        self.kinds = [range(first + i * self.ages, first + (i + 1) * self.ages) for i in range(kinds)]
+        """Numbers of the hypotheses of thrust, and of each kind of turn; before them are those of straight flight."""
+        every = range(self.kinds[-1][-1] + 1)
+        begun, turning = [kind[0] for kind in self.kinds], range(self.kinds[1][0], len(every))
+        raised = [[float(h in those) for h in every] for those in (begun, [0], turning)]
+        self.raised = task.constant(raised)[:, :, None]
+        """Whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:
-        """Start where everyone starts, long in straight flight."""
-        unknown = Likelihood.unknown(initial.mean[0])
-        return SemiMarkovState(initial.mean, initial.covariance, unknown, self.start_track(initial))
-
-    def update(self, state: SemiMarkovState, given: Input) -> SemiMarkovState:
-        """One cycle."""
-        measurement = given.measurement
-        found = self.update_track(self.predict_track(state.track, measurement.interval), measurement)
-        likelihood = self.likelihood(measurement, found.log_likelihood, found.nis)
-        return SemiMarkovState(found.mean, found.covariance, likelihood, found.track)
-
-    def start_track(self, initial: Initial) -> SemiMarkovTrack:
         """Start where everyone starts, long in straight flight."""
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
@@ -171,23 +156,26 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
 
         others = [least] * self.ages
         turns = [repeat(self.begin_turn(*initial, turn), others) for turn in self.turns]
-        return SemiMarkovTrack(
+        track = SemiMarkovTrack(
             repeat(initial, [least] * (self.straight_ages - 1) + [1.0]).pack(),
             repeat(self.begin_thrust(*initial), others).pack(),
             semi_markov.join(turns).pack(),
         )
+        return SemiMarkovState(initial.mean, initial.covariance, Likelihood.unknown(none), track)
 
     def begin_thrust(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """State with an acceleration that is not known, ``(6, N)`` and ``(6, 6, N)``."""
         none = 0.0 * mean[:2]
-        variance = self.thrust**2 + none[0]
+        variance = self.prior.thrust**2 + none[0]
         return self.xp.concat([mean, none]), self.augment(covariance, [variance, variance])
 
     def begin_turn(self, mean: Array, covariance: Array, acceleration: float) -> tuple[Array, Array]:
         """State with the turn rate of a turn with a mean acceleration, ``(5, N)`` and ``(5, 5, N)``."""
         pace = self.xp.sqrt(self.squared_pace(mean))
         rate = acceleration / pace
-        return self.xp.concat([mean, rate[None]]), self.augment(covariance, [(self.turn_spread / pace) ** 2])
+        return self.xp.concat([mean, rate[None]]), self.augment(
+            covariance, [(self.prior.turn_spread / pace) ** 2]
+        )
 
     def squared_pace(self, mean: Array) -> Array:
         """Square of the speed that divides accelerations of turns, (m/s)^2."""
@@ -211,9 +199,9 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
 
     def switch(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses) -> Tables:
         """Let manoeuvres end and begin."""
-        ages, each = self.ages, self.turning * self.begin / len(self.turns)
+        ages, each = self.ages, self.prior.turning * self.prior.begin / len(self.turns)
         thrusting = semi_markov.Mode(
-            thrust, self.hazard, (1.0 - self.turning) * self.begin, self.begin_thrust
+            thrust, self.hazard, (1.0 - self.prior.turning) * self.prior.begin, self.begin_thrust
         )
         turning = [
             semi_markov.Mode(
@@ -230,8 +218,8 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
     def fly(self, straight: Hypotheses, thrust: Hypotheses, turns: Hypotheses, T: Array) -> Tables:
         """Fly on for an interval (s) in the mode of each hypothesis."""
         F, unit = (matrix[:, :, None] for matrix in self.motion(T))
-        Q = self.noise**2 * unit
-        change = self.change**2 * T[None] / self.task.parameters.sampling_interval
+        Q = self.prior.noise**2 * unit
+        change = self.prior.change**2 * T[None] / self.task.parameters.sampling_interval
         accelerated = kalman.constant_acceleration(T, axes=2)[:, :, None]
         square = self.squared_pace(turns.mean)
         return (
@@ -250,15 +238,36 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
             ),
         )
 
-    def predict_track(self, memory: SemiMarkovTrack, T: Array) -> Tables:
-        """Let manoeuvres end and begin, and fly on for an interval, s: the tables that a measurement updates."""
-        return self.fly(*self.switch(*(table.unpack() for table in memory)), T)
+    def predict(self, state: SemiMarkovState, measurement: Measurement) -> SemiMarkovState:
+        """Let manoeuvres end and begin, and fly on to the scan."""
+        tables = self.fly(*self.switch(*(table.unpack() for table in state.track)), measurement.interval)
+        return state._replace(track=SemiMarkovTrack(*(table.pack() for table in tables)))
 
-    def update_track(self, tables: Tables, measurement: Measurement) -> Posterior:
+    def heeds(self, measurement: Measurement) -> Array:
+        """Where the scan saw the target."""
+        return measurement.available
+
+    def steer(self, tables: Iterable[Hypotheses], logarithms: Array) -> list[Hypotheses]:
+        """Multiply weights and covariances by factors of these logarithms, ``(5, N)``."""
+        factors = self.xp.exp(ordered_sum(self.raised * logarithms[:3, None]))
+        straight, manoeuvre = self.xp.exp(logarithms[3:])
+        steered, first = [], 0
+        for table, growth in zip(tables, (straight, manoeuvre, manoeuvre), strict=True):
+            last = first + table.probability.shape[0]
+            weights = factors[first:last] * table.probability
+            steered.append(table._replace(probability=weights, covariance=growth * table.covariance))
+            first = last
+        return steered
+
+    def update(self, state: SemiMarkovState, given: Input) -> SemiMarkovState:
         """Take in a measurement. Its normalised innovation squared is the mean of the filters' by their posterior
         weights.
         """
-        xp = self.xp
+        xp, measurement = self.xp, given.measurement
+        tables = [table.unpack() for table in state.track]
+        if given.action is not None:
+            tables = self.steer(tables, given.action[:5])
+            measurement = measurement._replace(variance=xp.exp(given.action[5]) * measurement.variance)
         results = [self.update_table(table, measurement) for table in tables]
         logarithms = xp.concat(
             [xp.log(table.probability) + r.log_likelihood for table, r in zip(tables, results, strict=True)]
@@ -275,7 +284,8 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
         track = SemiMarkovTrack(
             *(Hypotheses(r.mean, r.covariance, p).pack() for r, p in zip(results, parts, strict=True))
         )
-        return Posterior(mean, covariance, track, probabilities, imm.log_sum(logarithms), nis)
+        likelihood = self.likelihood(measurement, imm.log_sum(logarithms), nis)
+        return SemiMarkovState(mean, covariance, likelihood, track)
 
     def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:
         """Update every hypothesis with the measured position, or leave it as predicted."""
@@ -284,8 +294,8 @@ class SemiMarkov(ConstantVelocityModel, Filter["ManeuveringTarget", Measurement,
             table.covariance,
             measurement.position[:, None],
             measurement.variance[:, None],
-            self.outliers,
-            self.outlier_factor,
+            self.prior.outliers,
+            self.prior.outlier_factor,
         )
         return self.where_detected(measurement, result, kalman.Update(table.mean, table.covariance, 0.0, 0.0))
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 
 from ..contract.model import Model
+from ..contract.observation import Array
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..data.flights import Flights, flight_of
@@ -135,6 +136,8 @@ class ManeuveringTarget(Task):
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
     causes = CAUSES
     cost_description = "squared position error over the squared range sigma"
+    # An error of a kilometre throughout: ten times that of a plot.
+    lost_cost = 100.0
     reward_unit = 8.0
     # What a turn costs rules the noise of the reward, and who does nothing pays for it too; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.
@@ -154,11 +157,13 @@ class ManeuveringTarget(Task):
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
-    def filter_feedback(self, filter: Any, state: Any, measurement: Any) -> Track | None:
-        """Where there is clutter, the track about which the radar looks for plots."""
-        if not self.parameters.cluttered:
-            return None
-        return Track(filter.mean(state), filter.covariance(state))
+    def is_closed_loop(self) -> bool:
+        """Whether there is clutter."""
+        return self.parameters.cluttered
+
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Track:
+        """Track about which the radar looks for plots."""
+        return Track(mean, covariance)
 
     def _sampling_interval(self) -> float | None:
         """Return the time between scans, s; None where some miss the target, or come early."""

@@ -135,6 +135,8 @@ class RadarEsmTracking(Task):
         "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
         "and acceleration_scale"
     )
+    # Errors of three of the scales throughout.
+    lost_cost = 9.0
     reward_unit = 0.3
     # The noise of the track is most of the cost, and no weight changes it; a logarithm, because a few mistaken classes
     # would hide what an action changes in all other episodes.

@@ -78,21 +78,16 @@ class Filters(NamedTuple):
     """Weights of the hypotheses in force, ``(M, N)``."""
     mean: Array
     """Of the combination, ``(17, N)``."""
-    last_action: Array
+    action: Array
     """``(A, N)``."""
 
 
-class HypothesisBank(Bank[Task, Measurement, Filters]):
-    """Controls ``evidence``, ``mode`` and ``weights``: the action weighs the hypotheses."""
+class SatelliteBank(Bank[Task, Measurement, Any]):
+    """What all controls share: what each filter of a bank says by group of sensors, and what comes with it."""
 
     task: "TightlyCoupledNavigation"
     parameters: TightlyCoupledNavigationParameters
     hypotheses: Sequence[str] = HYPOTHESES
-
-    @property
-    def action_space(self) -> gymnasium.Space:
-        """One hypothesis, or a number for each."""
-        return bank_action_space(self.control, len(self.hypotheses))
 
     @property
     def actions(self) -> Sequence[str]:
@@ -156,10 +151,10 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             available("pseudorange", ranges),
             available("rate", rates),
             Block(
-                "time", lambda f, y: xp.astype(y.number, f.mean.dtype) / p.horizon,
+                "time", lambda f, y: xp.astype(y.number, xp.float64) / p.horizon,
                 "measurements so far over the horizon", shown=within(0.0, (p.horizon + 1) / p.horizon), unit="horizon",
             ),
-            Block("last", lambda f, y: f.last_action, "last action", self.actions, ACTION),
+            Block("last", lambda f, y: f.action, "last action", self.actions, ACTION),
         )  # fmt: skip
 
     @property
@@ -182,7 +177,14 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         here = [ordered_sum(measurement.available[sensor.readings]) for sensor in self.task.sensors]
         return self.xp.stack([self.xp.clip(count, 1.0, None) for count in here])[:, None]
 
-    # --- the filters
+
+class HypothesisBank(SatelliteBank):
+    """Controls ``evidence``, ``mode`` and ``weights``: the action weighs the hypotheses."""
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """One hypothesis, or a number for each."""
+        return bank_action_space(self.control, len(self.hypotheses))
 
     def start(self, initial: Initial) -> Filters:
         """Start every filter from what is known of the start."""
@@ -205,7 +207,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             range_innovation=xp.stack([zeros] * task.tracked.stop),
             probabilities=probabilities,
             mean=initial.mean,
-            last_action=xp.stack([zeros] * len(self.actions)),
+            action=xp.stack([zeros] * len(self.actions)),
         )
 
     def _predict_hypotheses(self, state: Filters) -> Prediction:
@@ -217,9 +219,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        if not self.parameters.aperture:
-            return None
+        """State that the tracking loops expect at the next measurement, ``(17, N)``."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
         mixed = weighted_sum(chain.mixing, state.means[:, :, None])
@@ -325,7 +325,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         return state._replace(
             probabilities=probabilities,
             mean=weighted_sum(probabilities, state.means),
-            last_action=last_action,
+            action=last_action,
         )
 
     def covariance(self, state: Filters) -> Array:
@@ -405,7 +405,7 @@ class NoiseBank(HypothesisBank):
         """
         groups = int(state.average_nis.shape[0])
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
-        steered = self.xp.any(state.last_action != 0.0, axis=0)
+        steered = self.xp.any(state.action != 0.0, axis=0)
         return super().covariance(state) * self.xp.where(steered, self.xp.clip(average, 1.0, None), 1.0)
 
 

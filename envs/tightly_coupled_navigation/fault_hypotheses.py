@@ -16,19 +16,32 @@ a Gaussian sum. Accelerometers that repeat themselves exactly are left out: nois
 
 Reading: levels and renewals are weighed under each hypothesis on the motion, and the levels then averaged over them.
 
-It is the estimator ``fault-hypotheses`` of the baselines, and what the control ``hypotheses`` steers.
+It is the estimator ``fault-hypotheses`` of the baselines, and what the control ``hypotheses`` steers. Before the
+readings the hypotheses on the motion have probabilities p', each range error j is drawn anew with the probability p_j,
+and the level l of every rate has the probability q'(l). Factors f of its settings change what the readings are weighed
+with:
+
+    p'(begun) <- p'(begun) f1,  p'(manoeuvre) <- p'(manoeuvre) f2                          renormalised by Bayes' rule
+    p_j / (1 - p_j) <- f3 p_j / (1 - p_j)
+    q'(l) <- q'(l) f4^s(l)                                                                 likewise
+    Q <- Q f5,  R_k <- R_k f(5 + k)                                                        k = 1, 2, 3
+
+begun: a manoeuvre begins at this step; manoeuvre: one goes on; s(l): how far the level lies above the nominal one,
+logarithmically, one for the highest; Q: process noise of the 17 states; R_k: variance of pseudoranges, of rates at all
+their levels, of accelerometers. Where a rate is missing its levels stay what they were expected to be.
 """
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy
 
 from ...filters import extended_kalman, gnss_ins, imm, range_errors
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
-from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.controls import Steerable
+from ..contract.filter import Initial, Input, Likelihood
 from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
 from .world import Measurement
@@ -136,17 +149,7 @@ UNCHANGED = Factors()
 class Posterior(NamedTuple):
     """What the bank makes of a measurement; four hypotheses: those on the motion, and a manoeuvre that has begun."""
 
-    mean: Array
-    """Of all hypotheses together, ``(17, N)``."""
-    covariance: Array
-    """``(17, 17, N)``."""
-    memory: Hypotheses
-    log_likelihood: Array
-    """Of the readings, nats, ``(N,)``."""
-    nis: Array
-    """The hypotheses' mean normalised innovation squared, ``(N,)``."""
-    degrees: Array
-    """Readings that were taken in, ``(N,)``."""
+    after: "FaultState"
     predicted: Array
     """Probabilities of the hypotheses before the readings, ``(4, N)``."""
     log_likelihoods: Array
@@ -172,7 +175,7 @@ class FaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState]):
+class FaultHypotheses(Steerable["TightlyCoupledNavigation", Measurement, FaultState]):
     """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
 
     Args:
@@ -180,6 +183,11 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
         prior: what it expects.
         **changed: fields of the prior.
     """
+
+    settings: ClassVar[dict[str, float]] = {
+        "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,
+        "motion": 2.0, "pseudoranges": 2.0, "rates": 2.0, "accelerometers": 4.0,
+    }  # fmt: skip
 
     def __init__(
         self, task: "TightlyCoupledNavigation", prior: FaultPrior = TRAINING, **changed: Any
@@ -213,18 +221,10 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
         self.level_chain = chain
         self.first_levels = task.constant(numpy.array([1.0 - 1e-3] + [1e-3 / (L - 1)] * (L - 1)))[:, None]
 
+        heights = [math.log(level) / math.log(prior.levels[-1]) for level in prior.levels]
+        self.heights = task.constant(heights)[:, None]
+
     def start(self, initial: Initial) -> FaultState:
-        """Start every filter from what is known of the start."""
-        unknown = Likelihood.unknown(initial.mean[0])
-        return FaultState(initial.mean, initial.covariance, self.start_bank(initial), unknown)
-
-    def update(self, state: FaultState, given: Input) -> FaultState:
-        """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
-        found = self.update_bank(given.measurement, state.hypotheses)
-        likelihood = Likelihood(found.log_likelihood, found.nis, found.degrees)
-        return FaultState(found.mean, found.covariance, found.memory, likelihood)
-
-    def start_bank(self, initial: Initial) -> Hypotheses:
         """Start every filter from what is known of the start."""
         xp, S, task = self.xp, self.task.satellites, self.task
         none = 0.0 * initial.mean[0]
@@ -232,13 +232,22 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
             initial.mean, initial.covariance, S, none + self.prior.coloured**2
         )
         levels = self.first_levels[:, None] + xp.stack([none] * S)
-        return Hypotheses(
+        hypotheses = Hypotheses(
             xp.stack([mean] * 3, axis=1),
             xp.stack([pack(covariance)] * 3, axis=1),
             task.constant(self.prior.start)[:, None] + none,
             levels,
             xp.stack([none + math.inf] * 3),
         )
+        return FaultState(initial.mean, initial.covariance, hypotheses, Likelihood.unknown(none))
+
+    def update(self, state: FaultState, given: Input) -> FaultState:
+        """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
+        if given.action is None:
+            return self.examine(state, given.measurement).after
+        factors = Factors(*self.xp.exp(given.action))
+        levels = self.xp.exp(self.heights * given.action[Factors._fields.index("levels")])
+        return self.examine(state, given.measurement, factors._replace(levels=levels)).after
 
     def _predict(
         self, memory: Hypotheses, measurement: Measurement, between: Array, factors: Factors
@@ -259,8 +268,7 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
         mean, covariance = imm.combine(x[:, LINE:], P[:, :, LINE:], weights)
         x = xp.stack([x[:, REST], mean, x[:, SINGER]], axis=1)
         P = xp.stack([P[:, :, REST], covariance, P[:, :, SINGER]], axis=2)
-        kept = xp.where(between, 1.0, self.open_sky)
-        gained = xp.where(between, 0.0, self.gained)
+        kept, gained = self._error_process(between)
         mean, covariance = range_errors.predict(
             x, P, task.axis, common.T, common.decay, factors.motion * self.noise, kept, gained
         )
@@ -286,6 +294,11 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
         mean = xp.concat([mean, new[:, None]], axis=1)
         return mean, xp.concat([covariance, C[:, :, None]], axis=2), probabilities
 
+    def _error_process(self, between: Array) -> tuple[Any, Any]:
+        """What is left of a range error after a step, and the variance that it gains, m^2; one for all, or a list."""
+        xp = self.xp
+        return xp.where(between, 1.0, self.open_sky), xp.where(between, 0.0, self.gained)
+
     def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
         """How each range error may have been drawn anew."""
         xp, prior = self.xp, self.prior
@@ -308,18 +321,16 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
             )
         return renewals
 
-    def update_bank(
-        self, measurement: Measurement, memory: Hypotheses, factors: Factors = UNCHANGED
-    ) -> Posterior:
+    def examine(self, state: FaultState, measurement: Measurement, factors: Factors = UNCHANGED) -> Posterior:
         """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all.
 
         Args:
+            state: after the measurement before.
             measurement: that arrives.
-            memory: after the one before.
             factors: of what is expected. Probabilities need not sum to one with them; then neither the log-likelihood
                 nor the NIS is that of a density.
         """
-        xp, task, S = self.xp, self.task, self.task.satellites
+        xp, task, S, memory = self.xp, self.task, self.task.satellites, state.hypotheses
         forces, angles = (sensor.readings for sensor in task.sensors[2:])
         available = measurement.available
         readings = xp.where(available > 0.0, measurement.readings, 0.0)
@@ -335,11 +346,11 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
             task.parameters.gravity,
         )
         residual = readings[:, None] - expected
-        state = range_errors.begin(mean, covariance)
+        taken = range_errors.begin(mean, covariance)
         for j, renewal in enumerate(self._renewals(measurement, between, factors.renewal)):
             place = gnss_ins.SIZE + j
-            state = range_errors.take_pseudorange(
-                state,
+            taken = range_errors.take_pseudorange(
+                taken,
                 mean[place],
                 place,
                 residual[j],
@@ -348,13 +359,13 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
                 renewal,
                 available[j],
             )
-        of_ranges = state.squared_distance
+        of_ranges = taken.squared_distance
         shares, predicted_levels = [], []
         for j in range(S):
             i = S + j
             levels = self._move_levels(memory.levels[:, j])
-            state, share = range_errors.take_reading(
-                state,
+            taken, share = range_errors.take_reading(
+                taken,
                 residual[i],
                 rows[i],
                 factors.rates * self.level_variance[j],
@@ -365,7 +376,7 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
             predicted_levels.append(levels)
         others = slice(forces.start, angles.stop)
         left = [
-            residual[i] - ordered_sum([state.shift[c] * v for c, v in zip(*rows[i], strict=True)])
+            residual[i] - ordered_sum([taken.shift[c] * v for c, v in zip(*rows[i], strict=True)])
             for i in range(others.start, others.stop)
         ]
         rest_available = xp.concat([usable, available[angles]])
@@ -374,17 +385,17 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
             *task.sensor_variance[angles],
         ]
         update = extended_kalman.update_one_by_one(
-            mean + state.shift,
-            state.covariance,
+            mean + taken.shift,
+            taken.covariance,
             xp.stack(left),
             rows[others],
             variance,
             rest_available,
         )
-        log_likelihood = state.log_likelihood + update.log_likelihood
+        log_likelihood = taken.log_likelihood + update.log_likelihood
         log_prior = imm.log_probabilities(probabilities)
         weights = imm.mode_posterior(log_prior, log_likelihood)
-        nis = weighted_sum(weights, state.squared_distance + ordered_sum(update.squared_residuals))
+        nis = weighted_sum(weights, taken.squared_distance + ordered_sum(update.squared_residuals))
         learned = [
             xp.where(available[S + j] > 0.0, weighted_sum(weights, shares[j]), predicted_levels[j])
             for j in range(S)
@@ -393,20 +404,20 @@ class FaultHypotheses(Filter["TightlyCoupledNavigation", Measurement, FaultState
         known = gnss_ins.SIZE
         centre, spread = imm.combine(means[:known], covariances[:known, :known], weights)
         after = Hypotheses(means, pack(covariances), weights, xp.stack(learned, axis=1), readings[forces])
-        of_forces, of_angles = update.squared_residuals[:3], update.squared_residuals[3:]
-        return Posterior(
-            centre,
-            spread,
-            after,
+        likelihood = Likelihood(
             imm.log_mixture_density(log_prior, log_likelihood),
             nis,
             ordered_sum(available[: forces.start]) + ordered_sum(rest_available),
+        )
+        of_forces, of_angles = update.squared_residuals[:3], update.squared_residuals[3:]
+        return Posterior(
+            FaultState(centre, spread, after, likelihood),
             probabilities,
             log_likelihood,
             xp.stack(
                 [
                     of_ranges,
-                    state.squared_distance - of_ranges,
+                    taken.squared_distance - of_ranges,
                     ordered_sum(of_forces),
                     ordered_sum(of_angles),
                 ]

@@ -98,7 +98,7 @@ class KalmanNetBank(RobustBank):
     def _predict_hypotheses(self, state: Filters) -> Prediction:
         """Extrapolate with the noise of the motion that was answered."""
         common = self.task.common
-        factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.last_action[self.manoeuvre])
+        factor = self.xp.exp(2.0 * math.log(MANOEUVRE_RANGE) * state.action[self.manoeuvre])
         noise = self.common_noise + factor * self.manoeuvre_noise
         covariances = unpack(state.covariances, gnss_ins.SIZE)
         mean, covariance = gnss_ins.predict(
@@ -107,8 +107,8 @@ class KalmanNetBank(RobustBank):
         return Prediction(mean, pack(covariance), state.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
-        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        return self.task.feedback(state.mean, measurement)
+        """None: the tracking loops expect what follows from the estimate."""
+        return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update by the gain that was answered."""

@@ -52,7 +52,7 @@ class TightlyCoupledNavigationPicture(Picture):
         task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
         error = self.model.error(state)[:, lane]
         P = numpy.diagonal(self.model.covariance(state)[:, :, lane])
-        truth, estimate = state.truth.state[:, lane], bank.mean[:, lane]
+        truth, estimate = state.truth.state[:, lane], self.model.mean(state)[:, lane]
         innovation = bank.range_innovation[:, lane] / task.sensor_sigma[task.tracked, 0]
         innovation = numpy.where(state.measurement.available[task.tracked, lane] > 0.0, innovation, 0.0)
         if state.measurement.number[lane] <= 1:
@@ -74,7 +74,7 @@ class TightlyCoupledNavigationPicture(Picture):
         }
         values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
         if self.model.control in ACTIONS:
-            values |= {f"gain.{i}": action[lane] for i, action in enumerate(bank.last_action)}
+            values |= {f"gain.{i}": action[lane] for i, action in enumerate(bank.action)}
         return {name: float(value) for name, value in values.items()}
 
     def begin(self, state: Episode) -> None:

@@ -162,6 +162,8 @@ class TightlyCoupledNavigation(Task):
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix"
     )
+    # Five times the errors of a single-epoch fix throughout.
+    lost_cost = 25.0
     reward_unit = 10.0
     log_reward_unit = 0.1
     # A few lost tracks rule the mean, and who does nothing pays for them, too.
@@ -219,10 +221,12 @@ class TightlyCoupledNavigation(Task):
             self.xp.take(self._satellite_velocity, row, axis=2),
         )
 
-    def feedback(self, mean: Array, measurement: Any) -> Array | None:
+    def is_closed_loop(self) -> bool:
+        """Whether tracking loops have an aperture."""
+        return bool(self.parameters.aperture)
+
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
         """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""
-        if not self.parameters.aperture:
-            return None
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
 
     def picture(self, model: Model) -> Any:

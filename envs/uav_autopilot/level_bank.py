@@ -6,11 +6,20 @@ Rockets 5 (1968), 662-665, by augmentation). In each kind every hypothesis is a 
 levels are, each knows by probabilities of its own. The first hypothesis of a kind believes all noise as designed, for
 ever but for a small hazard. Kinds do not change.
 
-It is the estimator ``level-bank`` of the baselines, and what the control ``hypotheses`` steers.
+It is the estimator ``level-bank`` of the baselines, and what the control ``hypotheses`` steers. H hypotheses predict to
+the measurement with weights p' and covariances P'. Factors f of its settings change what the readings of m sensors are
+weighed with, this once:
+
+    p'(h) <- p'(h) f1^s(h) f2^designed(h)                                                   renormalised by Bayes' rule
+    P'(h) <- P'(h) + (f3 - 1) Q(h),    R_k <- R_k f(3 + k)
+
+s(h): how far the hypothesis' level of the gusts lies above the designed one, logarithmically, one for the highest;
+designed: all noise is as designed. So f1 says that the gusts have risen or fallen and f2 that they are as designed, as
+other probabilities of a change would; Q is the process noise of the hypothesis, so that the prediction is made with
+``f3 Q``; R_k are the variances of sensor k at all its levels. Where no sensor answers nothing changes.
 """
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
@@ -18,7 +27,8 @@ import numpy
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.controls import Steerable
+from ..contract.filter import Initial, Input, Likelihood
 from ..contract.observation import Array
 from .plant import Model, pitch_channel
 from .world import Measurement, Start
@@ -94,20 +104,6 @@ def grid(limits: tuple[float, float], points: int) -> numpy.ndarray:
     return numpy.asarray(low * (high / low) ** ((numpy.arange(points) + 0.5) / points))
 
 
-class Posterior(NamedTuple):
-    """What the readings leave of the hypotheses."""
-
-    mean: Array
-    """Of all together, ``(n, N)``."""
-    covariance: Array
-    """``(n, n, N)``."""
-    memory: Hypotheses
-    log_likelihood: Array
-    """Of the readings, ``(N,)``."""
-    nis: Array
-    """Their normalised innovation squared, ``(N,)``."""
-
-
 class Levels(NamedTuple):
     """State of the bank over levels."""
 
@@ -126,7 +122,7 @@ def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, x
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
-class LevelBank(Filter["UavAutopilot", Measurement, Levels]):
+class LevelBank(Steerable["UavAutopilot", Measurement, Levels]):
     """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
@@ -182,60 +178,61 @@ class LevelBank(Filter["UavAutopilot", Measurement, Levels]):
         self.believed = constant(believed)[:, :, None]
         self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
+        self.settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0, **dict.fromkeys(sensors, 1.5)}
+        heights, designed = numpy.log(levels) / math.log(levels[-1]), numpy.arange(each) == 0
+        raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
+        self.raised = constant(raised)[:, :, None]
+        """By how much the first two settings multiply each weight, logarithmically, ``(2, H, 1)``."""
 
-    def start(self, initial: Start) -> Levels:
-        """Start all where everyone starts."""
-        unknown = Likelihood.unknown(initial.mean[0])
-        return Levels(initial.mean, initial.covariance, unknown, self.start_bank(initial))
-
-    def update(self, state: Levels, given: Input) -> Levels:
-        """Switch, predict, update, and report the moments of all."""
-        found = self.update_bank(self.predict_bank(state.hypotheses, given.measurement), given.measurement)
-        likelihood = likelihood_of(given.measurement, found.log_likelihood, found.nis, self.xp)
-        return Levels(found.mean, found.covariance, likelihood, found.memory)
-
-    def start_bank(self, initial: Initial | Start) -> Hypotheses:
+    def start(self, initial: Initial | Start) -> Levels:
         """Start all where everyone starts."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
-        return Hypotheses(
+        hypotheses = Hypotheses(
             xp.stack([mean] * self.probability.shape[0], axis=1),
             self.start_covariance + none,
             self.probability + none,
             tuple(self.believed + none for _ in self.rows),
         )
+        return Levels(initial.mean, initial.covariance, Likelihood.unknown(none), hypotheses)
 
-    def predict_bank(self, memory: Hypotheses, measurement: Measurement) -> Hypotheses:
+    def predict(self, state: Levels, measurement: Measurement) -> Levels:
         """Let levels change, and predict every hypothesis to the time of a measurement."""
-        h = self.switch(memory)
+        h = self.switch(state.hypotheses)
         mean, covariance = self.propagate(h, measurement)
-        return h._replace(mean=mean, covariance=covariance)
+        return state._replace(hypotheses=h._replace(mean=mean, covariance=covariance))
 
-    def update_bank(
-        self, predicted: Hypotheses, measurement: Measurement, variance_factors: Sequence[Any] = ()
-    ) -> Posterior:
-        """Take in the readings one after the other, and report the moments of all.
+    def heeds(self, measurement: Measurement) -> Array:
+        """Where a sensor answers."""
+        return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
-        Args:
-            predicted: by :meth:`predict_bank`.
-            measurement: that arrives.
-            variance_factors: multiply the variances of every level of each sensor, ``(N,)``; empty: none.
-        """
-        xp, n = self.xp, self.n
+    def steer(self, h: Hypotheses, logarithms: Array) -> Hypotheses:
+        """Multiply weights and process noise by factors of these logarithms, ``(3, N)``."""
+        xp = self.xp
+        return h._replace(
+            probability=xp.exp(ordered_sum(self.raised * logarithms[:2, None])) * h.probability,
+            covariance=h.covariance + (xp.exp(logarithms[2]) - 1.0) * self.process,
+        )
+
+    def update(self, state: Levels, given: Input) -> Levels:
+        """Take in the readings one after the other, and report the moments of all."""
+        xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
+        steered = self.variances
+        if given.action is not None:
+            predicted = self.steer(predicted, given.action[:3])
+            factors = xp.exp(given.action[3:])
+            steered = [factors[k] * variances for k, variances in enumerate(self.variances)]
         mean, covariance = predicted.mean, predicted.covariance
         log_density, nis, sensors = 0.0, 0.0, []
         for k, rows in enumerate(self.rows):
             there = measurement.available[k]
             reading = xp.where(there > 0.0, measurement.reading[k], 0.0)
-            variances = (
-                variance_factors[k] * self.variances[k] if len(variance_factors) else self.variances[k]
-            )
             step = noise_levels.update_sensor(
                 mean,
                 covariance,
                 reading,
                 rows,
-                noise_levels.SensorNoise(variances, predicted.sensors[k], self.prior.outlier, self.wide[k]),
+                noise_levels.SensorNoise(steered[k], predicted.sensors[k], self.prior.outlier, self.wide[k]),
                 there,
             )
             mean, covariance = step.mean, step.covariance
@@ -244,12 +241,11 @@ class LevelBank(Filter["UavAutopilot", Measurement, Levels]):
         log_weights = imm.log_probabilities(predicted.probability) + log_density
         probability = imm.softmax(log_weights)
         whole = noise_levels.merge(mean, covariance, probability)
-        return Posterior(
+        return Levels(
             whole.mean[:n],
             packed_covariance.unpack(whole.covariance, self.size)[:n, :n],
+            likelihood_of(measurement, imm.log_sum(log_weights), weighted_sum(probability, nis), xp),
             Hypotheses(mean, covariance, probability, tuple(sensors)),
-            imm.log_sum(log_weights),
-            weighted_sum(probability, nis),
         )
 
     def switch(self, memory: Hypotheses) -> Hypotheses:

@@ -41,7 +41,7 @@ class UavAutopilotPicture(Picture):
             "command": truth.command[0],
             "output": truth.state[task.output, 0],
             "estimate": self.model.mean(state)[task.output, 0],
-            "control": self.model.filter.feedback(estimator, state.measurement)[0],
+            "control": self.model.feedback(estimator, state.measurement)[0],
             # A line breaks off where there is no reading.
             "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
             "mean_nis": estimator.mean_nis[0],

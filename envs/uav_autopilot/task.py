@@ -137,6 +137,8 @@ class UavAutopilot(Task):
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"
     )
+    # A loop that is off by ten times its sensor's error throughout.
+    lost_cost = 100.0
     reward_unit = 1.5
     # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
     reward = "relative"
@@ -178,8 +180,8 @@ class UavAutopilot(Task):
         """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
 
-    def feedback(self, mean: Array, measurement: Measurement | Start) -> Array:
-        """Report the control that follows from an estimate made outside the bank, ``(N,)``."""
+    def feedback(self, mean: Array, covariance: Array, measurement: Measurement | Start) -> Array:
+        """Report the control that follows from an estimate, ``(N,)``."""
         return self.autopilot(mean, measurement.command)
 
     def readings_of(self, state: Array) -> Array:
@@ -188,7 +190,7 @@ class UavAutopilot(Task):
 
     def records(self, model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
         """Report what is fed back: the control that follows from the estimate."""
-        return {"control_signal": model.filter.feedback(episode.filter, episode.measurement)}
+        return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
 TASK = UavAutopilot

@@ -21,9 +21,11 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
-from ..storage.dataset import FAULTS
 from .kinds import Kind, check_competitor, compilation_key, make_competitor
+from .programs import ProgramEstimator
 
+AFTER_MISSED = 5.0
+"""Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
 """What starts and updates with nothing but the initial estimate and the measurements."""
 
@@ -85,6 +87,11 @@ class Adapter(Filter[Task, Any, Adapted]):
             self.tells, likelihood = True, Likelihood.of(*reported)
             likelihood = likelihood if self.in_python else likelihood.fill_unknown(mean[0])
         return Adapted(mean, covariance, memory, likelihood)
+
+    @property
+    def fault(self) -> int:
+        """Number of the reason among ``FAULTS`` for which it has no answer at all, as a program may have; 0: none."""
+        return getattr(self.own, "fault", 0)
 
     def ask(self, given: Input, memory: Any) -> Any:
         """Its answer to a measurement."""
@@ -150,6 +157,11 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         self.own, self.name, self.count = own, name, count
         self.memory, self.step_number = None, 0
         self.knows = getattr(own, "knows", "")
+
+    @property
+    def fault(self) -> int:
+        """Number of the reason among ``FAULTS`` for which a program has no answer at all; 0: it has."""
+        return self.own.fault if isinstance(self.own, Adapter) else 0
 
     def _repeat_last(self, given: Input) -> Input:
         """Copies, which may be changed in place."""
@@ -259,6 +271,8 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
+        if isinstance(self.own, HeldInPython) and self.own.fault:
+            fault = numpy.where(state.fault > 0.0, state.fault, float(self.own.fault))
         lost = fault > 0.0
         mean = self._held(lost, state.mean, mean)
         return Checked(own, mean, self._held(lost, state.covariance, covariance), fault, missed)
@@ -315,7 +329,7 @@ def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp:
     fault = xp.where(finite[1], fault, 2.0)
     fault = xp.where(finite[0], fault, 1.0)
     unreceived = (missed > 0.0) & ((fault == 1.0) | (fault == 2.0))
-    fault = xp.where(unreceived, float(len(FAULTS)), fault)
+    fault = xp.where(unreceived, AFTER_MISSED, fault)
     return xp.where(before > 0.0, before, fault)
 
 
@@ -436,6 +450,8 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
+    if isinstance(own, ProgramEstimator):
+        own.tracks = count
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:

@@ -6,21 +6,22 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 import copy
 import importlib.metadata
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy
 
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
+from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
-from ...envs.data.recorded_world import measure_examples
-from ...envs.engine.stepper import filter_stepper
+from ...envs.engine.episode_noise import MeasurementRow
+from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .filters import find_fault, put_in_loop
 from .kinds import Kind, check_competitor, make_competitor
+from .online_state import Estimate, History, OnlineState, Taken, Watch
 from .stepping import SteppingPolicy
 
 LEAST_INTERVAL = 1e-6
@@ -29,113 +30,6 @@ MOST_MISSED = 1000
 """Scans without a measurement, after which a track is another one."""
 REPORTED = ("nis", "nis_degrees", "log_likelihood", "mode_probability", "lost")
 """What a filter may report beside its estimate."""
-
-
-class Watch(Protocol):
-    """Says whether what a network is shown looks like its training."""
-
-    memory: Any
-    """What it has seen so far."""
-
-    def describe(self) -> list[str]:
-        """Return what is unusual, in words, for each track; empty where nothing is."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a filter says after a measurement; C components, and for N tracks side by side a last axis of N."""
-
-    time: Any
-    """s."""
-    names: tuple[str, ...]
-    """Of the components."""
-    units: tuple[str, ...]
-    """Of the components."""
-    mean: numpy.ndarray
-    """``(C,)``."""
-    covariance: numpy.ndarray
-    """``(C, C)``."""
-    nis: Any = None
-    """Normalised innovation squared of the measurement; NaN where none was received, None where the filter does not
-    say it; likewise what follows."""
-    nis_degrees: Any = None
-    """Numbers of the measurement that it counts: its mean, if the filter is consistent."""
-    log_likelihood: Any = None
-    """Log-density of the measurement as it was predicted, nats."""
-    mode_probability: Any = None
-    """Probabilities of the hypotheses, ``(M,)``."""
-    lost: Any = ""
-    """Why an estimator's answers are no estimates any more; a list for several tracks."""
-    departure: Any = ""
-    """What is unlike the training of a network inside; likewise."""
-
-    @property
-    def sigma(self) -> numpy.ndarray:
-        """Standard deviations that the filter states, ``(C,)``."""
-        return numpy.sqrt(numpy.einsum("ii...->i...", self.covariance))
-
-    def __getitem__(self, name: str) -> Any:
-        """Mean of a component, by its name."""
-        return self.mean[self.names.index(name)]
-
-    def __str__(self) -> str:
-        if self.mean.ndim > 1:
-            return f"<Estimate of {self.mean.shape[1]} tracks: {', '.join(self.names)}>"
-        each = zip(self.names, self.mean, self.sigma, self.units, strict=True)
-        return ", ".join(f"{name} {mean:.6g} ± {sigma:.2g} {unit}" for name, mean, sigma, unit in each)
-
-
-class Taken(NamedTuple):
-    """A measurement that was taken in."""
-
-    time: numpy.ndarray
-    """s, ``(N,)``."""
-    values: Mapping[str, Any]
-    """What the sensors said."""
-    before: "OnlineState"
-    """Without a history."""
-
-
-@dataclass(frozen=True)
-class History:
-    """The last measurements in the order of their times. Nothing in it ever changes, so that copies share it."""
-
-    taken: tuple[Taken, ...] = ()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "History":
-        return self
-
-
-class OnlineState(NamedTuple):
-    """All that a running filter remembers; it can be pickled.
-
-    ``owner`` says whose it is: environment and its interface, filter, tracks, version of the package.
-    """
-
-    filter: Any
-    """Of the filter, arrays ``(..., N)``."""
-    input: Any
-    """Of the measurements before."""
-    policy: Any = None
-    """What a policy remembers."""
-    fresh: numpy.ndarray | None = None
-    """Which tracks have just begun, for the policy, ``(N,)``."""
-    measurements: int = 0
-    """So far."""
-    action: Any = None
-    """In force, where one holds for several measurements."""
-    total: Any = 0.0
-    """Sums of what is shown as a mean since the last decision."""
-    python: Any = None
-    """Memory of an estimator that runs in Python."""
-    watch: Any = None
-    """Memory of the watch."""
-    owner: tuple[str, ...] = ()
-    """Of which filter it is; no other goes on from it."""
-    history: History = History()
-    """Of a filter that takes late measurements, what these may have to be followed by again."""
-    too_late: int = 0
-    """Measurements so far that were older than the history."""
 
 
 class OnlineFilter:
@@ -172,10 +66,8 @@ class OnlineFilter:
         tracks = check_integer("tracks", tracks, 1)
         self.name, self.tracks, self.watch, self._lag = name, tracks, watch, _check_lag(lag)
         self.task = model.task
-        initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
-        if self.task.recording.second_sensor:
-            measurement = self.task.world.add_recorded_fields(measurement)
-        self.input = self.task.live_input(self.task, initial, measurement, tracks)
+        world: Any = self.task.world
+        self.input = self.task.live_input(self.task, world.initial, world.measurement, tracks)
         self._policy: SteppingPolicy | None = None
         if kind == "policy":
             self._policy = SteppingPolicy(
@@ -187,10 +79,11 @@ class OnlineFilter:
         self.names = tuple(component.name for component in self.task.components)
         self.units = tuple(component.unit for component in self.task.components)
         interval = self.task.decision_interval
-        averaged = [i for i, f in enumerate(self.model.fields) if f.over_interval == "mean"]
-        self._interval, self._averaged = interval, averaged if interval > 1 else []
+        self._interval, self._means = interval, DecisionMeans(self.model.fields, interval)
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
+        self._stepper = make_stepper(self.model, report_estimate, len(self._pad))
+        self._stepper.take(numpy.zeros((len(self._pad), *(self.model.action_space.shape or ()))))
+        self._measured = MeasurementRow(world.measurement, len(self._pad))
         of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
@@ -386,11 +279,12 @@ class OnlineFilter:
         measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
         stepper = self._stepper
-        stepper.predict(self._padded(measurement))
-        action = numpy.zeros(stepper.width, dtype=numpy.int64)
+        self._measured.put(self._padded(measurement))
+        stepper.arrive(self._measured)
         if self._policy is not None:
-            after, action = self._decide(after, stepper.observe())
-        stepper.update(action)
+            after = self._decide(after, stepper.observation_by_field())
+            stepper.take(after.action[self._pad])
+        stepper.answer()
         self._state = after
         return self._estimate(at, stepper.report())
 
@@ -421,7 +315,7 @@ class OnlineFilter:
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(
             state._replace(
-                filter=self._stepper.state,
+                filter=self._stepper.filter_state,
                 python=None if own is None else (own.memory, own.step_number),
                 watch=None if self.watch is None else self.watch.memory,
             )
@@ -451,37 +345,25 @@ class OnlineFilter:
         self._go_on(state)
 
     def _go_on(self, state: OnlineState) -> None:
-        self._stepper.state = state.filter
+        self._stepper.filter_state = state.filter
         self._state = state._replace(filter=None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> tuple[OnlineState, numpy.ndarray]:
-        """Ask the policy where a decision is due; the action is ``(A, width)`` or ``(width,)``."""
+    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
+        """Ask the policy where a decision is due."""
         assert self._policy is not None
         number = state.measurements - 1
-        if self._averaged:
-            observation, state = self._average(observation, state, number)
+        if number:
+            state = state._replace(total=self._means.add(state.total, observation))
+        if number and number % self._interval == 0:
+            observation = self._means.show(observation, state.total, numpy)
+            state = state._replace(total=0.0)
         if number % self._interval == 0:
             shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(shown, state.policy, state.fresh)
             state = state._replace(policy=memory, action=action, fresh=numpy.zeros(self.tracks, dtype=bool))
-        action = state.action
-        turned = action.T if action.ndim == 2 else action
-        return state, numpy.ascontiguousarray(turned[..., self._pad])
-
-    def _average(
-        self, observation: numpy.ndarray, state: OnlineState, number: int
-    ) -> tuple[numpy.ndarray, OnlineState]:
-        """Show means over the measurements since the last decision."""
-        if number == 0:
-            return observation, state
-        total = state.total + observation[self._averaged]
-        if number % self._interval:
-            return observation, state._replace(total=total)
-        observation = observation.copy()
-        observation[self._averaged] = total / self._interval
-        return observation, state._replace(total=0.0)
+        return state
 
     def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
         cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
@@ -592,7 +474,7 @@ class OnlineFilter:
             ) from None
         old = self._running()
         return old._replace(
-            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
+            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.filter_state),
             input=select_nested(chosen, begun.input, old.input),
             fresh=chosen | old.fresh,
             history=History(),

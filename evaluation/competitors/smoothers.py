@@ -47,14 +47,6 @@ class SmoothedTrack(Filter[Task, Any, int]):
         return self.covariances[:, :, state - 1]
 
 
-def is_open_loop(model: Model) -> bool:
-    """Whether the estimate does not decide what is measured next."""
-    plain = model.on_numpy()
-    noise = plain.task.noise
-    episode = plain.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
-    return plain.filter.feedback(episode.filter, episode.measurement) is None
-
-
 def check_open_loop(model: Model, name: str) -> None:
     """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed.
 
@@ -62,7 +54,7 @@ def check_open_loop(model: Model, name: str) -> None:
         model: in which a smoother is to run.
         name: of the smoother.
     """
-    if not is_open_loop(model):
+    if model.task.closes_loop:
         raise ValueError(
             f"smoother {name!r} cannot run in {model.task.id}, a closed loop with these parameters, in which the "
             "estimate steers what is measured later: leave it out"

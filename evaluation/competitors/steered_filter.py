@@ -16,7 +16,7 @@ from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ...envs.contract.filter import Input
 from ...envs.contract.model import Episode, Model
-from ...envs.contract.observation import Array
+from ...envs.contract.observation import Array, DecisionMeans
 from ...envs.engine.compiled import CompiledModel, warn_of
 from .filters import AroundBank
 from .kinds import Policy, says_traceable
@@ -55,12 +55,10 @@ class Decider:
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
         self.xp, self.ask, self._template = model.task.xp, act, memory
         self._shapes = shapes_of(memory)
-        self._fields = len(model.fields)
         self.space = model.action_space
         self.size = math.prod(self.space.shape or (1,))
         self.interval = model.task.decision_interval if interval is None else interval
-        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
-        self.averaged = averaged if self.interval > 1 else []
+        self.means = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
         """Nothing is decided yet; all numbers are zero, ``(N,)``."""
@@ -68,7 +66,7 @@ class Decider:
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
         action = self.xp.stack([zero] * self.size)
-        return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.averaged), 1)))
+        return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.means.columns), 1)))
 
     def is_due(self, state: Decisions) -> Array:
         """Whether the policy is asked at the next measurement, ``(N,)``."""
@@ -79,13 +77,9 @@ class Decider:
         xp, K = self.xp, self.interval
         first = state.count == 0.0
         due, total = self.is_due(state), state.total
-        if self.averaged:
-            total = xp.where(first, 0.0, total + xp.stack([observation[i] for i in self.averaged]))
-            means = xp.where(first, xp.stack([observation[i] for i in self.averaged]), total / K)
-            place = {field: i for i, field in enumerate(self.averaged)}
-            observation = xp.stack(
-                [means[place[i]] if i in place else observation[i] for i in range(self._fields)]
-            )
+        if self.means.columns:
+            total = xp.where(first, 0.0, self.means.add(total, observation))
+            observation = xp.where(first, observation, self.means.show(observation, total, xp))
             total = xp.where(due, 0.0, total)
         answer, memory = self._ask(observation, state.memory, first)
         if K > 1:

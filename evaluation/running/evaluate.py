@@ -371,12 +371,14 @@ class Plan(NamedTuple):
                     recording_coords(self.scenario.recording, self.flown, dataset)
                 )
                 dataset = with_innovations(dataset, next(iter(self.models.values())).task)
+        task = next(iter(self.models.values())).task
         return dataset.assign_attrs(
             paper=experiment.paper,
             reference=experiment.reference,
             notes="\n".join(self.scenario.notes),
             recorded=int(self.scenario.recording is not None),
-            truth=int(next(iter(self.models.values())).task.has_truth),
+            truth=int(task.has_truth),
+            lost_cost=float(task.lost_cost or 0.0),
         )
 
 

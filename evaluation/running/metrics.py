@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..competitors.kinds import RANKED
-from ..statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
+from ..statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, ratio, share_interval
 from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
@@ -28,7 +28,7 @@ from ..storage.dataset import (
     with_windows,
 )
 from .threads import one_thread
-from .times import COMPILED, IN_PYTHON, METRIC, time_of
+from .times import METRIC, time_of, way_of
 
 if TYPE_CHECKING:
     import xarray
@@ -155,6 +155,9 @@ def record_statistics(
             yield from means("mean_error", component, unit, run["error"].sel(component=component).values)
     for metric in consistency_metrics(run):
         yield from _consistency(run, metric, episodes)
+        if metric == "nees":
+            nees = ratio(sums_of_present(_over_dimension(run, metric)[0]))
+            yield Statistic(("episodes", "anees"), nees, sample=ALL)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             yield from means(
@@ -278,7 +281,7 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> Estimate:
-    """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
+    """(C_paper - C) / (C_paper - C_reference), from means, and resampled ones, of three costs or their logarithms."""
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
     # worse it would praise what is worse still.
@@ -308,30 +311,59 @@ def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
 
 
 class _Against:
-    """Comparisons of every episode's cost with the paper's algorithm, the reference and the best."""
+    """Costs of every episode, and their comparisons with the paper's algorithm, the reference and the best.
+
+    Ratios are geometric means over episodes, of which no single one owns much: exp of mean differences of logarithms.
+    """
 
     def __init__(
-        self, contenders: Sequence[Contender], paper: str, reference: str, bootstrap: Bootstrap
+        self, contenders: Sequence[Contender], attrs: Mapping[str, Any], bootstrap: Bootstrap
     ) -> None:
         self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
-        self.paper, self.reference, self.bootstrap = paper, reference, bootstrap
-        against = self.costs.get(paper)
-        self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
-        columns = [*self.costs.values(), *map(_wins, self.ratios.values())]
-        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else ()
-        self.means = dict(zip(self.costs, means, strict=False))
-        self.wins = dict(zip(self.ratios, means[len(self.costs) :], strict=True))
-        ranked = {c.name: c.costs.mean() for c in contenders if c.kind in RANKED and c.costs is not None}
-        self.ranked = list(ranked)
+        self.paper, self.reference, self.bootstrap = attrs["paper"], attrs["reference"], bootstrap
+        against = self.costs.get(self.paper)
+        with numpy.errstate(divide="ignore", invalid="ignore"):
+            self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
+            logs = [numpy.log(own) for own in self.costs.values()]
+        self.bound = attrs.get("lost_cost", 0.0)
+        lost = [own > self.bound for own in self.costs.values()]
+        columns = [*self.costs.values(), *logs, *lost, *map(_wins, self.ratios.values())]
+        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else numpy.empty((0, 0))
+        parts = [means[i * len(logs) : (i + 1) * len(logs)] for i in range(4)]
+        self.means, self.logs, self.lost = (dict(zip(self.costs, part, strict=True)) for part in parts[:3])
+        self.wins = dict(zip(self.ratios, parts[3], strict=True))
+        self.ranked = [c.name for c in contenders if c.kind in RANKED and c.costs is not None]
         self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
         # The first where none is a number, as of flights in which nobody was measured.
-        self.best = list(ranked)[int(numpy.argmin(list(ranked.values())))] if ranked else ""
+        places = numpy.argmin([self.logs[name] for name in self.ranked], axis=0) if self.ranked else []
+        self.best = self.ranked[places[0]] if self.ranked else ""
+        self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
 
     def behind_best(self, name: str) -> Iterator[Measure]:
-        """Paired relative difference of the cost to the best one's."""
+        """Paired ratio of the cost to the best one's, less one, and how often other episodes would name this one."""
         if name in self.ranked:
-            difference = self.bootstrap.relative_difference(self.means[name], self.means[self.best])
+            difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
+            share = float(self.chosen[name])
+            yield Measure("best_share", "", "all", Estimate(share, math.nan, math.nan), "1")
+
+    def _difference(self, name: str, other: str) -> Estimate:
+        """Geometric mean of the ratios of two costs, less one."""
+        with numpy.errstate(invalid="ignore", over="ignore"):
+            return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
+
+    def own(self, name: str) -> Iterator[Measure]:
+        """Geometric mean of the cost, and the share of episodes whose track is lost where a bound says so."""
+        if name in self.logs:
+            with numpy.errstate(over="ignore"):
+                mean = self.bootstrap.interval(numpy.exp(self.logs[name]))
+            yield Measure("geometric_cost", "", "all", mean, "1")
+            if self.bound > 0.0:
+                lost, bootstrap = self.lost[name], self.bootstrap
+                # Of flights whole ones are resampled: their episodes are not independent.
+                of_episodes = share_interval(float(lost[0]), bootstrap.episodes)
+                share = bootstrap.interval(lost) if bootstrap.ragged else of_episodes
+                yield Measure("lost_tracks", "", "all", share, "1")
 
     def others(self, name: str) -> Iterator[Measure]:
         """Score and paired difference to the paper's algorithm, where there is what they need."""
@@ -339,6 +371,7 @@ class _Against:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
         found = {
+            "geometric_cost_difference": self._difference(name, self.paper),
             "cost_difference": bootstrap.interval(cost - paper),
             "relative_cost_difference": bootstrap.relative_difference(cost, paper),
             "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
@@ -346,7 +379,8 @@ class _Against:
         }
         # A share of the room that a causal competitor has says nothing of one that uses later measurements.
         if self.reference in self.costs and name not in self.smoothers:
-            found["score"] = score(cost, paper, self.means[self.reference], bootstrap)
+            logs = (self.logs[other] for other in (name, self.paper, self.reference))
+            found["score"] = score(*logs, bootstrap)
         for metric, estimate in found.items():
             yield Measure(metric, "", "all", estimate, "1")
 
@@ -402,7 +436,7 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
     return records
 
 
-PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
+PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "relative_cost_difference")
 """Metrics that are told of every flight."""
 
 
@@ -411,7 +445,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
-    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
+    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent),
+    ``median_anees`` (of the middle one of the episodes, which a few lost tracks do not rule), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
     ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
@@ -420,9 +455,13 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     left out. Of a recording with tracks ``prediction_error`` and ``innovation_correlation``, whose intervals are over
     stretches of measurements.
 
-    Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
-    and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
-    ranked ``behind_best`` (paired; the component names the best). And the environment's own metrics.
+    ``geometric_cost`` is the geometric mean over episodes, by which competitors are ranked, ``lost_tracks`` the share
+    of episodes whose mean cost is beyond the environment's bound. Against the paper's algorithm, paired,
+    ``geometric_cost_difference`` (geometric mean of the ratios of the episodes' costs, less one), ``cost_difference``
+    and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate`` over episodes, ``score`` =
+    (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best of what is ranked
+    ``behind_best`` (as the geometric difference; the component names the best) and ``best_share``, the share of
+    resamples of the episodes in which this one is the best. And the environment's own metrics.
 
     Args:
         dataset: from an evaluation.
@@ -457,6 +496,9 @@ def contender_of(
             metric, component, window, unit = words
             estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
             measures.append(Measure(metric, component, window, estimate, unit))
+    if (nees := results.get(("episodes", "anees"))) is not None:
+        middle = bootstrap.interval(bootstrap.quantiles(nees, chosen=~numpy.isnan(nees)))
+        measures.append(Measure("median_anees", "state", "all", middle, "1"))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
     causes = None
@@ -465,7 +507,7 @@ def contender_of(
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
         estimate = Estimate(time.nanoseconds, math.nan, math.nan)
-        measures.append(Measure(METRIC, COMPILED if time.compiled else IN_PYTHON, "all", estimate, "ns"))
+        measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
     return Contender(
         name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
     )
@@ -496,14 +538,15 @@ def records_of(
         bootstrap: over the episodes.
     """
     attrs = evaluation.attrs
-    against = _Against(contenders, attrs["paper"], attrs["reference"], bootstrap)
+    against = _Against(contenders, attrs, bootstrap)
 
     def finite(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
 
     records = []
     for c in contenders:
-        measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
+        compared = *against.own(c.name), *against.others(c.name), *against.behind_best(c.name)
+        measures = [*c.measures, *compared, *c.further]
         measures += _compare_causes(c, contenders, bootstrap)
         for m in measures:
             records.append(

@@ -20,6 +20,36 @@ LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
 
 
+OF_COMPONENTS = "that of the component (coordinate unit)"
+MEANINGS = {
+    "error": (OF_COMPONENTS, "estimate minus truth, not normalised"),
+    "estimate": (OF_COMPONENTS, "estimate, not normalised"),
+    "truth": (OF_COMPONENTS, "truth, not normalised"),
+    "mean_square": ("square of that of the component", "computed mean square error, not normalised"),
+    "covariance": ("product of those of both components", "covariance as reported, not normalised"),
+    "nees": ("1", "estimation error squared, normalised by the reported covariance, not by the dimension"),
+    "nis": ("1", "innovation squared, normalised by its predicted covariance, not by the dimension"),
+    "nis_degrees": ("1", "dimension of the innovation"),
+    "log_likelihood": ("nat", "log-density of the measurement as it was predicted, in its units"),
+    "mode_probability": ("1", "probability of each hypothesis"),
+    "action": ("1", "action as the filter got it, normalised to its space"),
+    "charge": ("1", "minus the reward `cost`: normalised to reward_unit, and compressed"),
+    "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
+    "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
+}
+"""Unit and meaning of variables; what an environment reports beside them is in the unit that its page says."""
+MEASURED = ("that of the environment's table of measurements", "as the sensors report it, not normalised")
+
+
+def _attributes(key: str, cost: str) -> dict[str, str]:
+    """Unit of a variable, and whether it is normalised; nothing where only the environment knows."""
+    name = key.removeprefix(DRAWN_PREFIX)
+    if name == "cost":
+        return {"units": "1", "long_name": f"{cost}, normalised as it says"}
+    found = MEASURED if name.startswith("measurement_") else MEANINGS.get(name, ())
+    return dict(zip(("units", "long_name"), found, strict=False))
+
+
 def recording_coords(
     recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
@@ -120,10 +150,8 @@ def with_named_axes(
     actions = _actions_named(per_policy, controls, models)
     for key in sorted({key for series in per_policy.values() for key in series}):
         if key == "action":
-            variables[key] = (
-                ["policy", "episode", "time", "action_name"],
-                _actions_aligned(per_policy, actions),
-            )
+            dims = ["policy", "episode", "time", "action_name"]
+            variables[key] = (dims, _actions_aligned(per_policy, actions), _attributes(key, ""))
             continue
         example = next(series[key] for series in per_policy.values() if key in series)
         stacked = numpy.empty((len(names), *example.shape))
@@ -131,7 +159,7 @@ def with_named_axes(
             stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
-        variables[key] = (dims, stacked)
+        variables[key] = (dims, stacked, _attributes(key, model.task.cost_description))
     dataset = xarray.Dataset(
         variables,
         coords={

@@ -50,6 +50,8 @@ class Place(NamedTuple):
     paths: list[str]
     named_in: list[str]
     """Folders of modules that the user has named, where nothing else is looked for."""
+    safe_path: str | None
+    """What the user's environment says of PYTHONSAFEPATH, which we set for the processes that begin."""
 
 
 class Outcome(NamedTuple):
@@ -89,6 +91,8 @@ def _run_piece(index: int, packed: bytes, packed_item: bytes, place: Place) -> O
     if os.getcwd() != place.folder:
         with suppress(OSError):  # another machine may not have it
             os.chdir(place.folder)
+    if place.safe_path is None:  # programs that compete are the user's
+        os.environ.pop("PYTHONSAFEPATH", None)
     # Engines search the working directory, too, where a file is no library, unless this command does.
     unwanted = {"", place.folder} - set(place.paths)
     sys.path[:] = [path for path in sys.path if path not in unwanted]
@@ -218,7 +222,7 @@ class Workers:
                     result = function(item, tick)
                 yield index, result
             return
-        place = Place(os.getcwd(), list(sys.path), list(FOUND_IN))
+        place = Place(os.getcwd(), list(sys.path), list(FOUND_IN), os.environ.get("PYTHONSAFEPATH"))
         packed = cloudpickle.dumps(function)
         calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)

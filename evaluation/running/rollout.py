@@ -3,6 +3,7 @@
 import itertools
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
 from ..competitors.filters import put_in_loop
 from ..competitors.kinds import Kind, check_competitor, compilation_key, kind_of, make_competitor
+from ..competitors.programs import Program
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
@@ -29,7 +31,10 @@ Progress = Callable[[int], None]
 
 
 def start_lanes(
-    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+    model: Model,
+    seeds: Sequence[int],
+    on_start: Callable[[Episode], None] | None = None,
+    report: Report | None = None,
 ) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
@@ -37,8 +42,9 @@ def start_lanes(
         model: task with a bank.
         seeds: of the episodes.
         on_start: called with the episodes at the start of the track.
+        report: that will be made of them; default: not known.
     """
-    lanes = Lanes(model, len(seeds), on_start=on_start)
+    lanes = Lanes(model, len(seeds), on_start=on_start, report=report)
     lanes.begin(identities_of_seeds(seeds))
     return lanes
 
@@ -76,7 +82,7 @@ def rollout(
 
 def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
     """Step a filter that needs nobody who steers it."""
-    lanes, action = start_lanes(looped, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+    lanes, action = start_lanes(looped, seeds, report=report), numpy.zeros(len(seeds), dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for found, _ in lanes.decide(action, report):
             yield found, action
@@ -86,7 +92,7 @@ def _steer_by_python(
     model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
     """Step a bank, and ask its policy before every decision."""
-    lanes = start_lanes(model, seeds)
+    lanes = start_lanes(model, seeds, report=report)
     policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
@@ -198,7 +204,7 @@ def _run_compiled(
     looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
     """Run compiled episodes as one call of native code."""
-    lanes, count = start_lanes(looped, seeds), len(seeds)
+    lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
     reports, actions = lanes.run(report, steering)
     tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
     found = {name: _episodes_first(values, count) for name, values in reports.items()}
@@ -281,12 +287,14 @@ TIMED_SECONDS, FEWEST_RUNS, MOST_RUNS = 0.05, 3, 20
 
 
 class ProcessorTime(NamedTuple):
-    """What a measurement takes on one core: world and competitor together."""
+    """What a measurement takes on one core: world and competitor together, or of a program the process alone."""
 
     nanoseconds: float
     """Of a measurement of one of many episodes side by side."""
     compiled: bool
     """Whether all of it is native code; else the time is mostly that of the steps between, in Python."""
+    own: bool = False
+    """Whether it is that of a program's own process, without the world: not to be compared with the others."""
 
 
 def measure_time(
@@ -296,6 +304,7 @@ def measure_time(
 
     Of :data:`TIMED_EPISODES` episodes side by side, after everything is traced and compiled: of native code the
     quickest of several runs, since what disturbs one only adds to it; of what is asked in Python the median decision.
+    Of a program it is the time of its own process.
 
     Args:
         model: as in :func:`rollout`, likewise what follows.
@@ -308,6 +317,10 @@ def measure_time(
         return None
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, steers = model.task, kind == "policy"
+    clock = time.process_time
+    if own := isinstance(competitor, Program):
+        competitor = competitor(task)
+        clock = competitor.processor_seconds
     decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
     looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
     steering = _steering_of(model, competitor, name) if steers else None
@@ -319,8 +332,13 @@ def measure_time(
         if steers
         else _step_filter(looped, seeds, _report_estimate)
     )
-    spent = _time_steps(steps, decisions, task.decision_interval)
-    return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False)
+    with warnings.catch_warnings():
+        if own:
+            warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program
+        spent = _time_steps(steps, decisions, task.decision_interval, clock)
+    if math.isnan(spent):
+        return None
+    return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), False, own)
 
 
 def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
@@ -331,7 +349,8 @@ def _time_compiled(
     looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
     """Seconds of a decision of all episodes, in the quickest run of optimised code."""
-    lanes, identities = start_lanes(looped, seeds), identities_of_seeds(seeds)
+    identities = identities_of_seeds(seeds)
+    lanes = start_lanes(looped, seeds, report=_report_estimate)
     interval = looped.task.decision_interval
 
     def run(count: int) -> float:
@@ -353,14 +372,16 @@ def _time_compiled(
     return (min(spent) - setting_up) / (count - 1)
 
 
-def _time_steps(steps: Iterator[Any], decisions: int, interval: int) -> float:
-    """Seconds of the median decision."""
+def _time_steps(
+    steps: Iterator[Any], decisions: int, interval: int, clock: Callable[[], float] = time.process_time
+) -> float:
+    """Seconds of the median decision, by a clock."""
     spent: list[float] = []
     for _ in range(decisions):
-        began = time.process_time()
+        began = clock()
         for _ in range(interval):
             next(steps)
-        spent.append(time.process_time() - began)
+        spent.append(clock() - began)
         if sum(spent[1:]) > 2.0 * TIMED_SECONDS:
             break
     return float(numpy.median(spent[1:] or spent))  # the first starts the episodes and compiles

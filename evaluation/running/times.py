@@ -19,16 +19,19 @@ COORDINATES = ("nanoseconds", "compiled")
 """Names of the coordinates over policy."""
 METRIC = "nanoseconds"
 """Of the records that hold the time."""
-COMPILED, IN_PYTHON = "compiled", "python"
-"""Components of these records."""
-PYTHON_MARK, FRONT_MARK = "py", "*"
-"""In tables, of times that are mostly Python's, and of who lies on the front."""
+IN_PYTHON, COMPILED, OWN = WAYS = ("python", "compiled", "own")
+"""Components of these records; the coordinate ``compiled`` is 0, 1 or 2."""
+PYTHON_MARK, OWN_MARK, FRONT_MARK = "py", "own", "*"
+"""In tables, of times that are mostly Python's, of those of a program alone, and of who lies on the front."""
 TIME_TITLE = "ns"
 """Of the column of times."""
 TIME_NOTE = (
     f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
     "An asterisk marks the front, where no other ranked competitor costs less in as much time or less. "
     f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
+)
+OWN_NOTE = (
+    f"{OWN_MARK} marks programs: the time of their own process, without the world, which is on no front."
 )
 EQUAL_TIMES = 1.1
 """Ratio up to which two times are taken for the same: so much they differ from run to run."""
@@ -37,18 +40,24 @@ EQUAL_TIMES = 1.1
 def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None]) -> "xarray.Dataset":
     """Return an evaluation with the time of each of its competitors, or one competitor's part of one."""
     values = [math.nan if time is None else time.nanoseconds for time in times]
-    compiled = [int(time is not None and time.compiled) for time in times]
+    compiled = [0 if time is None else WAYS.index(way_of(time)) for time in times]
     attrs = {"units": "ns", "long_name": "processor time of a measurement, of world and competitor"}
     if "policy" not in dataset.dims:
         return dataset.assign_coords(nanoseconds=((), values[0], attrs), compiled=compiled[0])
     return dataset.assign_coords(nanoseconds=("policy", values, attrs), compiled=("policy", compiled))
 
 
+def way_of(time: ProcessorTime) -> str:
+    """Return which of :data:`WAYS` a time is of."""
+    return OWN if time.own else COMPILED if time.compiled else IN_PYTHON
+
+
 def time_of(run: "xarray.Dataset") -> ProcessorTime | None:
     """Return the time of one competitor's part of an evaluation; None where it is not known."""
     if COORDINATES[0] not in run.coords or math.isnan(nanoseconds := float(run[COORDINATES[0]])):
         return None
-    return ProcessorTime(nanoseconds, bool(run[COORDINATES[1]]))
+    way = WAYS[int(run[COORDINATES[1]])]
+    return ProcessorTime(nanoseconds, way == COMPILED, way == OWN)
 
 
 class Point(NamedTuple):
@@ -64,14 +73,15 @@ class Point(NamedTuple):
 def times_of_records(records: Sequence[Any]) -> dict[str, ProcessorTime]:
     """Times by name, from tidy records of one environment and scenario."""
     return {
-        r.policy: ProcessorTime(r.value, r.component == COMPILED)
+        r.policy: ProcessorTime(r.value, r.component == COMPILED, r.component == OWN)
         for r in records
         if r.metric == METRIC and r.value is not None
     }
 
 
 def points_of_records(records: Sequence[Any]) -> list[Point]:
-    """Points of all competitors whose cost and time are known; the cost is relative to the paper's algorithm, in %.
+    """Points of all competitors whose cost and time are known, but for programs, whose time is without the world; the
+    cost is relative to the paper's algorithm, in %.
 
     Args:
         records: tidy ones of one environment and scenario.
@@ -80,7 +90,8 @@ def points_of_records(records: Sequence[Any]) -> list[Point]:
     return [
         Point(r.policy, r.kind, times[r.policy], 100.0 * r.value)
         for r in records
-        if r.metric == "relative_cost_difference" and r.value is not None and r.policy in times
+        if r.metric == "geometric_cost_difference" and r.value is not None
+        if r.policy in times and not times[r.policy].own
     ]
 
 
@@ -111,7 +122,8 @@ def time_text(time: ProcessorTime | None) -> str:
     if time is None or time.nanoseconds <= 0.0:
         return "-"
     rounded = round(time.nanoseconds, min(1 - math.floor(math.log10(time.nanoseconds)), 0))
-    return f"{rounded:,.0f}" + ("" if time.compiled else f" {PYTHON_MARK}")
+    mark = {COMPILED: "", OWN: f" {OWN_MARK}"}.get(way_of(time), f" {PYTHON_MARK}")
+    return f"{rounded:,.0f}{mark}"
 
 
 def column_of_times(records: Sequence[Any]) -> dict[str, str]:

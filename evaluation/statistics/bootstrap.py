@@ -15,7 +15,9 @@ too narrow.
 """
 
 import functools
+import math
 import operator
+import statistics
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -64,6 +66,24 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
         ends = numpy.percentile(samples[1:], [tail, 100.0 - tail], axis=0)
     ends = numpy.where(numpy.isfinite(samples[1:]).all(axis=0), ends, numpy.nan)
     return numpy.concatenate([samples[:1], ends])
+
+
+def share_interval(share: float, number: int) -> Estimate:
+    """A share of independent episodes and its 95 % interval, which has a width where none or all are counted, too.
+
+    Wilson's score interval (E. B. Wilson, Probable inference, the law of succession, and statistical inference, Journal
+    of the American Statistical Association 22, 1927): all shares p with ``|share - p| <= z sqrt(p (1 - p) / n)``.
+
+    Args:
+        share: that was counted.
+        number: of episodes.
+    """
+    z = statistics.NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
+    middle = (share + 0.5 * z * z / number) / (1.0 + z * z / number)
+    half = z / (1.0 + z * z / number) * math.sqrt(share * (1.0 - share) / number + (0.5 * z / number) ** 2)
+    # The ends are exact there but for rounding.
+    low, high = 0.0 if share == 0.0 else middle - half, 1.0 if share == 1.0 else middle + half
+    return Estimate(share, low, high)
 
 
 def block_of(times: int) -> int:
@@ -196,6 +216,10 @@ class Bootstrap:
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> Estimate:
         """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
         return self.interval(means / others - 1.0)
+
+    def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> Estimate:
+        """Geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less one."""
+        return self.estimate(numpy.log(costs / others), numpy.expm1)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m

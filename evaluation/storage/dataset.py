@@ -28,6 +28,9 @@ FAULTS = (
     "the covariance is not positive definite",
     "the covariance is not symmetric",
     "the estimate is not finite after a missed measurement (what is not received is NaN: predict without it)",
+    "the program ended",
+    "the program did not answer in time",
+    "the program answered with what is no estimate",
 )
 """Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
 

@@ -1,7 +1,8 @@
 """The command that advises which filter to take for a log."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,7 +10,6 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
 from ..baselines.problem import Problem, problem_of
-from ..baselines.tuned_values import make_tuned_policy
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
@@ -21,6 +21,7 @@ from ..reports.tables.advice import (
     further_sentences,
     held_out_numbers,
     parameter_lines,
+    price_table,
     reading_lines,
 )
 from ..reports.tables.results import settings_of
@@ -41,7 +42,7 @@ from .terminal import (
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
 
 
-def price_words(price: dict[str, int] | None) -> str:
+def price_words(price: Mapping[str, int] | None) -> str:
     """Say what an update of a filter costs in C; nothing where it is not known."""
     if price is None:
         return ""
@@ -80,7 +81,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
         console.print(OWN)
         return
     write_advised(out, problem, name, found, fitted, intervals, command_line())
-    console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
+    console.print(f"saved in {out}; filtergym evaluate {problem.name} --policy {out} runs it", soft_wrap=True)
 
 
 def advise_on_log(
@@ -161,6 +162,14 @@ def advise_on_log(
             bar.update(line, completed=share)
             bar.say(what)
 
+        parameters = setup_of(problem, found).parameters
+
+        def price(name: str, maker: Any) -> dict[str, int] | None:
+            from ..exports.c_source import price_of
+            from ..exports.request import ExportRequest
+
+            return price_of(ExportRequest(problem, name, maker, keywords=parameters))
+
         advice = advise(
             problem,
             found,
@@ -169,9 +178,13 @@ def advise_on_log(
             noise=noise,
             seed=seed,
             progress=progress,
+            price_of=price,
             **keywords,
         )
+        costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
+    if costs is not None:
+        console.print(costs)
     departures = list(departure_lines(problem, found, learned, keywords))
     for sentence in [*advice_lines(advice, learned), *departures]:
         console.print(sentence, highlight=False, soft_wrap=True)
@@ -179,13 +192,7 @@ def advise_on_log(
     if out is not None and name in own:
         console.print(OWN)
     elif out is not None:
-        from ..exports.c_source import price_of
-        from ..exports.request import ExportRequest
-
         fit = advice.fits[name] if advice.advised.fitted else None
-        maker = shipped[name] if fit is None else make_tuned_policy(name, advice.tunables[name], fit.values)
-        parameters = setup_of(problem, found).parameters
-        price = price_of(ExportRequest(problem, name, maker, keywords=parameters))
         write_advised(
             out,
             problem,
@@ -195,10 +202,11 @@ def advise_on_log(
             advice.intervals if fit is not None else {},
             command_line(),
             held_out=held_out_numbers(advice),
-            price=price,
+            price=advice.prices[name],
         )
+        costs_words = price_words(advice.prices[name])
         console.print(
-            f"{name} is saved{price_words(price)}: filtergym evaluate {problem.id} --policy {out} runs it",
+            f"{name} is saved{costs_words}: filtergym evaluate {problem.name} --policy {out} runs it",
             soft_wrap=True,
         )
     if report is not None and make_page is not None:

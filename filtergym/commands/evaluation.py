@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,7 +46,16 @@ from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.work import work_of
 from ..reports.tables.worst import worst_figures
 from .shown import REPORT, make_report
-from .terminal import command_line, console, pair, print_sentence, print_table, progress_bar, renamed
+from .terminal import (
+    check_no_recording_options,
+    command_line,
+    console,
+    pair,
+    print_sentence,
+    print_table,
+    progress_bar,
+    renamed,
+)
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
@@ -129,9 +139,7 @@ def find_data(
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
-    for option, given in (("--truth", options.truth), ("--rename", options.rename)):
-        if given is not None:
-            raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
+    check_no_recording_options(options.truth, options.rename)
     if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     if scenario in named or not names_flights(scenario):
@@ -297,7 +305,8 @@ def run(
             bar.update(line, advance=done)
 
         if task.flights or outputs.estimates is not None or whole:
-            dataset = run_experiment(experiment, competitors_of(problem, names, trust), tick, workers)
+            named = replace(experiment, paper=problem.paper_among(names))
+            dataset = run_experiment(named, competitors_of(problem, names, trust), tick, workers)
             records = tidy_records(dataset)
             if outputs.estimates is None:
                 tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from ..agents import training_run
 from ..agents.settings import parse_settings
 from ..agents.training_run import RunOptions
 from ..agents.training_session import Session
@@ -30,6 +29,7 @@ from .terminal import (
     Trust,
     TruthOffset,
     TruthOption,
+    check_no_recording_options,
     complete_policy,
     console,
     pair,
@@ -82,6 +82,7 @@ def tune_policy(
         )
         fit_to_recording(problem, policy, found, out, seed)
         return
+    check_no_recording_options(truth, rename)
     tunable = problem.baselines.tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
@@ -207,69 +208,3 @@ def train(
         runs = train_runs(opened, trainer, workers)
     if compare and all(run.is_complete for run in runs):  # unless somebody wished to stop
         print_standing(opened, runs)
-
-
-def search(
-    environment: Environment,
-    out: Annotated[Path, typer.Option(help="Folder of the search: journal, runs, best.yml.")],
-    algo: Annotated[
-        str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small or bptt-linear.")
-    ] = "ppo",
-    trials: Annotated[int, typer.Option(help="In all, those before an interruption included.")] = 50,
-    steps: Annotated[int, typer.Option(help="Environment steps of each run.")] = 100_000,
-    seeds: Annotated[str, typer.Option(help="Training seeds of every trial, such as 0-2.")] = "0",
-    control: TrainedControl = None,
-    scenario: TrainingScenario = None,
-    seed: Annotated[int, typer.Option(help="Of what is drawn to be tried.")] = 0,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="What stays as it is, env.NAME=VALUE or algo.NAME=VALUE."
-        ),
-    ] = None,
-    space: Annotated[
-        Path | None,
-        typer.Option(
-            help="YAML file of what is searched; default: the shipped one of ppo, bptt, its kin or kalman-net."
-        ),
-    ] = None,
-) -> None:
-    """Search hyperparameters on the validation split with Optuna; afterwards train --config OUT/best.yml uses them.
-
-    Trials that fall behind are pruned. Ctrl-C or SIGTERM stops; the same command goes on, without the trial under way.
-
-    Example: filtergym search filtergym/ManeuveringTarget-v0 --algo ppo --steps 77000 --trials 50 --out searches/ppo
-    """
-    trainer = trainer_of(algo)
-    try:
-        from ..agents import search as searching
-    except ImportError as error:
-        raise ValueError(
-            f"searching needs more packages: pip install 'filtergym[agents,search]' ({error})"
-        ) from error
-    keywords, hyperparameters = parse_settings(set_ or [])
-    if algo not in training_run.FILES:
-        raise nearest("algorithm", algo, training_run.FILES)
-    problem = problem_of(environment)
-    wanted = searching.Search(
-        problem,
-        RunOptions(algo, control, scenario=scenario, overrides=hyperparameters, keywords=keywords),
-        steps,
-        tuple(whole_numbers("--seeds", seeds)),
-        searching.read_space(problem.id, algo, space),
-        seed,
-    )
-    wanted.run(wanted.seeds[0], {})  # a wrong word costs nothing
-    with progress_bar() as bar:
-        line = bar.add_task(f"searching {algo}", total=trials)
-        searching.search_hyperparameters(
-            wanted,
-            out,
-            trials,
-            trainer,
-            progress=lambda done: bar.update(line, completed=done),
-            report=lambda text: console.print(text, highlight=False, soft_wrap=True),
-        )
-    best = out / "best.yml"
-    if best.exists():
-        console.print(f"best settings: filtergym train {environment} --algo {algo} --config {best} --out RUN")

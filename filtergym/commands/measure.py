@@ -10,6 +10,7 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names
+from ..evaluation.competitors.programs import limit_programs
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.parallel import Workers
@@ -17,7 +18,7 @@ from ..evaluation.running.recording import record_experiment
 from ..evaluation.running.rollout import Progress
 from ..evaluation.running.threads import one_thread
 from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
-from ..names import assumed_parameters, find_competitor, is_learned
+from ..names import assumed_parameters, find_competitor, is_learned, isolate_names
 from ..offline import plan_datasets
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
@@ -82,7 +83,7 @@ def evaluate_policies(
         list[str] | None,
         typer.Option(
             help="Policy, estimator, reference or bound; repeat for several. Also a file, the folder of a "
-            "training run, or module:Class.",
+            "training run, module:Class, or exec:COMMAND of any program.",
             autocompletion=complete_policy,
         ),
     ] = None,
@@ -130,6 +131,19 @@ def evaluate_policies(
             help="Stop where an estimator's answer is not finite or no covariance; default: the episode is lost.",
         ),
     ] = False,
+    isolated: Annotated[
+        bool,
+        typer.Option(
+            "--isolated",
+            help="Run every module:Class in a process of its own, which is told the measurements and nothing else.",
+        ),
+    ] = False,
+    time_limit: Annotated[
+        float, typer.Option(help="Of programs and isolated estimators: for each answer, s.")
+    ] = 10.0,
+    memory_limit: Annotated[
+        float, typer.Option(help="Likewise: address space, MB, on Linux; 0: no limit.")
+    ] = 4000.0,
     backend: Backend = "auto",
     threads: Threads = 1,
     jobs: Jobs = 1,
@@ -175,6 +189,10 @@ def evaluate_policies(
     outputs.check()
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
+    if isolated:
+        if trust:
+            raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
+        policy, why = isolate_names(problem, policy or []), isolate_names(problem, why or [])
     names = find_names(problem, data, policy)
     check_explained(why or [], names)
     learned = [name for name in names if is_learned(problem, name)]
@@ -193,14 +211,15 @@ def evaluate_policies(
         timed=True,
         keywords=keywords,
     )
-    with Workers(jobs, cluster) as workers:
-        outcome = run(problem, experiment, names, outputs, workers, trust)
-    explained = outcome.explained(policy or [], why or [])
-    worst = (
-        []
-        if out is None
-        else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
-    )
+    with limit_programs(time_limit, memory_limit):
+        with Workers(jobs, cluster) as workers:
+            outcome = run(problem, experiment, names, outputs, workers, trust)
+        explained = outcome.explained(policy or [], why or [])
+        worst = (
+            []
+            if out is None
+            else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
+        )
     write(problem, outcome, outputs, learned, explained, worst)
     say_departures(problem, data, learned, keywords, trust)
 
@@ -292,6 +311,13 @@ def benchmark(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for results, report and figures.")] = Path("results"),
     seed: Experiment = 0,
+    half_width: Annotated[
+        float,
+        typer.Option(
+            help="Run more episodes of the training distributions, at most 20,000, until no interval of the headline "
+            "reaches further than this to either side, percentage points; 0: no more."
+        ),
+    ] = 0.0,
     environment: Annotated[
         list[str] | None,
         typer.Option(
@@ -321,7 +347,9 @@ def benchmark(
     """
     formats = check_formats(format or [])
     check_columns(columns)
-    options = BenchmarkOptions(full, seed, environment or (), split, backend, threads, command_line())
+    options = BenchmarkOptions(
+        full, seed, environment or (), split, backend, threads, command_line(), half_width
+    )
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
         def add_line(total: int) -> Progress:

@@ -10,6 +10,7 @@ from .. import __version__
 from ..baselines.problem import problem_of
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, write_text
+from ..reports.tables.terminal_tables import HEADLINE
 from ..submission import (
     PROTOCOLS,
     TIME,
@@ -134,7 +135,7 @@ def _results_table(title: str, columns: dict[str, tuple[Figure, ...]]) -> Table:
     for scenario in dict.fromkeys(f.scenario for figures in columns.values() for f in figures):
         cells = []
         for known in rows.values():
-            cells.append(_percent(known.get((scenario, "relative_cost_difference"))))
+            cells.append(_percent(known.get((scenario, HEADLINE))))
             anees = known.get((scenario, "anees"))
             cells.append("-" if anees is None or anees.value is None else f"{anees.value:.3g}")
         table.add_row(scenario, *cells)

@@ -260,6 +260,13 @@ def close_output(*_: Any, **__: Any) -> None:
         ) from console.refusal
 
 
+def check_no_recording_options(truth: Any, rename: str | None) -> None:
+    """Raise ValueError for options of a recording where there is none."""
+    for option, given in (("--truth", truth), ("--rename", rename)):
+        if given is not None:
+            raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
+
+
 def renamed(text: str | None) -> dict[str, str]:
     """Names of columns by what they are called in a file, of an option such as ``t=time,pos=x``.
 

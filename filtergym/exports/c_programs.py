@@ -1,7 +1,9 @@
 """Programs of C around an exported filter, with fields for what differs from filter to filter."""
 
 MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
-   A row whose initial columns are filled begins a new track. */
+   A row whose initial columns are filled begins a new track. Where the first line is a hello of filtergym, such as
+   `filtergym evaluate --policy exec:./run` writes it, the program speaks that protocol: a line of its own, and then
+   frames of doubles, for any number of tracks. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -10,10 +12,11 @@ MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and w
 #include "rows.h"
 
 #define COLUMNS {count}
+#define ANSWER ({C} + {C} * {C})
 static const char columns[] =
     {columns};
 
-static char line[32 * COLUMNS + sizeof columns];
+static char line[1024 + 32 * COLUMNS + sizeof columns];
 
 /* The numbers of a line; an empty one is NaN. Returns how many there are. */
 static int numbers(const char *text, double *row) {{
@@ -30,6 +33,70 @@ static int numbers(const char *text, double *row) {{
     }}
 }}
 
+/* The number that follows a name in the hello; zero where there is none. */
+static long number_of(const char *name) {{
+    const char *place = strstr(line, name);
+    return place == NULL ? 0 : strtol(place + strlen(name), NULL, 10);
+}}
+
+/* What was not received comes as NaN; the filter weighs it by its availability, and any number will do. */
+static void clear_missing(double *row) {{
+    static const int available[] = {{{available}-1}};
+    int i, missing = 0;
+    for (i = 0; available[i] >= 0; ++i) missing |= !(row[available[i]] > 0.0);
+    for (i = 0; missing && i < COLUMNS - {initial}; ++i)
+        if (row[i] != row[i]) row[i] = 0.0;
+}}
+
+/* Answers every measurement of some tracks until there are no more. */
+static int serve(void) {{
+    const long tracks = number_of("\\"tracks\\": ");
+    {own}_state *states;
+    double *rows;
+    long t;
+    int i, j;
+    if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
+        number_of("\\"measurement\\": ") != COLUMNS - {initial} || number_of("\\"answer\\": ") != ANSWER ||
+        tracks < 1) {{
+        puts("{{\\"error\\": \\"this filter was exported from another environment or scenario\\"}}");
+        return 2;
+    }}
+    while (strchr(line, '\\n') == NULL && fgets(line, (int)sizeof line, stdin) != NULL) {{
+    }}
+    states = malloc((size_t)tracks * sizeof *states);
+    rows = malloc((size_t)tracks * (COLUMNS + ANSWER) * sizeof *rows);
+    if (states == NULL || rows == NULL) return 2;
+    puts("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"}}");
+    fflush(stdout);
+    if (fread(rows, {initial} * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
+    for (t = 0; t < tracks; ++t) {{
+        {own}_initial initial;
+        set_initial(&initial, rows + t * {initial});
+        {own}_start(&states[t], &initial);
+    }}
+    while (fread(rows, (COLUMNS - {initial}) * sizeof *rows, (size_t)tracks, stdin) == (size_t)tracks) {{
+        double *answer = rows + tracks * (COLUMNS - {initial});
+        for (t = 0; t < tracks; ++t) {{
+            {own}_measurement measurement;
+            {own}_estimate estimate;
+            clear_missing(rows + t * (COLUMNS - {initial}));
+            set_measurement(&measurement, rows + t * (COLUMNS - {initial}));
+            if ({own}_update(&states[t], &measurement, &estimate) >= {upper}_REJECTED) {{
+                for (i = 0; i < ANSWER; ++i) *answer++ = (double)NAN;
+                continue;
+            }}
+            for (i = 0; i < {C}; ++i) *answer++ = (double)estimate.mean{mean};
+            for (i = 0; i < {C}; ++i)
+                for (j = 0; j < {C}; ++j) *answer++ = (double)estimate.covariance{entry};
+        }}
+        if (fwrite(answer - tracks * ANSWER, ANSWER * sizeof *rows, (size_t)tracks, stdout) != (size_t)tracks) return 2;
+        fflush(stdout);
+    }}
+    free(states);
+    free(rows);
+    return 0;
+}}
+
 int main(int argc, char **argv) {{
     static {own}_state state;
     static double row[COLUMNS];
@@ -39,8 +106,9 @@ int main(int argc, char **argv) {{
         fprintf(stderr, "cannot read %s\\n", argv[1]);
         return 2;
     }}
-    if (fgets(line, (int)sizeof line, file) == NULL || strncmp(line, columns, strlen(columns)) != 0 ||
-        strcspn(line, "\\r\\n") != strlen(columns)) {{
+    line[0] = '\\0';
+    if (fgets(line, (int)sizeof line, file) != NULL && file == stdin && line[0] == '{{') return serve();
+    if (strncmp(line, columns, strlen(columns)) != 0 || strcspn(line, "\\r\\n") != strlen(columns)) {{
         fprintf(stderr, "the first line must be %s\\n", columns);
         return 2;
     }}

@@ -357,8 +357,13 @@ class Writer:
             count=len(given),
             C=C,
             digits=digits,
+            upper=self.name.upper(),
+            available="".join(
+                f"{i}, " for i, column in enumerate(self.columns("measurement")) if column.startswith("available")
+            ),
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
+            entry="" if C == 1 else "[i][j]",
             told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
         )
 

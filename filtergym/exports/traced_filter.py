@@ -4,16 +4,11 @@ Traced is the filter's own text, the same that an evaluation runs. What the esti
 the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept once.
 """
 
-import ast
 import copy
 import functools
-import inspect
 import math
-import re
-import textwrap
 from collections.abc import Callable, Sequence
 from itertools import count as count_from
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy
@@ -28,7 +23,7 @@ from ..compiler.namespace import NotTraceable, Traced
 from ..compiler.program import Graph, Program, Result, program
 from ..envs.contract.filter import Filter, Input
 from ..envs.contract.model import Model
-from ..envs.contract.task import Task
+from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.competitors.steered_filter import Decider, Decisions, steer
@@ -239,27 +234,6 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
         ]
     shape = tuple(size for size in numpy.shape(getattr(part, "nodes", part)) if size != 1)
     return [Member(prefix or "value", shape, i, words) for i in range(math.prod(shape))]
-
-
-def field_words(cls: type) -> dict[str, str]:
-    """What a NamedTuple's text says below each of its fields; nothing where there is no text."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-    except (OSError, TypeError, SyntaxError, IndexError):
-        return {}
-    lines = tree.body if isinstance(tree, ast.ClassDef) else []
-    return {
-        field.target.id: _without_shapes(below.value.value)
-        for field, below in pairwise(lines)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-        and isinstance(below.value.value, str)
-    }  # fmt: skip
-
-
-def _without_shapes(text: str) -> str:
-    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
-    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")
 
 
 def nodes_of(part: Any) -> list[int]:

@@ -1,5 +1,6 @@
 """The paper's flight under the IMM, its rivals, the other readings of the paper, and a grid of gains."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -181,7 +182,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     exact = {f"fixed gain {a:g}": exactly(numpy.full(scans, a)) for a in (low, high, 0.65)}
     first, last = WINDOWS["turn"]
     recording = record_measurements(episodes, SEED)
-    grid_episodes = min(episodes, GRID_EPISODES)
+    grid_episodes = max(2, math.ceil(GRID_EPISODES * min(1.0, episodes / EPISODES)))
     few = record_measurements(grid_episodes, SEED)
     results = Results(
         episodes,

@@ -1,5 +1,6 @@
 """The measurer and its rivals on both readings of the course, on Singer's motion, and with other settings."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -192,7 +193,8 @@ class Results(NamedTuple):
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
-    few, scatter = min(FEW, episodes), min(SCATTER, episodes)
+    share = min(1.0, episodes / EPISODES)
+    few, scatter = (max(2, math.ceil(share * count)) for count in (FEW, SCATTER))
 
     def run(scenario: str, filters: Mapping[str, int], **keywords: Any) -> Any:
         return later(simulate, scenario, filters, **keywords)

@@ -18,11 +18,13 @@ from ...evaluation.running.metrics import chi_square_band
 from ...evaluation.statistics.innovations import received
 from ..tables.advice import (
     COLUMNS,
+    PRICES,
     ParameterText,
     advice_rows,
     parameter_name,
     parameter_size,
     parameter_text,
+    price_cells,
     verdict,
 )
 from ..tables.results import Settings
@@ -69,6 +71,8 @@ def advice_html(
         parameters=list(_parameters(advice, advice.fitted.name)),
         rows=list(advice_rows(advice, learned)),
         columns=[title.replace("-\n", "") for title in COLUMNS],
+        price_columns=list(PRICES),
+        prices=_prices(advice, learned),
         families=[
             (name, list(_parameters(advice, name))) for name in advice.fits if name not in advice.diverging
         ],
@@ -96,6 +100,13 @@ def _shown(advice: Advice) -> list[str]:
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
 
 
+def _prices(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
+    """What an update of each filter in the table costs; empty where it is known of none."""
+    names = [row.competitor.name for row in advice_rows(advice, learned)]
+    known = any(advice.prices[name] for name in names)
+    return [(name, price_cells(advice.prices[name])) for name in names] if known else []
+
+
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:
     """Parameters of a fitted filter in words; intervals where they were computed."""
     tunable, found, profiles = advice.tunables[name], advice.fits[name], advice.profiles.get(name, {})
@@ -114,17 +125,20 @@ def _log_facts(advice: Advice, task: Task) -> LogFacts:
     facts = [("measurements after the start of the track", f"{total:,}"), ("duration", f"{duration:,.6g} s")]
     if len(recording.names) > 1:
         facts.insert(0, ("tracks", f"{len(recording.names):,}"))
-    if len(steps):
-        facts.append(("interval", f"{numpy.median(steps):.4g} s in the median, {steps.max():.4g} s at most"))
     available = recording.measurements.get("available")
+    if len(steps):
+        # Where missed scans have a row, the longest interval between rows says nothing: the longest gap does.
+        longest = "" if available is not None else f", {steps.max():.4g} s at most"
+        facts.append(("interval", f"{numpy.median(steps):.4g} s in the median{longest}"))
     if available is not None:
         there = numpy.isfinite(recording.seconds)
         missed = there & ~(available > 0.0)
         facts.append(
             ("without a measurement", f"{missed.sum():,} ({100.0 * missed.sum() / there.sum():.1f} %)")
         )
-        if missed.any():
-            facts.append(("longest gap", f"{_longest_gap(recording.seconds, available):.4g} s"))
+        facts.append(
+            ("longest time between measurements", f"{_longest_gap(recording.seconds, available):.4g} s")
+        )
     facts += [
         (name.replace("_", " "), f"{value:g}, as the log states it")
         for name, value in recording.typical.items()
@@ -164,8 +178,9 @@ def _episodes(advice: Advice, task: Task) -> Iterator[dict[str, Any]]:
         found = {
             "name": recording.names[episode],
             "seconds": _numbers(seconds[::step]),
+            "outlier_seconds": _numbers(seconds[advice.outliers[episode, :rows]]),
             "spans": list(_spans(advice, episode, seconds)),
-            **_track(run, task, _shown(advice), step),
+            **_track(run, task, _shown(advice), step, advice.outliers[episode, :rows]),
             **_innovations(run, advice.advised.name, step),
         }
         if "nis" in run:
@@ -191,8 +206,12 @@ def _spans(advice: Advice, episode: int, seconds: numpy.ndarray) -> Iterator[tup
         yield ROLES[role], float(seconds[first]), float(seconds[last])
 
 
-def _track(run: xarray.Dataset, task: Task, names: Sequence[str], step: int) -> dict[str, Any]:
-    """Where the target was measured, estimated and truly was: of a plane its two axes, else the main component."""
+def _track(
+    run: xarray.Dataset, task: Task, names: Sequence[str], step: int, is_outlier: numpy.ndarray
+) -> dict[str, Any]:
+    """Where the target was measured, estimated and truly was, and which measurements are taken for outliers: of a plane
+    its two axes, else the main component.
+    """
     measured = received(run.isel(policy=0), task)
     if measured is None or task.log_format is None:
         return {}
@@ -205,6 +224,8 @@ def _track(run: xarray.Dataset, task: Task, names: Sequence[str], step: int) -> 
             f"{name.replace('_', ' ')}, {unit}" for name, unit in zip(components, units, strict=True)
         ],
         "measured": [_numbers(values[0, ::step]) for values in measured[: len(components)]],
+        "outliers": [_numbers(values[0][is_outlier]) for values in measured[: len(components)]],
+        "outlier_numbers": (numpy.flatnonzero(is_outlier) + 1).tolist(),
         "estimates": [
             [
                 _numbers(values)

@@ -16,6 +16,7 @@ from ..tables.headline import headline
 from ..tables.ranking import origin, ranking_sentence, remarks
 from ..tables.results import Result, Settings, serialise_datasets
 from ..tables.terminal_tables import (
+    HEADLINE,
     against_paper,
     consistency_word,
     main_components,
@@ -123,7 +124,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
         return Entry(text, None if record is None else record.value)
 
     against = f"cost against {result.paper or 'paper'}, %"
-    header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
+    header = ["competitor", against, "lost tracks, %", "means, %", "ANEES", "covariance", "score"]
     times, texts = times_of_records(records), column_of_times(records)
     header += [TIME_TITLE] * bool(times)
     header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
@@ -133,16 +134,16 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
     header += ["origin", "control"]
     rows = []
     for name, kind, control in rank_competitors(records):
-        median, wins = against_paper(found, name)
+        lost, means = against_paper(found, name)
         nees = found.get((name, "anees", "state", "all"))
         value = None if nees is None else nees.value
         score = found.get((name, "score", "", "all"))
         rows.append(
             [
                 Entry(name, name),
-                number(name, "relative_cost_difference", "", 100.0),
-                Entry(median, _number(median)),
-                Entry(wins, _number(wins)),
+                number(name, HEADLINE, "", 100.0),
+                Entry(lost, _number(lost.partition(" ")[0])),
+                Entry(means, _number(means)),
                 Entry("-" if value is None else f"{value:.3g}", value),
                 Entry(consistency_word(nees), consistency_word(nees)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
@@ -173,7 +174,7 @@ def _number(text: str) -> float | None:
 def _differences(result: Result) -> list[list[Any]]:
     """Name, and cost against the paper's algorithm with its interval in percent, of the ranked and the reference."""
     found: dict[str, Record] = {
-        r.policy: r for r in result.records if (r.metric, r.window) == ("relative_cost_difference", "all")
+        r.policy: r for r in result.records if (r.metric, r.window) == (HEADLINE, "all")
     }
     rows = []
     for name, kind, _ in rank_competitors(result.records):
@@ -263,7 +264,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
             {
                 "kind": "ranking",
                 "title": f"Cost against {result.paper or 'the paper'}",
-                "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
+                "text": "Geometric mean of the ratios of the episodes' costs, less one, with its paired 95 % interval; "
+                "left of zero is better.",
                 "alternative": "The table above holds these numbers.",
             }
         )
@@ -272,7 +274,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
             {
                 "kind": "front",
                 "title": "Cost and time",
-                "text": "Mean cost against the processor time of a measurement, of simulated world and competitor "
+                "text": "Cost against the processor time of a measurement, of simulated world and competitor "
                 "together. Nobody else costs less in as much time as those on the front, the line; open: asked in "
                 "Python.",
                 "alternative": f"On the front, the quickest first: {', '.join(front(points))}.",

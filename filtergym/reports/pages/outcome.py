@@ -10,6 +10,7 @@ from ...evaluation.running.metrics import Record
 from ...evaluation.running.times import EQUAL_TIMES, times_of_records
 from ..tables.ranking import Place, ranking
 from ..tables.results import Result
+from ..tables.terminal_tables import HEADLINE
 
 HALF = (0.45, 0.55)
 """Share of the paper's cost that is called half of it."""
@@ -39,8 +40,9 @@ def protocol_sentences(results: Sequence[Result]) -> list[str]:
     each = " to ".join(f"{number:,}" for number in dict.fromkeys((episodes[0], episodes[-1])))
     return [
         f"Every competitor met the same {each} episodes of an environment ({first.split} split, seed {first.seed}). "
-        "Ranges hold 95 %; competitors are level where that of their difference holds zero. Error cost is the mean "
-        "squared error of the estimate, in a control loop the loop's quadratic cost; times are of one processor core."
+        "Ranges hold 95 %; competitors are level where that of their ratio holds one. Error cost is the mean squared "
+        "error of the estimate, in a control loop the loop's quadratic cost; its ratios are geometric means over the "
+        "episodes, which no single one owns; times are of one processor core."
     ]
 
 
@@ -92,11 +94,7 @@ def _best_clause(result: Result, best: Place) -> str:
     what = "learned" if best.role == "learned" else "classical"
     name = f"the {what} {'filter' if kinds[best.name] == 'estimator' else 'policy'} `{best.name}`"
     found = next(
-        (
-            r
-            for r in result.records
-            if (r.policy, r.metric, r.window) == (best.name, "relative_cost_difference", "all")
-        ),
+        (r for r in result.records if (r.policy, r.metric, r.window) == (best.name, HEADLINE, "all")),
         None,
     )
     if found is None or found.value is None or not result.paper:
@@ -141,9 +139,7 @@ def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -
     costs = {
         r.policy: r
         for r in records
-        if (r.metric, r.window) == ("relative_cost_difference", "all")
-        and r.kind in RANKED
-        and r.value is not None
+        if (r.metric, r.window) == (HEADLINE, "all") and r.kind in RANKED and r.value is not None
     }
     known = [place for place in places if place.name in times and place.name in costs]
     allowed = sorted({times[place.name] for place in known})

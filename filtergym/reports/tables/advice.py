@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy
 from rich.table import Table
 
-from ...baselines.advice import APART, Advice, Competitor
+from ...baselines.advice import APART, Advice
 from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
+from ...baselines.judgement import Competitor
 from ...baselines.table import Tunable
 from ...envs.data.recording import Recording
 from ...evaluation.statistics.bootstrap import Estimate
@@ -27,6 +28,13 @@ NAME_WIDTH = 16
 """Columns of a name; longer ones go on below."""
 COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
 """Of the table, and how wide they are at least, so that no number is cut."""
+PRICES = {
+    "operations": "operations",
+    "state, bytes": "state_bytes",
+    "weights, bytes": "weight_bytes",
+    "stack, bytes": "stack_bytes",
+}
+"""Columns of what an update costs, and the parts of a price."""
 NEGLIGIBLE = 5e-4
 """Difference of errors that is none in the digits of a sentence."""
 FEW = 80
@@ -79,7 +87,11 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
-    rest = [c for c in advice.competitors if c not in keep]
+    rest = []
+    for each in advice.competitors:  # a filter that answers as another does in this log needs no row
+        same = (c for c in [*keep, *rest] if c[3:7] == each[3:7])
+        if each not in keep and (math.isnan(each.log_likelihood) or next(same, None) is None):
+            rest.append(each)
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
     for one in [c for c in advice.competitors if c in keep]:
@@ -92,6 +104,25 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
             _interval(one.correlation, "+.2f"),
         )
         yield Row(one, _label(advice, one), cells)
+
+
+def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
+    """Say what an update of each filter of :func:`advice_table` costs; None where it is known of none."""
+    prices = {row.competitor.name: advice.prices[row.competitor.name] for row in advice_rows(advice, learned)}
+    if not any(prices.values()):
+        return None
+    table = Table(title="What an update costs in C, in double precision", title_justify="left")
+    table.add_column("filter", no_wrap=True)
+    for title in PRICES:
+        table.add_column(title, justify="right")
+    for name, price in prices.items():
+        table.add_row(name, *price_cells(price))
+    return table
+
+
+def price_cells(price: Mapping[str, int] | None) -> tuple[str, ...]:
+    """Cells of a price, in the order of ``PRICES``."""
+    return tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
@@ -108,6 +139,7 @@ def reading_lines(recording: Recording) -> Iterator[str]:
         f"{len(recording.names)} track{'s' * (len(recording.names) > 1)}{missed}, {numpy.nanmedian(steps):.3g} s apart"
         f"{', with truth' if recording.truth is not None else ''}."
     )
+    yield from _extent(recording)
     if int(recording.rows.sum()) < FEWEST_MEASUREMENTS:
         yield (
             f"Fewer than {FEWEST_MEASUREMENTS} measurements tell filters apart by chance alone: what follows is a "
@@ -122,6 +154,25 @@ def reading_lines(recording: Recording) -> Iterator[str]:
         else:
             yield f"Errors as stated: {listed} (median of {source})."
     yield from (note for note in recording.notes if "no column" not in note)
+
+
+def _extent(recording: Recording) -> Iterator[str]:
+    """Say how far and how fast the positions move, which shows a wrong unit to who knows the target."""
+    position = recording.measurements.get("position")
+    if position is None:
+        return
+    there = numpy.isfinite(position).all(axis=-1) & (recording.measurements["available"] > 0.0)
+    found = []
+    for own, seconds, known in zip(position, recording.seconds, there, strict=True):
+        step = max(1, int(known.sum()) // 20)  # far apart, noise is no speed
+        moved = numpy.linalg.norm(numpy.diff(own[known][::step], axis=0), axis=-1)
+        found.append(moved / numpy.diff(seconds[known][::step]))
+    speeds = numpy.concatenate(found)
+    if len(speeds):
+        width, height = (
+            f"{x:,.0f}" if x >= 100.0 else f"{x:.3g}" for x in numpy.ptp(position[there], axis=0)
+        )
+        yield f"Positions span {width} m by {height} m, at {numpy.median(speeds):.3g} m/s in the median."
 
 
 def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
@@ -215,6 +266,11 @@ def verdict(advice: Advice) -> str:
         if advice.share.apart
         else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
     )
+    if one is not advice.advised and one.relative_error.low > 0.0 and one.gain.value > 0.0:
+        return (
+            f"Take {rival}, as it is shipped: {one.name}, fitted, predicts more likely and has "
+            f"{_amount(advice, one.relative_error)} than it, {where}. The likelihood misleads here."
+        )
     if one is not advice.advised:
         what = _interval(one.gain, "+.3f")
         text = (
@@ -227,6 +283,8 @@ def verdict(advice: Advice) -> str:
                 text += " That is beyond chance: a longer log may turn the choice."
         return text
     name = f"Take {one.name}, with the parameters below"
+    if one.gain.low <= 0.0 and not advice.tunables[one.name].anchored:
+        name += f", as good as {rival} and cheaper"
     if math.isnan(one.relative_error.value) and advice.anchor is not None and one.name == advice.anchor.name:
         return f"{name}, by the second sensor: there is no truth to say how much it gains."
     if math.isnan(one.relative_error.value):
@@ -235,10 +293,13 @@ def verdict(advice: Advice) -> str:
         f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
         f"same measurements, {where}."
     )
-    if one.relative_error.low > 0.0:
-        text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
-    elif one.relative_error.low <= 0.0 <= one.relative_error.high:
-        text += f" The difference may be chance: {rival} is good enough."
+    if one.relative_error.low <= 0.0 <= one.relative_error.high:
+        costs = [advice.prices[each] for each in (rival, one.name)]
+        text += " The difference may be chance"
+        if costs[0] and costs[1] and costs[0]["operations"] > costs[1]["operations"]:
+            text += f"; {rival} takes {costs[0]['operations']:,} operations an update for {costs[1]['operations']:,}."
+        else:
+            text += f": {rival} is good enough."
     return text
 
 
@@ -341,13 +402,18 @@ def _fits(advice: Advice) -> Iterator[str]:
 
 
 def _dearer(advice: Advice) -> Iterator[str]:
-    """What a family of more computation would bring."""
-    if advice.dearer is not None:
-        name, gain = advice.dearer
-        yield (
-            f"{advice.fitted.name} is the simplest of the fitted ones that are as likely within chance: {name} would "
-            f"bring {_interval(gain, '+.3f')} nats per measurement and takes more computation."
-        )
+    """What the likeliest would bring, where something cheaper is as good."""
+    if advice.dearer is None or math.isnan(advice.dearer[1].value):
+        return
+    name, gain = advice.dearer
+    one, other = (advice.prices[each] for each in (advice.advised.name, name))
+    costs = ""
+    if one is not None and other is not None:
+        costs = f" and takes {other['operations']:,} operations an update for {one['operations']:,}"
+    yield (
+        f"{name} is likelier where filters were chosen: it would bring {_interval(gain, '+.3f')} nats per measurement"
+        f"{costs}."
+    )
 
 
 def _outliers(advice: Advice) -> Iterator[str]:

@@ -4,6 +4,7 @@ Quick: the telling ones in the training distribution. Full: everything there is 
 compare, in all scenarios.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,10 +13,9 @@ import xarray
 
 from ...agents.named_policies import pretrained_agents
 from ...baselines.problem import Problem, problem_of
-from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import catalogue
+from ...envs.engine.scenario_choice import make_task
 from ...evaluation.competitors.kinds import RandomPolicy
-from ...evaluation.competitors.smoothers import is_open_loop
 from ...evaluation.running.metrics import Record
 from ...evaluation.running.parallel import Workers, check_workers
 from ...evaluation.running.rollout import Progress
@@ -26,6 +26,7 @@ from ...evaluation.storage.dataset import groups_of, notes_of
 from ...evaluation.storage.files import claim_folder, writable_file
 from ...evaluation.storage.store import UNFINISHED, Store
 from ...names import evaluation_requests
+from .ranking import best_of_origins
 from .results import (
     RESULTS,
     Result,
@@ -37,6 +38,7 @@ from .results import (
     track_of,
     write_results,
 )
+from .terminal_tables import HEADLINE
 from .work import work_of
 
 MEASUREMENTS = 60_000
@@ -45,6 +47,8 @@ FULL_SECONDS = 5.0
 """Time per policy and cell that the full benchmark, of ten times as many measurements, does not go beyond."""
 FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
 """Of fewer the intervals are too narrow; where episodes are long, the quick benchmark takes no more."""
+MOST_EPISODES = 20_000
+"""That are run for the sake of an interval's width."""
 LONG = 2000
 """Measurements of an episode, beyond which the quick benchmark leaves out who was tuned: few episodes side by side cost
 as much as many."""
@@ -127,7 +131,7 @@ def without_smoothers_of_closed_loops(
 ) -> tuple[str, ...]:
     """Names of those that can run in a scenario: in a closed loop nothing can be smoothed."""
     smoothers = {*names} & {*problem.baselines.smoothers}
-    if not smoothers or is_open_loop(make_model(problem.task, None, scenario, backend="numpy")):
+    if not smoothers or not make_task(problem.task, scenario).closes_loop:
         return tuple(names)
     return tuple(name for name in names if name not in smoothers)
 
@@ -223,6 +227,9 @@ class BenchmarkOptions(NamedTuple):
     """How many share the episodes, of the compiled backend."""
     command: str = "filtergym benchmark"
     """That runs this, kept in the results."""
+    half_width: float = 0.0
+    """Percentage points to either side, to which the intervals of the headline are brought by more episodes of the
+    training distribution; zero: as many episodes as there are in other scenarios."""
     timed: bool = True
     """Measure the processor time of every competitor, which differs from run to run."""
 
@@ -308,23 +315,72 @@ def run_benchmark(
     store = Store(folder / UNFINISHED)
     writable_file(folder / RESULTS)
     callbacks = callbacks or Callbacks()
+    workers = check_workers(workers)
+    claim_folder(folder)  # nothing is refused from here on
+    if options.half_width > 0.0:
+        wanted = [
+            _enlarge(cell, options, workers, store, callbacks.started)
+            if cell.scenario == cell.problem.task.default_scenario
+            else cell
+            for cell in wanted
+        ]
+    results = _run_cells(wanted, options, callbacks, workers, store)
+    write_results(folder / RESULTS, results, settings)
+    store.clear()
+    return results
+
+
+def _run_cells(
+    wanted: Sequence[Cell], options: BenchmarkOptions, callbacks: Callbacks, workers: Workers, store: Store
+) -> list[Result]:
+    """Run all competitors of some cells, those of which the store has nothing."""
     tick = callbacks.started(sum(cell.measurements for cell in wanted))
     # What is asked for, and the cell that it belongs to.
     asked = [(one, i) for i, cell in enumerate(wanted) for one in options.requests(cell)]
-    workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
     work = [work_of(wanted[i].problem, one) for one, i in asked]
-    claim_folder(folder)  # nothing is refused from here on
     results = _Results(wanted, callbacks)
     for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
         one, i = asked[k]
         results.add(i, one.name, summary)
-    write_results(folder / RESULTS, results.all(), settings)
-    store.clear()
     return results.all()
+
+
+def _enlarge(
+    cell: Cell, options: BenchmarkOptions, workers: Workers, store: Store, started: Callable[[int], Progress]
+) -> Cell:
+    """Return a cell with as many episodes as the headline's intervals need, ``MOST_EPISODES`` at most.
+
+    What is run on the way stays in the store, and the last run is not repeated. An interval's width falls with the root
+    of the number of episodes; stopping at a width keeps its coverage (Y. S. Chow and H. Robbins, On the asymptotic
+    theory of fixed-width sequential confidence intervals, Annals of Mathematical Statistics 36, 1965).
+    """
+    cell = cell._replace(episodes=max(cell.episodes, cell.problem.baselines.headline_episodes))
+    while cell.episodes < MOST_EPISODES:
+        [result] = _run_cells([cell], options, Callbacks(started), workers, store)
+        found = 100.0 * headline_half_width(result)
+        if found <= options.half_width:
+            break
+        needed = math.ceil(1.1 * cell.episodes * (found / options.half_width) ** 2)
+        cell = cell._replace(episodes=min(needed, MOST_EPISODES))
+    return cell
+
+
+def headline_half_width(result: Result) -> float:
+    """Half the widest interval of the headline, of the best of every origin, as a share of the paper's cost."""
+    shown = {name for _, name in best_of_origins(result)}
+    return max(
+        (
+            0.5 * (r.high - r.low)
+            for r in result.records
+            if (r.metric, r.window) == (HEADLINE, "all") and r.policy in shown
+            if r.high is not None and r.low is not None
+        ),
+        default=0.0,
+    )
 
 
 def all_records(results: Sequence[Result]) -> list[Record]:

@@ -7,7 +7,7 @@ from rich.text import Text
 
 from .ranking import best_of_origins
 from .results import Result
-from .terminal_tables import consistency_word, with_interval
+from .terminal_tables import HEADLINE, consistency_word, with_interval
 
 SHORT = {"slightly overconfident": "slightly over", "slightly cautious": "slightly under"}
 """Words on a covariance in a narrow column."""
@@ -20,7 +20,7 @@ def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, st
         results: of which those of training distributions are taken; of an environment without one all.
 
     Returns:
-        Result and rows: origin, name, cost against the paper's in percent, and a word on consistency.
+        Result and rows: origin, name, cost against the paper's in percent (geometric), and a word on consistency.
     """
     usual = {result.environment for result in results if result.default}
     found = []
@@ -30,7 +30,7 @@ def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, st
         by_name = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
         rows = []
         for origin, name in best_of_origins(result):
-            difference = by_name.get((name, "relative_cost_difference", ""))
+            difference = by_name.get((name, HEADLINE, ""))
             nees = by_name.get((name, "anees", "state"))
             cost = "0" if origin == "paper" else with_interval(difference, 100.0, negligible=0.005)
             rows.append((origin, name, cost, consistency_word(nees)))

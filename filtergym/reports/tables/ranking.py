@@ -1,5 +1,6 @@
 """Who is best in a scenario, of any control and kind, in words that follow from the records."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ from ...agents.named_policies import pretrained_agents
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
 from .results import Result
-from .terminal_tables import INCONSISTENT_WORDS, consistency_word, with_interval
+from .terminal_tables import HEADLINE, INCONSISTENT_WORDS, consistency_word, with_interval
 
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
@@ -24,10 +25,12 @@ class Place(NamedTuple):
     cost: float
     behind: Record | None
     """Relative difference of its cost to the best one's."""
+    chosen: float
+    """Share of resamples of the episodes that would call it the best; NaN where it is not known."""
 
 
 def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> list[Place]:
-    """Competitors of one environment and scenario that are ranked, lowest mean cost first.
+    """Competitors of one environment and scenario that are ranked, lowest geometric mean of the cost first.
 
     Args:
         records: of the scenario.
@@ -37,20 +40,24 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
     places = []
     for name, kind in dict.fromkeys((r.policy, r.kind) for r in records if r.kind in RANKED):
-        record = found.get((name, "cost"))
+        record, share = found.get((name, "geometric_cost")), found.get((name, "best_share"))
         if record is not None and record.value is not None:
             role = "learned" if name in learned else kind
-            places.append(Place(name, role, record.value, found.get((name, "behind_best"))))
+            chosen = math.nan if share is None or share.value is None else share.value
+            places.append(Place(name, role, record.value, found.get((name, "behind_best")), chosen))
     return sorted(places, key=lambda place: place.cost)
 
 
 def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
     """Who is best of learned and classical competitors in a scenario, in two or three words.
 
-    It rests on the paired difference between the best one and the best of the other origin: where its interval holds
-    zero, nobody is called best.
+    It rests on the paired ratio between the best one and the best of the other origin: where its interval holds one,
+    nobody is called best.
     """
-    best, *others = ranking(records, learned)
+    places = ranking(records, learned)
+    if not places:
+        return "nothing is ranked"
+    best, *others = places
     where = "learned" if best.role == "learned" else "classical"
     rival = next((place for place in others if (place.role == "learned") != (where == "learned")), None)
     if rival is None:
@@ -75,18 +82,21 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
     if not places:
         return f"On `{first.scenario}` nothing is ranked."
     best, *others = places
-    difference = found.get((best.name, "relative_cost_difference"))
+    difference = found.get((best.name, HEADLINE))
     sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) costs least"
     if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
         sentence += f", but not significantly less than `{paper}`"
     elif best.name != paper and difference is not None and difference.value is not None:
         sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
-        median, wins = (found.get((best.name, metric)) for metric in ("median_cost_ratio", "win_rate"))
-        if median is not None and wins is not None and median.value is not None and wins.value is not None:
-            sentence += (
-                f", {100.0 * (median.value - 1.0):+.1f} % in the median, "
-                f"lower in {100.0 * wins.value:.0f} % of episodes"
-            )
+        means, lost = (
+            found.get((best.name, metric)) for metric in ("relative_cost_difference", "lost_tracks")
+        )
+        if means is not None and means.value is not None:
+            sentence += f" ({100.0 * means.value:+.1f} % of the means)"
+        if lost is not None and lost.value:
+            sentence += f", {with_interval(lost, 100.0, digits=2)} % of its tracks are lost"
+    if best.chosen < 1.0:
+        sentence += f". Other episodes of the kind would name another one in {_share(1.0 - best.chosen)}"
     was_learned = best.role == "learned"
     rival = next((place for place in others if (place.role == "learned") != was_learned), None)
     if rival is not None and rival.behind is not None:
@@ -98,6 +108,11 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
         if rival.behind.low is not None and rival.behind.low <= 0.0:
             sentence += ", which is no significant difference"
     return sentence + "."
+
+
+def _share(share: float) -> str:
+    """Per cent of the resamples, of which there are a thousand."""
+    return f"{100.0 * share:.1f} % of cases" if share >= 0.001 else "less than 0.1 % of cases"
 
 
 def origin(result: Result, name: str, kind: str) -> str:
@@ -171,7 +186,5 @@ def _harms(result: Result) -> list[tuple[float, str]]:
     return [
         (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
         for r in result.records
-        if r.policy in result.learned
-        and (r.metric, r.window) == ("relative_cost_difference", "all")
-        and (r.low or 0.0) > HARM
+        if r.policy in result.learned and (r.metric, r.window) == (HEADLINE, "all") and (r.low or 0.0) > HARM
     ]

@@ -120,7 +120,7 @@ def select_competitors(
 
     The paper's algorithm, the reference, the learned, the cheapest of each kind, a bound; then by cost.
     """
-    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
+    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("geometric_cost", "all")}
     kinds = {r.policy: r.kind for r in records}
 
     def place(name: str) -> float:

@@ -112,7 +112,7 @@ def agent_standing(
 
 
 def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) -> Table:
-    """Compare agents with their opponents: cost, median difference to the paper's algorithm, consistency."""
+    """Compare agents with their opponents: cost, its difference to the paper's algorithm, consistency."""
     lines = [*agents, *opponents.found]
     episodes = len(lines[0].means["cost"])
     bootstrap = Bootstrap(episodes)
@@ -121,7 +121,7 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
     )
     table.add_column("name", no_wrap=True)
     table.add_column("")
-    for title in ("cost", "cost vs paper, %", "median,\n%", "ANEES", "beat paper\nafter steps"):
+    for title in ("cost", "cost vs paper, %", "means,\n%", "ANEES", "beat paper\nafter steps"):
         table.add_column(title, justify="right", no_wrap=True)
     paper = next((line.means["cost"] for line in lines if line.role == "paper"), None)
     for line in lines:
@@ -130,18 +130,18 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
         if paper is None or line.role == "paper":
             row += ["-", "-"]
         else:
-            difference = bootstrap.relative_difference(bootstrap.means(own), bootstrap.means(paper))
+            difference = bootstrap.geometric_difference(own, paper)
             row += [
                 with_interval(difference, 100.0, negligible=0.005),
-                f"{100.0 * (bootstrap.quantiles(own / paper)[0] - 1.0):+.1f}",
+                f"{100.0 * (own.mean() / paper.mean() - 1.0):+.1f}",
             ]
         row.append(consistency(Estimate(float(line.means["anees"].mean()), 0.0, 0.0)))
         passed = line.beat_paper
         row.append("-" if passed is None else f"{passed['steps']:,}\n({passed['seconds']:.1f} s)")
         table.add_row(*row)
     table.caption = (
-        "median compares the cost of each episode with that of the paper's algorithm. ANEES is 1 if errors are as "
-        f"large as the covariance says; {INCONSISTENT} marks one that is off by more than a factor of two. Agents were "
-        "chosen on these episodes."
+        "cost vs paper is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
+        f"ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off by more than "
+        "a factor of two. Agents were chosen on these episodes."
     )
     return table

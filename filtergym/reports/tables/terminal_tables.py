@@ -14,7 +14,7 @@ from rich.table import Table
 
 from ...baselines.tuned_values import Tuned
 from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
-from ...evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
+from ...evaluation.running.times import OWN_MARK, OWN_NOTE, TIME_NOTE, TIME_TITLE, column_of_times
 from ...offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
@@ -48,16 +48,22 @@ def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: 
     return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
 
 
+HEADLINE = "geometric_cost_difference"
+"""Metric of the first column: geometric mean of the ratios of the episodes' costs to the paper's, less one."""
+
+
 def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
-    """Median difference of the episodes' costs to the paper's algorithm, %, and the share of them that are lower, %."""
-    median, wins = (
-        found.get((*scenario, name, metric, "", "all")) for metric in ("median_cost_ratio", "win_rate")
+    """Share of lost tracks with its interval, %, and the difference of the mean cost to the paper's algorithm, %."""
+    lost, means = (
+        found.get((*scenario, name, metric, "", "all"))
+        for metric in ("lost_tracks", "relative_cost_difference")
     )
-    if median is None or wins is None or median.value is None:
-        return ["-", "-"]
-    percent = 100.0 * (median.value - 1.0)
+    shares = with_interval(lost, 100.0, digits=2, negligible=0.005)
+    if means is None or means.value is None:
+        return [shares, "-"]
+    percent = 100.0 * means.value
     digits = 1 if abs(percent) < 1000.0 else 0
-    return [f"{percent:+,.{digits}f}", f"{100.0 * wins.value:.0f}"]
+    return [shares, f"{percent:+,.{digits}f}"]
 
 
 def consistency_word(record: Any) -> str:
@@ -113,7 +119,7 @@ def select_components(names: Sequence[str]) -> list[str]:
 
 def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
     """Name, kind and control of every competitor: those that are ranked by their cost, then those that are not."""
-    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
+    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("geometric_cost", "all")}
     found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
 
     def place(entry: tuple[str, str, str]) -> tuple[int, float]:
@@ -164,6 +170,11 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
 
 Columns = Mapping[str, Callable[[str], str]]
 """What each competitor has in a column, by the column's title."""
+COST_NOTE = (
+    "cost is the geometric mean of the ratios of the episodes' costs, which no single episode owns; means that of the "
+    "mean costs, which few lost tracks may rule. A track is lost where an episode's mean cost is beyond the bound of "
+    "the environment."
+)
 RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 
 
@@ -171,16 +182,18 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
     """Columns on cost, consistency and time, and the sentences that explain them."""
     columns: dict[str, Callable[[str], str]] = {
         "cost vs paper, %": lambda name: with_interval(
-            found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+            found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
         ),
-        "median,\n%": lambda name: against_paper(found, name)[0],
-        "wins,\n%": lambda name: against_paper(found, name)[1],
+        "lost\ntracks, %": lambda name: against_paper(found, name)[0],
+        "means,\n%": lambda name: against_paper(found, name)[1],
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
     }
     notes = [
-        "median and wins compare the cost of each episode with that of the paper's algorithm. ANEES is 1 if errors are "
-        f"as large as the covariance says; {INCONSISTENT} marks one that is off by more than a factor of two.",
+        f"{COST_NOTE} ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off "
+        "by more than a factor of two.",
     ]
+    if not any(r.metric == "lost_tracks" for r in records):
+        del columns["lost\ntracks, %"]
     if any(r.metric == "score" and r.value is not None for r in records):
         columns["score"] = lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0]
         notes.append(
@@ -189,11 +202,13 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
     if times := column_of_times(records):
         columns[TIME_TITLE] = lambda name: times.get(name, "-")
         notes.append(TIME_NOTE)
+        if any(time.endswith(OWN_MARK) for time in times.values()):
+            notes.append(OWN_NOTE)
     lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
     if lost:
-        columns["lost"] = lambda name: f"{lost.get(name, 0)}"
+        columns["failed"] = lambda name: f"{lost.get(name, 0)}"
         notes.append(
-            "lost counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
+            "failed counts episodes in which an answer was not finite, or no covariance; the last valid one is held."
         )
     return columns, notes
 
@@ -325,7 +340,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
     for component in shown:
         title = f"RMSE {component.replace('_', ' ')} of {base}, {units[component]}"
         table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
-    metric = "relative_cost_difference" if base == paper else "cost"
+    metric = HEADLINE if base == paper else "cost"
     for name in others:
         title = f"{name}, %" if base == paper else f"cost of {name}"
         table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
@@ -340,7 +355,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
             record = found.get((scenario, name, number, component))
             if record is None or record.value is None:
                 row.append("-")
-            elif number == "relative_cost_difference":
+            elif number == HEADLINE:
                 row.append(f"{100.0 * record.value:+.1f}")
             else:
                 row.append(f"{record.value:.3g}")

@@ -26,12 +26,16 @@
 
   const FIGURES = {
     track({ names }, episode) {
-      const { components, measured, estimates, seconds, truth } = episode, isPlane = components.length === 2;
+      const { components, measured, estimates, outliers, outlier_numbers, outlier_seconds, seconds, truth } = episode, isPlane = components.length === 2;
       const isMissed = measured[0].map((x) => x === null);
       const at = (values) => (isPlane ? { x: values[0], y: values[1] } : { x: seconds, y: values[0] });
       const drawn = [];
       if (truth) drawn.push({ ...at(truth), mode: "lines", name: "truth", line: { color: css("--soft"), width: 5 }, opacity: 0.45 });
       drawn.push({ ...at(measured), mode: "markers", name: "measured", marker: { color: css("--soft"), size: 4, symbol: "cross-thin-open" }, text: seconds, hovertemplate: "%{text} s<extra>measured</extra>" });
+      if (outlier_numbers.length) {
+        const place = isPlane ? { x: outliers[0], y: outliers[1] } : { x: outlier_seconds, y: outliers[0] };
+        drawn.push({ ...place, mode: "markers", name: "taken for outliers", marker: { color: "#CC79A7", size: 10, symbol: "circle-open", line: { width: 2 } }, text: outlier_numbers, hovertemplate: "measurement %{text}<extra>taken for an outlier</extra>" });
+      }
       names.forEach((name, i) => {
         const [solid, dotted] = [0, 1].map((k) => at(estimates[i].map((values) => parts(values, isMissed)[k])));
         const shown = { name: plain(name), legendgroup: plain(name), text: seconds, visible: i ? "legendonly" : true, hovertemplate: "%{text} s<extra>" + plain(name) + "</extra>" };

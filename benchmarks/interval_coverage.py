@@ -1,0 +1,121 @@
+"""How often nominal 95 % intervals hold the truth, for each statistic of a comparison and several numbers of episodes.
+
+    python benchmarks/interval_coverage.py
+
+The mean costs of many episodes of each competitor are taken for all there are: their own statistics are the truth.
+Episodes are then drawn from them with replacement, again and again, and intervals are made of what was drawn as an
+evaluation makes them. Printed in Markdown: the share of intervals that hold the truth, and where there are misses the
+share of them that lie below it (a half, where misses have no side).
+"""
+
+import argparse
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy
+import xarray
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.evaluation.running.metrics import mean_over_time
+from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
+from filtergym.evaluation.statistics.statistic import ALL, Statistic
+
+from filtergym.names import find_competitor
+
+NUMBERS = (100, 200, 1000, 5000)
+"""Episodes of an evaluation."""
+CASES = (
+    ("ManeuveringTarget", "random", ("semi-markov", "bptt")),
+    ("ManeuveringTarget", "clutter", ("semi-markov-pda",)),
+    ("LooselyCoupledNavigation", "random", ("fault-bank", "kalman-net")),
+    ("TightlyCoupledNavigation", "random", ("fault-hypotheses", "bptt-small", "stuck-check")),
+)
+"""Environment, scenario and competitors, each beside the paper's algorithm."""
+STATISTICS = ("geometric mean of ratios", "lost tracks", "ratio of means")
+
+
+class Pool(NamedTuple):
+    """What is taken for all episodes there are."""
+
+    paper: numpy.ndarray
+    """Mean cost of every episode, ``(episodes,)``."""
+    own: numpy.ndarray
+    """Likewise."""
+    bound: float
+    """Beyond which a track is lost."""
+
+
+def episode_costs(environment: str, scenario: str, name: str, episodes: int) -> numpy.ndarray:
+    """Mean cost of every episode of the validation split, ``(episodes,)``: no table is made of it."""
+    problem = problem_of(f"filtergym/{environment}-v0")
+    split = "validation" if problem.task.scenarios[scenario].training else "test"
+    experiment = problem.experiment(scenario, episodes, 1, split)
+    asked = EvaluationRequest(experiment, name, find_competitor(problem, name))
+
+    def declare(run: xarray.Dataset) -> Iterator[Statistic]:
+        yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+
+    found: numpy.ndarray = reduce_episodes(asked, declare, lambda done: None).reduction.results()["cost",]
+    return found
+
+
+def truths(pool: Pool) -> list[float]:
+    """Every statistic of all episodes, in the order of ``STATISTICS``."""
+    ratio = pool.own / pool.paper
+    return [
+        float(numpy.expm1(numpy.log(ratio).mean())),
+        float((pool.own > pool.bound).mean()),
+        float(pool.own.mean() / pool.paper.mean() - 1.0),
+    ]
+
+
+def intervals(pool: Pool, bootstrap: Bootstrap) -> list[Estimate]:
+    """Every statistic of some episodes with its interval, likewise."""
+    own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
+    return [
+        bootstrap.geometric_difference(pool.own, pool.paper),
+        share_interval(float((pool.own > pool.bound).mean()), len(pool.own)),
+        bootstrap.relative_difference(own, paper),
+    ]
+
+
+def coverage(pool: Pool, number: int, repetitions: int) -> list[str]:
+    """Share of the intervals of so many episodes that hold the truth, of each statistic, as text."""
+    generator, bootstrap = numpy.random.default_rng(number), Bootstrap(number)
+    true = numpy.array(truths(pool))
+    below, above = numpy.zeros(len(true)), numpy.zeros(len(true))
+    for _ in range(repetitions):
+        drawn = generator.integers(0, len(pool.paper), number)
+        part = pool._replace(paper=pool.paper[drawn], own=pool.own[drawn])
+        found = numpy.array(intervals(part, bootstrap))
+        below += found[:, 2] < true
+        above += found[:, 1] > true
+    missed = below + above
+    return [
+        f"{1.0 - m / repetitions:.3f}" + (f" ({b / m:.1f})" if m else "")
+        for m, b in zip(missed, below, strict=True)
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Coverage of intervals, by resampling many episodes.")
+    parser.add_argument("--episodes", type=int, default=10000)
+    parser.add_argument("--repetitions", type=int, default=1000)
+    options = parser.parse_args()
+    print("| environment | competitor | statistic | of all | " + " | ".join(f"{n:,}" for n in NUMBERS) + " |")
+    print("|---" * (4 + len(NUMBERS)) + "|")
+    for environment, scenario, names in CASES:
+        problem = problem_of(f"filtergym/{environment}-v0")
+        paper = episode_costs(environment, scenario, problem.paper, options.episodes)
+        bound = make_task(problem.task, scenario).lost_cost or numpy.inf
+        for name in names:
+            pool = Pool(paper, episode_costs(environment, scenario, name, options.episodes), bound)
+            cells = [coverage(pool, number, options.repetitions) for number in NUMBERS]
+            for i, (statistic, true) in enumerate(zip(STATISTICS, truths(pool), strict=True)):
+                row = [f"{environment} `{scenario}`", f"`{name}`", statistic, f"{100.0 * true:.1f} %"]
+                print(f"| {' | '.join([*row, *(column[i] for column in cells)])} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

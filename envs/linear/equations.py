@@ -1,0 +1,314 @@
+r"""Equations of a state-space model, and what they give on the arrays of a task.
+
+    x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k)) + v,  v ~ N(0, R)
+
+dt is the interval between the measurements k - 1 and k, and u the input that acted in it, constant. A model may do
+without either. Where u is known with white noise of covariance N only, what is known of the state after it is
+
+    P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
+
+(Simon, Optimal State Estimation (2006), section 13.2, with the input among the noises).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy
+
+from ...compiler.vector_functions import VectorFunction
+from ...filters.gaussian import log_density
+from ...filters.innovation_update import Received, kalman_gain, keep_received
+from ...filters.small_matrices import product, transpose
+from ..contract.observation import Array
+from .inputs import Input
+from .sensors import Channel
+
+if TYPE_CHECKING:
+    from .state_space import StateSpace
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpaceModel:
+    """Equations of a state-space model. Functions of the motion take the state, then the interval where the model is
+    timed, s, and then the inputs.
+    """
+
+    f: VectorFunction
+    h: VectorFunction
+    Q: numpy.ndarray | VectorFunction
+    """``(n, n)``; or a function to the n^2 numbers of it, row by row: then the model is timed."""
+    R: numpy.ndarray
+    """``(m, m)``."""
+    G: VectorFunction | None = None
+    """f as a function of the inputs, and then of all else; None where no input has noise."""
+
+    @property
+    def timed(self) -> bool:
+        """Whether f and Q are functions of the interval between measurements."""
+        return isinstance(self.Q, VectorFunction)
+
+    def stands_still(self, mean: numpy.ndarray, inputs: numpy.ndarray) -> bool:
+        """Whether nothing happens in no time, as far as some states show: measurements may then come at one time.
+
+        Args:
+            mean: a state near which they are, ``(n,)``.
+            inputs: usual ones, ``(p,)``.
+        """
+        if not isinstance(self.Q, VectorFunction):
+            return False
+        x = mean[:, None] + numpy.linspace(-1.0, 2.0, 3 * len(mean)).reshape(len(mean), 3)
+        given = numpy.concatenate([x, numpy.zeros((1, 3)), inputs[:, None] + numpy.zeros((1, 3))])
+        moved = self.f.value(given, numpy)
+        return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.Q.value(given, numpy).any()
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether both functions are matrices."""
+        maps = (self.f, self.h)
+        return all(one.matrix is not None and not numpy.any(one.offset) for one in maps)
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpaceDefinition:
+    """All that makes a task of state-space models."""
+
+    world: tuple[StateSpaceModel, ...]
+    """Models that the world obeys, M of them."""
+    filters: tuple[StateSpaceModel, ...]
+    """What the filters believe of each."""
+    transition: tuple[tuple[float, ...], ...]
+    """Probabilities that one model follows another from a measurement to the next (row = from), ``(M, M)``."""
+    switching: bool
+    """Whether the world does so; else it obeys the first model."""
+    mean: numpy.ndarray
+    """``(n,)``."""
+    covariance: numpy.ndarray
+    """``(n, n)``."""
+    weights: numpy.ndarray
+    """Of the squared error of each component in the cost, ``(n,)``."""
+    measured: Mapping[str, str]
+    """Units of the m numbers that are measured, by their names."""
+    inputs: Mapping[str, Input]
+    """Known inputs by their names, p of them."""
+    channels: tuple[Channel, ...]
+    """Sensors, of which each measures some of the m numbers; without names one for all of them."""
+
+    @property
+    def usual_inputs(self) -> numpy.ndarray:
+        """Means of the inputs, ``(p,)``."""
+        return numpy.array([one.mean for one in self.inputs.values()])
+
+    def usual_noise(self, interval: float) -> numpy.ndarray:
+        """Q of the filters' first model in an interval, s, at the initial mean, ``(n, n)``."""
+        return process_noise(self.filters[0], self.mean, interval, self.usual_inputs)
+
+
+def process_noise(
+    model: StateSpaceModel, x: numpy.ndarray, interval: float, inputs: numpy.ndarray
+) -> numpy.ndarray:
+    """Q of a model, ``(n, n)``; without time the same for all.
+
+    Args:
+        model: the equations.
+        x: state, ``(n,)``.
+        interval: s.
+        inputs: ``(p,)``.
+    """
+    if not isinstance(model.Q, VectorFunction):
+        return model.Q
+    given = numpy.concatenate([x, [interval], inputs])
+    return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
+
+
+class Passed(Protocol):
+    """What says how a state moved since the measurement before, such as a measurement."""
+
+    @property
+    def interval(self) -> Array | None:
+        """Since then, s, ``(N,)``; None where the model is not timed."""
+
+    @property
+    def inputs(self) -> Array | None:
+        """What acted in it, ``(p, N)``; None where the model has no inputs."""
+
+
+class Measured(Passed, Protocol):
+    """A measurement."""
+
+    @property
+    def values(self) -> Array:
+        """``(m, N)``."""
+
+    @property
+    def available(self) -> Array:
+        """1 where a value was received, 0 where not, ``(m, N)``."""
+
+
+class Passage(NamedTuple):
+    """No more than that."""
+
+    interval: Array | None
+    inputs: Array | None
+
+
+class Equations:
+    """A model on the arrays of a task.
+
+    Args:
+        task: whose arrays they are.
+        model: the equations.
+    """
+
+    def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
+        self.model, self.xp = model, task.xp
+        self.R = task.constant(model.R)
+        self._Q = None if model.timed else task.constant(model.Q)
+        self._F, self._H = (
+            None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
+        )
+        self.channels = task.definition.channels
+        self.wraps = any(channel.period for channel in self.channels)
+        self.gated = any(channel.gate for channel in self.channels)
+        self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
+
+    def move(self, x: Array, passed: Passed) -> Array:
+        """State without noise at the next measurement, ``(n, ...)``.
+
+        Args:
+            x: ``(n, ...)``.
+            passed: what went on until then.
+        """
+        return self._value(self.model.f, self._with_passed(x, passed))
+
+    def _with_passed(self, x: Array, passed: Passed) -> Array:
+        """State with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
+        rows = [] if passed.interval is None else [passed.interval]
+        if passed.inputs is not None:
+            rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
+        return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
+
+    def process_noise(self, x: Array, passed: Passed) -> Array:
+        """Q, ``(n, n, N)``, without time ``(n, n, 1)``.
+
+        Args:
+            x: predicted state, ``(n, N)``.
+            passed: what went on until then.
+        """
+        if self._Q is not None:
+            return self._Q[:, :, None]
+        assert isinstance(self.model.Q, VectorFunction)
+        n = self.model.f.size
+        entries = self.model.Q.value(self._with_passed(x, passed), self.xp)
+        return self.xp.reshape(entries, (n, n, *x.shape[1:]))
+
+    def input_noise(self, x: Array, passed: Passed) -> Array | float:
+        """What noise of the inputs adds to the covariance, ``(n, n, N)``.
+
+        Args:
+            x: state before, ``(n, N)``.
+            passed: what went on since.
+        """
+        if self.model.G is None:
+            return 0.0
+        assert passed.inputs is not None
+        inputs = passed.inputs + 0.0 * x[0]
+        given = self._with_passed(x, Passage(passed.interval, None))
+        G = self.model.G.jacobian(self.xp.concat([inputs, given]), self.xp)
+        scaled = self.xp.stack(
+            [G[:, j] * variance for j, variance in enumerate(self._input_variances)], axis=1
+        )
+        return product(scaled, transpose(G))
+
+    def sensor_noise(self, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None) -> Array:
+        """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
+
+        Args:
+            factor: a number, or ``(N,)``.
+            of_sensors: further ones of some sensors, by their names.
+        """
+        R = factor * self.R[:, :, None]
+        if not of_sensors:
+            return R
+        rows, none = [], 0.0 * sum(of_sensors.values())  # of their shape
+        for channel in self.channels:
+            own = of_sensors.get(channel.name, 1.0) + none
+            rows += [own * R[place] for place in range(channel.first, channel.first + channel.count)]
+        return self.xp.stack(rows)
+
+    def measure(self, x: Array) -> Array:
+        """Measurement without noise, ``(m, ...)``."""
+        return self._value(self.model.h, x)
+
+    def subtract(self, z: Array, predicted: Array) -> Array:
+        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
+        nu = z - predicted
+        if not self.wraps:
+            return nu
+        rows = []
+        for channel in self.channels:
+            for place in range(channel.first, channel.first + channel.count):
+                turns = (
+                    0.0
+                    if channel.period is None
+                    else channel.period * self.xp.round(nu[place] / channel.period)
+                )
+                rows.append(nu[place] - turns)
+        return self.xp.stack(rows)
+
+    def receive(self, measurement: Measured, mean: Array, R: Array) -> Received:
+        """What was received of a measurement, as it was predicted.
+
+        Args:
+            measurement: with numbers also where nothing was received.
+            mean: predicted, ``(n, N)``.
+            R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
+        """
+        nu = self.subtract(measurement.values, self.measure(mean))
+        return keep_received(nu, self.measurement_matrix(mean), R, measurement.available)
+
+    def gain(self, covariance: Array, received: Received) -> Array:
+        """Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates, ``(n, m, N)``."""
+        if self.gated:
+            S = product(product(received.H, covariance), transpose(received.H)) + received.R
+            kept = self.within_gates(received.innovation, S)
+            received = keep_received(received.innovation, received.H, received.R, received.available * kept)
+        return kalman_gain(covariance, received)
+
+    def within_gates(self, nu: Array, S: Array) -> Array:
+        """1 for numbers of sensors whose innovation is within their gate, else 0, ``(m, N)``.
+
+        Args:
+            nu: innovation, ``(m, N)``.
+            S: its covariance, ``(m, m, N)``.
+        """
+        xp, rows = self.xp, []
+        for channel in self.channels:
+            within = 1.0 + 0.0 * nu[channel.first]
+            if channel.gate is not None:
+                _, squared = log_density(nu[channel.places], S[channel.places, channel.places])
+                within = xp.where(squared <= channel.gate**2, within, 0.0)
+            rows += [within] * channel.count
+        return xp.stack(rows)
+
+    def _value(self, function: VectorFunction, x: Array) -> Array:
+        flat = self.xp.reshape(x, (x.shape[0], -1))
+        return self.xp.reshape(function.value(flat, self.xp), (function.size, *x.shape[1:]))
+
+    def transition_matrix(self, x: Array, passed: Passed) -> Array:
+        """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
+        if self._F is not None:
+            return self._F[:, :, None]
+        return self.model.f.jacobian(self._with_passed(x, passed), self.xp)
+
+    def measurement_matrix(self, x: Array) -> Array:
+        """Jacobian of h, likewise."""
+        return self.model.h.jacobian(x, self.xp) if self._H is None else self._H[:, :, None]
+
+    def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
+        """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""
+        F = self.transition_matrix(mean, passed)
+        carried = product(product(F, covariance), transpose(F))
+        if self.model.G is not None:
+            carried = carried + self.input_noise(mean, passed)
+        return self.move(mean, passed), carried

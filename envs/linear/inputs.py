@@ -1,0 +1,91 @@
+r"""Known inputs of a state-space model: a current, a commanded thrust, the rates of a gyroscope.
+
+A simulation draws each as a Gauss-Markov process around its mean (Gelb, Applied Optimal Estimation (1974), section
+3.6),
+
+    u(k) = mean + a (u(k-1) - mean) + deviation sqrt(1 - a^2) n(k),  a = exp(-dt / correlation_time),  n(k) ~ N(0, 1)
+
+and tells filters ``u(k) + noise e(k)``, e(k) ~ N(0, 1).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from types import ModuleType
+
+from ..contract.observation import Array
+
+
+@dataclass(frozen=True)
+class Input:
+    """A known input: how it behaves in a simulation, and how well it is known.
+
+    Raises:
+        ValueError: for what cannot be.
+    """
+
+    mean: float = 0.0
+    """In its own unit, as the deviation and the noise."""
+    deviation: float = 1.0
+    """Of its course from the mean."""
+    correlation_time: float = 10.0
+    """Of its course, s."""
+    noise: float = 0.0
+    """Standard deviation of what is told from what acts, independent at every measurement."""
+    unit: str = "1"
+
+    def __post_init__(self) -> None:
+        for field in fields(self)[:-1]:
+            value = getattr(self, field.name)
+            least = "above 0" if field.name == "correlation_time" else "at least 0"
+            wrong = value <= 0.0 if field.name == "correlation_time" else value < 0.0
+            if not math.isfinite(value) or (wrong and field.name != "mean"):
+                raise ValueError(f"{field.name} of an input must be finite, {least}, got {value!r}")
+
+
+class InputCourses:
+    """Courses of the inputs of a simulation.
+
+    Args:
+        inputs: p of them.
+        xp: array namespace.
+
+    Attributes:
+        initial_normals: standard normal numbers that are taken at the start, p.
+        normals: at each measurement, p for the courses and one for each input with noise.
+    """
+
+    def __init__(self, inputs: Sequence[Input], xp: ModuleType) -> None:
+        self.inputs, self.xp = tuple(inputs), xp
+        self.noisy = [j for j, one in enumerate(inputs) if one.noise > 0.0]
+        self.initial_normals = len(inputs)
+        self.normals = len(inputs) + len(self.noisy)
+
+    def begin(self, normals: Array) -> Array | None:
+        """Inputs before the first measurement, ``(p, N)``, of standard normal numbers likewise; None without any."""
+        if not self.inputs:
+            return None
+        each = zip(self.inputs, normals, strict=True)
+        return self.xp.stack([one.mean + one.deviation * number for one, number in each])
+
+    def advance(self, inputs: Array, interval: Array, normals: Array) -> Array:
+        """Inputs that act until the next measurement, ``(p, N)``.
+
+        Args:
+            inputs: that acted until the one before, ``(p, N)``.
+            interval: s, ``(N,)``.
+            normals: :attr:`normals` of them, ``(normals, N)``.
+        """
+        xp, after = self.xp, []
+        for j, one in enumerate(self.inputs):
+            kept = xp.exp(-interval / one.correlation_time)
+            fresh = one.deviation * xp.sqrt(1.0 - kept * kept)
+            after.append(one.mean + kept * (inputs[j] - one.mean) + fresh * normals[j])
+        return xp.stack(after)
+
+    def report(self, inputs: Array, normals: Array) -> Array:
+        """What is told of them, ``(p, N)``; arguments as of :meth:`advance`."""
+        told = [inputs[j] for j in range(len(self.inputs))]
+        for place, j in enumerate(self.noisy):
+            told[j] = told[j] + self.inputs[j].noise * normals[len(told) + place]
+        return self.xp.stack(told)

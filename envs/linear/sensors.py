@@ -1,0 +1,190 @@
+"""Sensors of a state-space model by name: what each measures, when, and what may go wrong with it.
+
+A measurement holds the numbers of all sensors, one after the other, and says which were received. What several sensors
+say at one time is taken in together: their noises are independent, so the order would matter only to linearisation.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ..contract.causes import Cause, Moment
+from ..contract.draws import Draws
+from ..contract.observation import Array
+
+if TYPE_CHECKING:
+    from .state_space import StateSpace
+
+PERIODS = {"rad": 2.0 * math.pi, "deg": 360.0}
+"""Of angles, by their units."""
+EARLY = 1e-6
+"""Share of a sensor's interval by which it may be due early: sums of intervals are rounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of a state-space model.
+
+    Raises:
+        ValueError: for what cannot be.
+    """
+
+    h: Any
+    """What it measures: a function of the state ``(n,)`` that returns a list of numbers, or a matrix ``(m, n)``."""
+    R: Any
+    """Covariance of its noise, ``(m, m)``, or the variance where it measures one number."""
+    interval: float | None = None
+    """Between its measurements in a simulation, s: it speaks at the first measurement at which it is due. None: at
+    every measurement."""
+    availability: float = 1.0
+    """Probability that a measurement which is due is received."""
+    gate: float | None = None
+    """Distance of an innovation from zero, in predicted standard deviations (Mahalanobis), beyond which no filter takes
+    the measurement in; None: all are. The likelihood counts it all the same."""
+    wraps: str | None = None
+    """``"rad"`` or ``"deg"``: it measures angles, and innovations are between minus and plus half a turn."""
+    names: Sequence[str] = ()
+    """Of its m numbers, which are columns of a table ``SENSOR_NAME``; default: 1, 2 and so on. One number is called as
+    the sensor."""
+    units: Sequence[str] = ()
+    """Of its numbers; default: of the component that it measures, or of the angle."""
+
+    def __post_init__(self) -> None:
+        if self.interval is not None and not 0.0 < self.interval < math.inf:
+            raise ValueError(f"interval of a sensor must be above 0 s, or None, got {self.interval!r}")
+        if not 0.0 < self.availability <= 1.0:
+            raise ValueError(
+                f"availability of a sensor must be above 0 and at most 1, got {self.availability!r}"
+            )
+        if self.gate is not None and not 0.0 < self.gate < math.inf:
+            raise ValueError(f"gate of a sensor must be above 0, or None, got {self.gate!r}")
+        if self.wraps not in (None, *PERIODS):
+            raise ValueError(f"wraps of a sensor must be None, {' or '.join(PERIODS)}, got {self.wraps!r}")
+
+
+class Channel(NamedTuple):
+    """A sensor's place among the m numbers of a measurement, and how it behaves."""
+
+    name: str
+    first: int
+    count: int
+    interval: float | None = None
+    availability: float = 1.0
+    gate: float | None = None
+    period: float | None = None
+    """Of its numbers, where they are angles."""
+
+    @property
+    def places(self) -> slice:
+        """Its numbers."""
+        return slice(self.first, self.first + self.count)
+
+    def received(self, available: Array) -> Array:
+        """Whether it said anything, ``(N,)``, from what was received, ``(m, N)``."""
+        found = available[self.first] > 0.0
+        for place in range(self.first + 1, self.first + self.count):
+            found = found | (available[place] > 0.0)
+        return found
+
+
+def silence_causes(channels: Sequence[Channel]) -> tuple[Cause, ...]:
+    """Return a cause of costs for each of several sensors: that it says nothing."""
+
+    def cause(channel: Channel) -> Cause:
+        def holds(moment: Moment) -> Array:
+            return ~channel.received(moment.measurement.available)
+
+        return Cause(f"no {channel.name}", f"where {channel.name} says nothing", holds)
+
+    return tuple(map(cause, channels))
+
+
+class SensorStates(NamedTuple):
+    """Where the sensors of a simulation stand."""
+
+    waited: Array | None = None
+    """Since each sensor with an interval was due, s, ``(sensors, N)``."""
+    silent: Array | None = None
+    """1 in a gap of a sensor, else 0, ``(sensors, N)``."""
+    bias: Array | None = None
+    """Constant error, ``(m, N)``."""
+
+
+class Receptions:
+    """When the sensors of a simulation speak, and which of them has an offset.
+
+    Args:
+        task: with its parameters.
+        deviations: of the noise of the m numbers, ``(m,)``.
+
+    Attributes:
+        row_uniforms: uniform numbers that are taken at each measurement.
+    """
+
+    def __init__(self, task: "StateSpace", deviations: numpy.ndarray) -> None:
+        self.parameters, self.xp = task.parameters, task.xp
+        self.channels, self.deviations = task.definition.channels, deviations
+        self.due = [channel for channel in self.channels if channel.interval is not None]
+        self.losing = [channel for channel in self.channels if channel.availability < 1.0]
+        self.pauses = self.parameters.gaps > 0.0
+        self.row_uniforms = len(self.losing) + len(self.channels) * self.pauses
+
+    def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
+        """State at the start of the track, of zeros ``(N,)``; None where nothing has to be remembered."""
+        states = SensorStates(
+            self.xp.stack([zero] * len(self.due)) if self.due else None,
+            self.xp.stack([zero] * len(self.channels)) if self.pauses else None,
+            self._bias(draws, zero) if self.parameters.bias > 0.0 else None,
+        )
+        return None if all(part is None for part in states) else states
+
+    def _bias(self, draws: Draws, zero: Array) -> Array:
+        """Offset of one sensor, up or down, ``(m, N)``."""
+        biased = draws.integer("biased_sensor", (0, len(self.channels) - 1))
+        sign = 2.0 * draws.integer("sign", (0, 1)) - 1.0
+        size, rows = (self.parameters.bias * self.deviations).tolist(), []
+        for number, channel in enumerate(self.channels):
+            one = self.xp.where(biased == float(number), sign, zero)
+            rows += [size[place] * one for place in range(channel.first, channel.first + channel.count)]
+        return self.xp.stack(rows)
+
+    def advance(
+        self, states: SensorStates | None, interval: Array, uniforms: Array
+    ) -> tuple[SensorStates | None, Array | None]:
+        """State at a measurement, and what is received of it, ``(m, N)``; None where all is.
+
+        Args:
+            states: at the one before.
+            interval: since then, s, ``(N,)``.
+            uniforms: :attr:`row_uniforms` of them, ``(row_uniforms, N)``.
+        """
+        xp, here = self.xp, {channel.name: 1.0 + 0.0 * interval for channel in self.channels}
+        if not (self.due or self.losing or self.pauses):
+            return states, None
+        states = states or SensorStates()
+        waited = []
+        for place, channel in enumerate(self.due):
+            assert states.waited is not None
+            assert channel.interval is not None
+            total = states.waited[place] + interval
+            times = xp.floor(total / channel.interval + EARLY)
+            here[channel.name] = xp.where(times > 0.0, here[channel.name], 0.0)
+            waited.append(total - channel.interval * times)
+        for place, channel in enumerate(self.losing):
+            here[channel.name] = xp.where(uniforms[place] < channel.availability, here[channel.name], 0.0)
+        silent = []
+        for place, channel in enumerate(self.channels if self.pauses else ()):
+            assert states.silent is not None
+            uniform = uniforms[len(self.losing) + place]
+            begins = xp.where(uniform < self.parameters.gaps, 1.0, 0.0)
+            goes_on = xp.where(uniform * self.parameters.gap_length >= 1.0, 1.0, 0.0)
+            silent.append(xp.where(states.silent[place] > 0.0, goes_on, begins))
+            here[channel.name] = here[channel.name] * (1.0 - silent[-1])
+        states = states._replace(
+            waited=xp.stack(waited) if waited else None, silent=xp.stack(silent) if silent else None
+        )
+        rows = [here[channel.name] for channel in self.channels for _ in range(channel.count)]
+        return (None if all(part is None for part in states) else states), xp.stack(rows)

@@ -1,0 +1,130 @@
+r"""A bank over the faults of one pseudorange: the filter of healthy satellites, and one for a fault of each of them.
+
+Every member is a whole :class:`.FaultHypotheses`. In member j the error of pseudorange j may jump once in a while and
+then walks at random, so that the pseudorange says little of the position from the start on, and a fault that creeps in
+cannot have bent the estimate before it is found (solution separation: R. G. Brown and P. W. McBurney, Self-contained
+GPS integrity check using maximum solution separation, Navigation 35, 1988). At most one pseudorange is wrong. Faults
+begin at a rate h, of all satellites together, and last. With weights w0 of no fault and wj of that of satellite j,
+
+    w0' = (1 - h T) w0,    wj' = wj + h T w0 / S,
+
+before the readings weigh them by their densities. Between houses, where reflections are what is wrong, none begins.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...filters import imm, range_errors
+from ...filters.ordered_sums import weighted_sum
+from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.observation import Array
+from .fault_hypotheses import TRAINING, FaultHypotheses, FaultPrior, FaultState
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import TightlyCoupledNavigation
+
+
+class OneFault(FaultHypotheses):
+    """Member of the bank: the error of one pseudorange jumps and walks, those of the others are as expected.
+
+    Args:
+        task: the problem.
+        prior: what it expects; of jumps those of this pseudorange.
+        wrong: number of the satellite.
+        walk: m, standard deviation of a step of its error in a second.
+    """
+
+    def __init__(self, task: "TightlyCoupledNavigation", prior: FaultPrior, wrong: int, walk: float) -> None:
+        super().__init__(task, prior)
+        self.wrong, self.walk = wrong, task.constant(walk**2 * task.common.T)
+
+    def _error_process(self, between: Array) -> tuple[Any, Any]:
+        """That of the prior, but of its own pseudorange a random walk."""
+        kept, gained = super()._error_process(between)
+        places = range(self.task.satellites)
+        return [1.0 if j == self.wrong else kept for j in places], [
+            self.walk if j == self.wrong else gained for j in places
+        ]
+
+    def _renewals(self, measurement: Measurement, between: Array, odds: Array) -> list[range_errors.Renewal]:
+        """As the prior says of its own pseudorange; under an open sky no other jumps."""
+        found = super()._renewals(measurement, between, odds)
+        return [
+            one if j == self.wrong else one._replace(probability=self.xp.where(between, one.probability, 0.0))
+            for j, one in enumerate(found)
+        ]
+
+
+class SatelliteFaultState(NamedTuple):
+    """State of the bank."""
+
+    members: tuple[FaultState, ...]
+    """Of no fault, and of that of each satellite."""
+    weights: Array
+    """``(1 + S, N)``."""
+    likelihood: Likelihood
+
+
+class SatelliteFaults(Filter["TightlyCoupledNavigation", Measurement, SatelliteFaultState]):
+    """`fault-hypotheses`, and a copy of it for a fault of each pseudorange that jumps and walks off to the end.
+
+    Args:
+        task: the problem.
+        prior: what the members expect.
+        begins: faults expected in a second, of all satellites together.
+        walk: m, what the error of a wrong pseudorange moves in a second.
+        **changed: fields of the prior.
+    """
+
+    def __init__(
+        self,
+        task: "TightlyCoupledNavigation",
+        prior: FaultPrior = TRAINING,
+        begins: float = 0.05,
+        walk: float = 3.0,
+        **changed: Any,
+    ) -> None:
+        super().__init__(task)
+        prior = prior._replace(**{"jump": 0.5, "jump_sigma": 35.0, **changed})
+        healthy = FaultHypotheses(task, prior._replace(jump=0.0))
+        faulty = [OneFault(task, prior, j, walk) for j in range(task.satellites)]
+        self.members = [healthy, *faulty]
+        self.begins = 1.0 - math.exp(-begins * task.common.T)
+
+    def start(self, initial: Initial) -> SatelliteFaultState:
+        """Start every member from what is known of the start; nothing is wrong yet."""
+        none = 0.0 * initial.mean[0]
+        weights = self.xp.stack([none + 1.0, *[none] * self.task.satellites])
+        members = tuple(member.start(initial) for member in self.members)
+        return SatelliteFaultState(members, weights, Likelihood.unknown(none))
+
+    def update(self, state: SatelliteFaultState, given: Input) -> SatelliteFaultState:
+        """Update every member, and weigh them."""
+        xp, S, measurement = self.xp, self.task.satellites, given.measurement
+        between = xp.any(measurement.cn0 != self.task.parameters.clear_cn0, axis=0)
+        beginning = xp.where(between, 0.0, self.begins) * state.weights[0]
+        predicted = [state.weights[0] - beginning, *(state.weights[1 + j] + beginning / S for j in range(S))]
+        members = tuple(
+            member.update(own, given) for member, own in zip(self.members, state.members, strict=True)
+        )
+        log_prior = imm.log_probabilities(xp.stack(predicted))
+        log_likelihood, nis, degrees = (
+            xp.stack([getattr(member.likelihood, name) for member in members])
+            for name in ("log_likelihood", "nis", "nis_degrees")
+        )
+        weights = imm.mode_posterior(log_prior, log_likelihood)
+        density = imm.log_mixture_density(log_prior, log_likelihood)
+        found = Likelihood(density, weighted_sum(weights, nis), weighted_sum(weights, degrees))
+        return SatelliteFaultState(members, weights, found)
+
+    def mean(self, state: SatelliteFaultState) -> Array:
+        """Of all members together, ``(17, N)``."""
+        return weighted_sum(state.weights, self.xp.stack([member.mean for member in state.members], axis=1))
+
+    def covariance(self, state: SatelliteFaultState) -> Array:
+        """Likewise, ``(17, 17, N)``."""
+        means = self.xp.stack([member.mean for member in state.members], axis=1)
+        covariances = self.xp.stack([member.covariance for member in state.members], axis=2)
+        found: Array = imm.combine(means, covariances, state.weights)[1]
+        return found

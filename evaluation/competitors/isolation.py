@@ -1,0 +1,104 @@
+"""Python estimators in a process of their own, which is told what is measured and nothing else.
+
+What :mod:`.isolated_estimator` needs is put together here: the text of the estimator, which this process never
+executes, and what the other one may read: Python's library, the installed packages but this one, and the folder of the
+estimator.
+"""
+
+import json
+import os
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ...envs.engine.catalogue import find_user_module
+from ..storage.code import package_folders
+from . import isolated_estimator
+from .programs import LIMITS, Program
+
+ISOLATED = "isolated:"
+"""Before ``module:Class`` of an estimator, for one in a process of its own."""
+SYSTEM = (
+    "/lib",
+    "/lib64",
+    "/usr/lib",
+    "/usr/lib64",
+    "/etc/ld.so.cache",
+    "/etc/localtime",
+    "/dev/null",
+    "/dev/urandom",
+)
+"""What libraries read."""
+ONE_THREAD = tuple((name, "1") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
+"""So that nothing runs before the wall stands, and products round as here."""
+
+
+def isolate_estimator(name: str) -> Program:
+    """Return what makes the estimator of a user's module, in a process of its own.
+
+    Args:
+        name: ``module:Class``, of a module in one file.
+
+    Raises:
+        ValueError: if there is no such file, or it cannot be read.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon or not attribute.isidentifier():
+        raise ValueError(f"{ISOLATED} takes module:Class of an estimator, got {name!r}")
+    file = find_user_module(module, f"cannot isolate {name!r}")
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot isolate {name!r}: {error}") from None
+    return isolate_source(text, attribute, ISOLATED + name, file)
+
+
+def isolate_source(text: str, attribute: str, name: str, file: Path | None = None) -> Program:
+    """Return what makes the estimator of a text, in a process of its own.
+
+    Args:
+        text: of its module.
+        attribute: name of its class.
+        name: in errors.
+        file: whose text it is, if there is one; its folder may be read.
+    """
+    folder = [] if file is None else [str(file.parent.absolute())]
+    libraries = _libraries()
+    forbidden = [place.resolve() for place in package_folders()]
+    readable = [*SYSTEM, *libraries, sys.base_prefix + "/lib", *folder]
+    request = {
+        "source": text,
+        "file": name if file is None else str(file.absolute()),
+        "module": "isolated" if file is None else file.stem,
+        "name": attribute,
+        "path": [*libraries, *folder],
+        "readable": sorted({path for place in readable for path in _without(Path(place), forbidden)}),
+    }
+    return Program(
+        name,
+        LIMITS.get(),
+        (sys.executable, "-I", "-S", "-B", isolated_estimator.__file__),
+        json.dumps(request).encode() + b"\n",
+        (*ONE_THREAD, ("PATH", os.defpath), ("LANG", "C.UTF-8")),
+    )
+
+
+def _libraries() -> list[str]:
+    """Folders of Python's library and of installed packages, in the order in which they are searched."""
+    own = [sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")]
+    extensions = [str(Path(place) / "lib-dynload") for place in own]
+    packages = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    return list(dict.fromkeys([*own, *extensions, *packages]))
+
+
+def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
+    """Give a folder, or where something in it is forbidden what else is in it, however deep."""
+    real = place.resolve()
+    if not real.exists() or any(real.is_relative_to(other) for other in forbidden):
+        return
+    if not any(other.is_relative_to(real) for other in forbidden):
+        yield str(real)
+        return
+    for inner in real.iterdir():
+        yield from _without(inner, forbidden)

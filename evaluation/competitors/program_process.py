@@ -1,0 +1,219 @@
+"""A program in a process of its own, and the pipes to it.
+
+A question is written and an answer read at the same time, so that neither side waits for the other with a full pipe.
+What goes wrong, a program that ends, is late or says too much, is a :class:`Failure` with its reason. The process
+and whatever it has begun end with the object, or with Python.
+"""
+
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+import weakref
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+ENDED, LATE, WRONG = 6, 7, 8
+"""Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
+START_SECONDS = 30.0
+"""For the first answer, where the limit is shorter: an interpreter takes its time to start."""
+PIPE_BYTES = 1 << 20
+"""Of a pipe, where the system can be asked for it: a message of a thousand tracks is one piece then."""
+LAST_WORDS = 2000
+"""Bytes of standard error that are kept."""
+
+
+class Limits(NamedTuple):
+    """What a program may take."""
+
+    seconds: float = 10.0
+    """s from a question to its whole answer."""
+    memory: float = 4000.0
+    """MB of address space; 0: as much as there is. Only Linux limits it."""
+
+
+class Failure(Exception):  # noqa: N818  (no error of ours: what a program has done)
+    """Why there is no answer."""
+
+    def __init__(self, fault: int, words: str) -> None:
+        super().__init__(words)
+        self.fault = fault
+
+
+class ProgramProcess:
+    """A program that runs.
+
+    Args:
+        command: its words; nothing of it is given to a shell.
+        limits: that it has.
+        environment: variables; None: those of this process.
+
+    Raises:
+        OSError: if it cannot be started.
+    """
+
+    def __init__(
+        self, command: Sequence[str], limits: Limits, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.limits = limits
+        self._process = process = subprocess.Popen(
+            list(command),
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=None if environment is None else dict(environment),
+            start_new_session=True,  # Ctrl-C is for us, and we end the whole group
+        )
+        self._answers = selectors.DefaultSelector()
+        self.end = weakref.finalize(self, _end, process, self._answers)
+        streams = (process.stdin, process.stdout, process.stderr)
+        self._to, self._from, self._errors = (stream.fileno() for stream in streams if stream is not None)
+        for pipe in (self._to, self._from, self._errors):
+            os.set_blocking(pipe, False)
+            _widen(pipe)
+        self._answers.register(self._from, selectors.EVENT_READ)
+        self._answers.register(self._errors, selectors.EVENT_READ)
+        self._buffer, self._last_words = bytearray(), b""
+        self._seconds = max(limits.seconds, START_SECONDS)
+        if limits.memory and sys.platform == "linux":
+            import resource
+
+            most = int(limits.memory * 1e6)
+            with suppress(ProcessLookupError):
+                resource.prlimit(process.pid, resource.RLIMIT_AS, (most, most))
+
+    def exchange(self, question: bytes, size: int | None, most: int = 0) -> bytes:
+        """Write a question, and return the answer.
+
+        Args:
+            question: bytes.
+            size: bytes of the answer; None: it is a line.
+            most: bytes that a line may have.
+
+        Raises:
+            Failure: if there is no such answer in time.
+        """
+        unsent, until = memoryview(question), time.monotonic() + self._seconds
+        self._read(self._from)
+        if self._buffer:
+            raise Failure(WRONG, "it has written more than an answer")
+        while True:
+            if unsent:
+                unsent = self._write(unsent)
+            if not unsent and (found := self._whole_answer(size, most)) is not None:
+                self._seconds = self.limits.seconds
+                return found
+            left = until - time.monotonic()
+            if left <= 0.0:
+                raise Failure(LATE, f"it has not answered within {self._seconds:g} s")
+            for key, _ in self._answers.select(left):
+                self._read(key.fd)
+
+    def tell(self, message: bytes) -> None:
+        """Write what has no answer.
+
+        Raises:
+            Failure: if it is not taken in time.
+        """
+        self.exchange(message, 0)
+
+    def _write(self, unsent: memoryview) -> memoryview:
+        """Write what fits into the pipe, and wait for room for the rest."""
+        try:
+            unsent = unsent[os.write(self._to, unsent) :]
+        except BlockingIOError:
+            pass
+        except OSError:  # nobody reads any more
+            raise self._explain_end() from None
+        waits = self._to in self._answers.get_map()
+        if unsent and not waits:
+            self._answers.register(self._to, selectors.EVENT_WRITE)
+        elif waits and not unsent:
+            self._answers.unregister(self._to)
+        return unsent
+
+    def _read(self, pipe: int) -> None:
+        if pipe == self._to:
+            return
+        try:
+            found = os.read(pipe, PIPE_BYTES)
+        except BlockingIOError:
+            return
+        if pipe == self._errors:
+            self._last_words = (self._last_words + found)[-LAST_WORDS:]
+            if not found:
+                self._answers.unregister(pipe)
+        elif not found:
+            raise self._explain_end()
+        else:
+            self._buffer += found
+
+    def _whole_answer(self, size: int | None, most: int) -> bytes | None:
+        """Take an answer out of what was read; None where it is not all there."""
+        buffer = self._buffer
+        if size is None:
+            end = buffer.find(b"\n")
+            if end < 0 and len(buffer) > most:
+                raise Failure(WRONG, f"it has answered with a line of more than {most:,} bytes")
+            size = end + 1
+            if end < 0:
+                return None
+        if len(buffer) < size:
+            return None
+        found = bytes(buffer[:size])
+        del buffer[:size]
+        return found
+
+    def _explain_end(self) -> Failure:
+        """Say how the program has ended, with the last line that it wrote to standard error."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        if self._errors in self._answers.get_map():
+            with suppress(OSError):
+                self._last_words += os.read(self._errors, PIPE_BYTES)
+        lines = self._last_words.decode(errors="replace").strip().splitlines()
+        code = self._process.returncode
+        if code is None:
+            words = "it has closed its standard input or output"
+        elif code < 0:
+            words = f"it was ended by {signal.Signals(-code).name}"
+        else:
+            words = f"it has ended with exit status {code}"
+        last = "".join(c if c.isprintable() else " " for c in lines[-1][:200]) if lines else ""
+        return Failure(ENDED, f"{words}: {last}" if last else words)
+
+    @property
+    def processor_seconds(self) -> float:
+        """Processor time of the process, s, of all its threads; NaN where the system does not say."""
+        if sys.platform != "linux":
+            return float("nan")
+        try:
+            return time.clock_gettime((~self._process.pid << 3) | 2)  # clock_getcpuclockid(3)
+        except OSError:
+            return float("nan")
+
+
+def _widen(pipe: int) -> None:
+    """Ask for a larger pipe, where that can be."""
+    if sys.platform == "linux":
+        import fcntl
+
+        with suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+
+
+def _end(process: "subprocess.Popen[bytes]", answers: selectors.BaseSelector) -> None:
+    """Close the pipes and end the process with all that it has begun; it leaves no zombie."""
+    answers.close()
+    for stream in (process.stdin, process.stdout, process.stderr):
+        if stream is not None:
+            stream.close()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(0.1)  # a program ends when its standard input does
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()

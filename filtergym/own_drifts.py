@@ -1,0 +1,59 @@
+"""Models in continuous time: a drift and a diffusion, made into a motion and a process noise of an interval."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy
+
+from .compiler import namespace
+from .compiler.vector_functions import VectorFunction
+from .filters.discretisation import choose_series, discretise, held_noise, runge_kutta
+
+LONGEST = 1e4
+"""Sampling intervals for which linear models are exact to rounding."""
+
+
+class Discretised(NamedTuple):
+    """A model of an interval."""
+
+    motion: Callable[[Any, Any, Any], Any]
+    """State ``(n,)`` after the interval, from state, interval and inputs ``(p,)``."""
+    noise: Callable[[Any, Any, Any], Any]
+    """Covariance of the process noise ``(n, n)``, from the predicted state, interval and inputs."""
+
+
+def discretise_drift(
+    drift: VectorFunction, diffusion: numpy.ndarray, interval: float, steps: int
+) -> Discretised:
+    """Make a model of an interval of one in continuous time, see :mod:`.filters.discretisation`.
+
+    Args:
+        drift: from state and inputs, ``(n + p,)``, to the derivative of the state, ``(n,)``.
+        diffusion: spectral density of the noise, ``(n, n)``.
+        interval: usual time between measurements, s.
+        steps: of the Runge-Kutta method in an interval.
+    """
+    n = drift.size
+    if drift.matrix is None:
+
+        def slope(x: Any, u: Any) -> Any:
+            return drift.value(namespace.concat([x, u])[:, None], namespace)[:, 0]
+
+        def held(x: Any, dt: Any, u: Any) -> Any:
+            A = drift.jacobian(namespace.concat([x, u])[:, None], namespace)[:, :n, 0]
+            return held_noise(A, diffusion, dt)
+
+        return Discretised(lambda x, dt, u: runge_kutta(lambda y: slope(y, u), x, dt, steps), held)
+    A = drift.matrix[:, :n]
+    # Inputs and what is constant are held: states without a drift of their own, the last of them 1.
+    whole = numpy.zeros((drift.matrix.shape[1] + 1,) * 2)
+    whole[:n, :-1], whole[:n, -1] = drift.matrix, drift.offset
+    still = numpy.zeros_like(whole)
+    series = choose_series(whole, LONGEST * interval), choose_series(A, LONGEST * interval)
+
+    def motion(x: Any, dt: Any, u: Any) -> Any:
+        E = discretise(whole, still, dt, series[0])[0][:n]
+        moved = x + E[:, :n] @ x + E[:, -1]
+        return moved + E[:, n:-1] @ u if len(whole) > n + 1 else moved
+
+    return Discretised(motion, lambda x, dt, u: discretise(A, diffusion, dt, series[1])[1])

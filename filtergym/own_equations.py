@@ -1,0 +1,193 @@
+"""The equations of somebody's state-space model, checked and traced."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy
+
+from .compiler.namespace import NotTraceable
+from .compiler.vector_functions import VectorFunction
+from .envs.contract.parameters import read_numbers
+from .envs.linear.equations import StateSpaceModel, process_noise
+from .envs.linear.inputs import Input
+from .own_drifts import discretise_drift
+
+Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
+"""A function of the state ``(n,)`` that returns a list of numbers, or a matrix; with more arguments see
+:func:`.own_models.state_space`."""
+FURTHER = ("dt", "u")
+"""What f may take after the state, by these names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What the equations of a model have to fit."""
+
+    mean: numpy.ndarray
+    """Of the initial state, ``(n,)``."""
+    interval: float
+    """Usual time between measurements, s."""
+    inputs: Mapping[str, Input]
+    """By their names."""
+    integration_steps: int = 1
+    """Of the Runge-Kutta method in an interval, of a drift that is not linear."""
+
+    @property
+    def usual_inputs(self) -> numpy.ndarray:
+        """Means of the inputs, ``(p,)``."""
+        return numpy.array([one.mean for one in self.inputs.values()])
+
+
+def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceModel:
+    """Trace a model.
+
+    Args:
+        given: f and Q, or drift and diffusion; h and R.
+        around: what they have to fit; the covariance of a timed model is checked at its usual interval.
+
+    Raises:
+        ValueError: for what does not, or cannot be traced.
+    """
+    n = len(around.mean)
+    h = trace("h", given["h"], n, None)
+    motion, of_inputs, noise = (
+        _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
+    )
+    R = check_covariance("R", given["R"], h.size, definite=True)
+    model = StateSpaceModel(motion, h, noise, R, of_inputs)
+    check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
+    return model
+
+
+class _Motion(NamedTuple):
+    """How the state moves: of a :class:`StateSpaceModel` f, G and Q."""
+
+    f: VectorFunction
+    G: VectorFunction | None
+    Q: numpy.ndarray | VectorFunction
+
+
+def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
+    """The motion of f and Q."""
+    n, f, Q = len(around.mean), given["f"], given["Q"]
+    takes = further_arguments(f)
+    if ("dt" in takes) != callable(Q):
+        raise ValueError(
+            "a timed model has f(x, dt) and Q(dt), any other takes the interval in neither: got "
+            f"{'f(x, dt)' if 'dt' in takes else 'f without dt'} and {'Q(dt)' if callable(Q) else 'Q as a matrix'}"
+        )
+    if not callable(f):
+        f = check_array("f", f, (n, n))
+    elif "u" in takes and not around.inputs:
+        raise ValueError("f takes u, and there are no inputs: name them, such as inputs=['current']")
+
+    def call(x: Any, dt: Any, u: Any) -> Any:
+        further = {"dt": dt, "u": u}
+        return f(x, **{name: further[name] for name in takes}) if callable(f) else f @ x
+
+    noise: numpy.ndarray | VectorFunction
+    if callable(Q):
+        noise = trace("Q", lambda v: _entries(Q(v[n])), 0, n * n, n + 1 + len(around.inputs))
+    else:
+        noise = check_covariance("Q", Q, n)
+    if not takes and not around.inputs:
+        return _Motion(trace("f", f, n, n), None, noise)
+    return _Motion(*_with_inputs("f", call, "dt" in takes, around), noise)
+
+
+def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
+    """The motion of a drift and a diffusion."""
+    n, p, drift = len(around.mean), len(around.inputs), given["drift"]
+    if callable(drift):
+        takes = further_arguments(drift)
+        if "dt" in takes or ("u" in takes and not p):
+            raise ValueError("drift takes the state, and u where there are inputs: drift(x) or drift(x, u)")
+        own = drift
+        drift = lambda v: own(v[:n], v[n:]) if takes else own(v[:n])  # noqa: E731
+    else:
+        drift = numpy.concatenate([check_array("drift", drift, (n, n)), numpy.zeros((n, p))], axis=1)
+    diffusion = check_covariance("diffusion", given["diffusion"], n)
+    found = discretise_drift(
+        trace("drift", drift, n + p, n), diffusion, around.interval, around.integration_steps
+    )
+    noise = trace("drift", lambda v: _entries(found.noise(v[:n], v[n], v[n + 1 :])), 0, n * n, n + 1 + p)
+    return _Motion(*_with_inputs("drift", found.motion, True, around), noise)
+
+
+def _with_inputs(
+    what: str, call: Callable[[Any, Any, Any], Any], timed: bool, around: Surroundings
+) -> tuple[VectorFunction, VectorFunction | None]:
+    """Motion of state, interval and inputs, and where an input has noise the same as a function of the inputs."""
+    n, p = len(around.mean), len(around.inputs)
+    further = int(timed)  # the interval stands between state and inputs, or nothing does
+    of_state = lambda v: call(v[:n], v[n] if timed else None, v[n + further :])  # noqa: E731
+    motion = trace(what, of_state, n, n, further + p)
+    if not any(one.noise > 0.0 for one in around.inputs.values()):
+        return motion, None
+    of_inputs = lambda v: call(v[p : p + n], v[p + n] if timed else None, v[:p])  # noqa: E731
+    return motion, trace(what, of_inputs, p, n, n + further)
+
+
+def further_arguments(function: Any) -> tuple[str, ...]:
+    """Which of :data:`FURTHER` a function takes after the state."""
+    if not callable(function):
+        return ()
+    try:
+        names = list(inspect.signature(function).parameters)[1:]
+    except (TypeError, ValueError):
+        return ()
+    return tuple(name for name in FURTHER if name in names)
+
+
+def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
+    """Return finite numbers of a shape, None for any number, or raise ValueError."""
+    array = read_numbers(what, values)
+    fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+    if not fits or not numpy.isfinite(array).all() or not array.size:
+        words = ", ".join("n" if size is None else str(size) for size in shape)
+        raise ValueError(f"{what} must be finite numbers of shape ({words}), got the shape {array.shape}")
+    return array
+
+
+def check_covariance(what: str, values: Any, size: int, definite: bool = False) -> numpy.ndarray:
+    """Return a covariance, or raise ValueError."""
+    matrix = check_array(what, values, (size, size))
+    scale = float(numpy.abs(matrix).max())
+    smallest = float(numpy.linalg.eigvalsh(matrix).min())
+    symmetric = bool((numpy.abs(matrix - matrix.T) <= 1e-12 * scale).all())
+    if not symmetric or smallest < -1e-12 * scale or (definite and smallest <= 0.0):
+        kind = "positive definite" if definite else "without negative eigenvalues"
+        raise ValueError(f"{what} must be symmetric and {kind}, got {matrix.tolist()}")
+    return 0.5 * (matrix + matrix.T)
+
+
+def trace(what: str, function: Function, size: int, answers: int | None, given: int = 0) -> VectorFunction:
+    """Trace a function of so many numbers, and others without a derivative; None for any number of answers.
+
+    Raises:
+        ValueError: if it cannot be traced, or answers with another number.
+    """
+    if not callable(function):
+        function = check_array(what, function, (answers, size))
+    try:
+        made = VectorFunction(function, size, given)
+    except NotTraceable as error:
+        raise ValueError(
+            f"{what} cannot be traced ({error}): write it with NumPy's functions of the state, return a list, and let "
+            "numpy.where choose where something depends on numbers"
+        ) from error
+    except ValueError as error:
+        raise ValueError(f"{what} {error}") from error
+    if answers not in (None, made.size):
+        raise ValueError(f"{what} must return {answers} numbers, got {made.size}")
+    return made
+
+
+def _entries(matrix: Any) -> list[Any]:
+    """Numbers of a matrix, or of a list of its rows, row by row."""
+    try:
+        return [entry for row in matrix for entry in row]
+    except TypeError:
+        raise ValueError("must return a matrix, as a list of its rows") from None

@@ -1,0 +1,118 @@
+"""The sensors of somebody's state-space model, checked and put one after the other."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy
+
+from .envs.contract.parameters import quote_shortened
+from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
+from .envs.linear.sensors import PERIODS, Channel, Sensor
+from .own_equations import Function, check_array, check_covariance, trace
+
+RESERVED = (RECORDING, "values", "available")
+"""Names that mean something else in a table or a measurement."""
+NOISES = ("process", "measurement")
+"""What has a noise of this name beside the sensors."""
+
+
+def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[str, Sensor]:
+    """Return sensors with some in place of others of the same name.
+
+    Raises:
+        ValueError: for what is no sensor, or of another name.
+    """
+    if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
+        raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
+    if {*given} & {*NOISES}:
+        raise ValueError(f"sensors cannot be called {' or '.join(NOISES)}, whose noises are others")
+    if sensors is not None and not {*given} <= {*sensors}:
+        unknown = next(name for name in given if name not in sensors)
+        raise ValueError(f"sensors are {', '.join(sensors) or 'not named'}, got {unknown!r}")
+    return {**(sensors or {}), **given}
+
+
+def stack_sensors(sensors: Mapping[str, Sensor], size: int) -> tuple[Function, numpy.ndarray]:
+    """Return h and R of all sensors together, of a state of n numbers.
+
+    Raises:
+        ValueError: for what does not fit.
+    """
+    noises, traced = [], []
+    for name, one in sensors.items():
+        traced.append(trace(f"h of the sensor {name!r}", one.h, size, None))
+        R = numpy.asarray(one.R, dtype=float)
+        given = R[None, None] if R.ndim == 0 else R
+        noises.append(check_covariance(f"R of the sensor {name!r}", given, traced[-1].size, definite=True))
+    places = numpy.cumsum([0, *map(len, noises)])
+    R = numpy.zeros((places[-1], places[-1]))
+    for first, noise in zip(places, noises, strict=False):
+        R[first : first + len(noise), first : first + len(noise)] = noise
+    matrices = [one.matrix for one in traced if one.matrix is not None and not numpy.any(one.offset)]
+    if len(matrices) == len(traced):
+        return numpy.concatenate(matrices), R
+    return lambda x: [number for one in sensors.values() for number in _numbers(one.h, x)], R
+
+
+def _numbers(h: Function, x: Any) -> Any:
+    return h(x) if callable(h) else check_array("h", h, (None, len(x))) @ x
+
+
+def find_channels(
+    sensors: Mapping[str, Sensor], counts: Sequence[int], interval: float
+) -> tuple[Channel, ...]:
+    """Return the places of sensors among the numbers of a measurement.
+
+    Args:
+        sensors: by their names; without any, one measures everything.
+        counts: of the numbers of each.
+        interval: between measurements, s.
+
+    Raises:
+        ValueError: for a sensor that is due more often.
+    """
+    if not sensors:
+        return (Channel("values", 0, counts[0]),)
+    channels, first = [], 0
+    for (name, one), count in zip(sensors.items(), counts, strict=True):
+        if one.interval is not None and one.interval < interval * (1.0 - 1e-9):
+            raise ValueError(
+                f"the sensor {name!r} is due every {one.interval:g} s, and measurements are {interval:g} s apart: let "
+                "sampling_interval be the shortest of all"
+            )
+        period = None if one.wraps is None else PERIODS[one.wraps]
+        channels.append(Channel(name, first, count, one.interval, one.availability, one.gate, period))
+        first += count
+    return tuple(channels)
+
+
+def sensor_columns(sensors: Mapping[str, Sensor], channels: Sequence[Channel]) -> dict[str, str]:
+    """Return the units of what sensors measure by the names of its columns; empty where a component says it.
+
+    Raises:
+        ValueError: for names or units that do not fit.
+    """
+    columns = {}
+    for channel in channels:
+        one, count = sensors[channel.name], channel.count
+        parts = tuple(one.names) or tuple(str(j + 1) for j in range(count))
+        units = tuple(one.units) or (one.wraps or "",) * count
+        if len(parts) != count or len(units) != count:
+            raise ValueError(
+                f"names and units of the sensor {channel.name!r} must be {count} each, got {parts!r} and {units!r}"
+            )
+        named = (channel.name,) if count == 1 else tuple(f"{channel.name}_{part}" for part in parts)
+        columns.update(zip(named, units, strict=True))
+    return columns
+
+
+def check_columns(names: Sequence[str], count: int, inputs: Iterable[str]) -> None:
+    """Raise ValueError for names of what is measured that cannot be told apart in a table, also from the inputs."""
+    lower = [str(name).lower() for name in (*names, *inputs)]
+    if len(names) != count or len({*lower}) != len(lower) or {*lower} & {*TIME, *RESERVED, ""}:
+        raise ValueError(
+            f"measured must be {count} different names, none of them a time or an input, got {names!r}; names may not "
+            f"be {', '.join(RESERVED)} either"
+        )
+    if any(name.startswith(TRUTH) for name in lower):
+        raise ValueError(f"names of what is measured must not begin with {TRUTH}, got {names!r}")

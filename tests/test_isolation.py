@@ -1,0 +1,257 @@
+"""An estimator in a process of its own: it answers what it answers anywhere, and finds no truth."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors.isolated_estimator import landlock_version
+from filtergym.evaluation.competitors.isolation import isolate_source
+from filtergym.evaluation.running.rollout import rollout, start_lanes
+from models import make_model
+
+import filtergym
+from filtergym.names import competitor, isolate_names
+
+ID = "filtergym/ManeuveringTarget-v0"
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+EPISODES, HORIZON = 16, 10
+
+# Each looks for the truth in another way, and where it finds none answers as the honest one does.
+CHEATS = '''
+import gc
+import sys
+
+import numpy as np
+
+
+class Honest:
+    def start(self, initial, N):
+        self.k = 0
+        return initial.mean, initial.covariance
+
+    def update(self, m, memory):
+        self.k += 1
+        mean, P = memory
+        seen = m.available > 0
+        position = mean[:2] + m.interval * mean[2:]
+        r = np.where(seen, m.position - position, 0.0)
+        mean = np.concatenate([position + 0.4 * r, mean[2:] + 0.1 * r / m.interval])
+        known = self.known(mean.shape[1])
+        return (mean if known is None else known), P, (mean, P)
+
+    def known(self, N):
+        return None
+
+
+class Recreates(Honest):
+    """Makes the episodes again, by public calls."""
+
+    def start(self, initial, N):
+        self.truth = None
+        try:
+            import filtergym
+
+            again = filtergym.record("filtergym/ManeuveringTarget-v0", None, EPISODES, seed=SEED, horizon=HORIZON)
+            self.who = ((initial.mean[None] - again.initial["mean"][:, :, None]) ** 2).sum(1).argmin(0)
+            self.truth = again.truth
+        except ImportError:
+            pass
+        return super().start(initial, N)
+
+    def known(self, N):
+        return None if self.truth is None else self.truth[self.who, self.k - 1].T.copy()
+
+
+def state(truth, N):
+    if not hasattr(truth, "velocity") or np.shape(truth.position)[-1] < N:
+        return None
+    return np.concatenate([truth.position, truth.velocity])[:, :N].astype(float)
+
+
+class Frames(Honest):
+    """Looks into the frames of whoever calls."""
+
+    def known(self, N):
+        frame = sys._getframe()
+        while frame:
+            for own in list(frame.f_locals.values()):
+                found = state(getattr(own, "truth", None), N)
+                if found is not None:
+                    return found
+            frame = frame.f_back
+        return None
+
+
+class TwoWords(Honest):
+    """Takes the two words from what runs the episodes to the truth, of all objects that there are."""
+
+    def known(self, N):
+        for own in gc.get_objects():
+            if type(own).__name__ == "Lanes":
+                found = state(own.state.truth, N)
+                if found is not None:
+                    return found
+        return None
+'''
+
+
+@pytest.fixture
+def cheats(tmp_path, monkeypatch):
+    """Write the module for an experiment; cost of each of its classes, in this process or in its own."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def costs(seed, *names):
+        head = f"SEED, EPISODES, HORIZON = {seed}, {EPISODES}, {HORIZON}\n"
+        (tmp_path / f"cheats_{seed}.py").write_text(head + CHEATS)
+        named = [name.replace("cheats", f"cheats_{seed}") for name in names]
+        found = filtergym.evaluate(ID, named, episodes=EPISODES, seed=seed, horizon=HORIZON)
+        return found["cost"].mean(["episode", "time"]).values
+
+    yield costs
+    for seed in (0, 5):
+        sys.modules.pop(f"cheats_{seed}", None)
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_a_cheat_is_worth_everything_beside_the_truth_and_nothing_apart(seed, cheats):
+    ways = ["Recreates", "Frames", "TwoWords"]
+    honest, *found = cheats(
+        seed, "cheats:Honest", *(f"{p}cheats:{n}" for p in ("", "isolated:") for n in ways)
+    )
+    assert honest > 1.0
+    np.testing.assert_array_equal(found[:3], 0.0)
+    np.testing.assert_allclose(found[3:], honest, rtol=1e-12)  # a sum in another order
+
+
+PROBE = '''
+import ctypes, importlib, os, signal, socket, subprocess, sys
+import numpy as np
+
+ATTEMPTS = {
+    "the package": lambda: importlib.import_module("filtergym"),
+    "its files": lambda: open(PACKAGE).read(),
+    "what runs it": lambda: open(f"/proc/{os.getppid()}/cmdline").read(),
+    "its memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
+    "another folder": lambda: os.listdir(FOLDER),
+    "a file of one's own": lambda: open("written", "w"),
+    "another program": lambda: subprocess.run(["/bin/true"], check=True),
+    "a connection": lambda: socket.create_connection(("127.0.0.1", PORT), timeout=1.0),
+}
+
+
+class Probe:
+    """Answers which of its attempts succeed."""
+
+    def start(self, initial, N):
+        return 0
+
+    def update(self, measurement, memory):
+        found = np.zeros(len(ATTEMPTS))
+        for i, attempt in enumerate(ATTEMPTS.values()):
+            try:
+                attempt()
+                found[i] = 1.0
+            except (OSError, ImportError):
+                pass
+        N = measurement.position.shape[-1]
+        mean = np.tile(found.reshape(2, 4)[memory % 2][:, None], (1, N))
+        return mean, np.tile(np.eye(4)[:, :, None], (1, 1, N)), memory + 1
+'''
+
+
+@pytest.mark.skipif(landlock_version() < 4, reason="this system has no Landlock that knows of connections")
+def test_nothing_can_be_reached_from_inside(tmp_path):
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        head = (
+            f"PACKAGE, FOLDER, PORT = {filtergym.__file__!r}, {str(tmp_path)!r}, {server.getsockname()[1]}\n"
+        )
+        apart = isolate_source(head + PROBE, "Probe", "probe")
+        model = make_model(ID, horizon=2)
+        reached = [e.filter.mean[:, 0].copy() for e, _ in rollout(model, apart, [0])]
+        space = {}
+        exec(head + PROBE, space)
+        here = [attempt() for name, attempt in space["ATTEMPTS"].items() if name != "a file of one's own"]
+    assert len(here) == 7  # outside each of them succeeds
+    names = np.array(list(space["ATTEMPTS"]))
+    assert names[np.concatenate(reached) > 0.0].tolist() == []
+
+
+@pytest.mark.parametrize("lanes", [1, 11])
+def test_what_is_isolated_answers_what_it_answers_anywhere(lanes, monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    model = make_model(ID, scenario="glint", horizon=20)
+    means = [
+        np.stack(
+            [e.filter.mean[:, :lanes].copy() for e, _ in rollout(model, competitor(ID, name), range(lanes))]
+        )
+        for name in ("isolated:mine:Mine", "mine:Mine")
+    ]
+    sys.modules.pop("mine", None)
+    np.testing.assert_allclose(
+        means[0], means[1], rtol=1e-12
+    )  # arrays may lie otherwise, and products round so
+
+
+ECHO = """
+class Echo:
+    def __init__(self, task):
+        self.task = task
+
+    def start(self, initial, N):
+        assert initial.mean.shape == (len(self.task.components), N), initial.mean.shape
+        return initial
+
+    def update(self, measurement, memory):
+        assert measurement._fields == tuple(FIELDS), measurement._fields
+        for name, (shape, kind) in FIELDS.items():
+            value = getattr(measurement, name)
+            assert value is None if shape is None else value.shape == shape and value.dtype.kind == kind, name
+        assert self.task.parameters.horizon == 2
+        return memory.mean, memory.covariance + self.task.xp.eye(len(memory.mean))[:, :, None], memory
+"""
+
+
+def test_it_is_given_what_an_estimator_is_given(env_id):
+    """Fields, shapes and types, in every environment."""
+    model = make_model(env_id, horizon=2, decision_interval=1)
+    measured = start_lanes(model, [0]).state.measurement
+    fields = {
+        name: (None, "") if value is None else (value.shape, value.dtype.kind)
+        for name, value in measured._asdict().items()
+    }
+    apart = isolate_source(f"FIELDS = {fields!r}\n{ECHO}", "Echo", "echo")
+    for episode, _ in rollout(model, apart, [0]):
+        assert not episode.filter.fault.any()
+    (last,) = episode.filter.mean[:, :1].T
+    assert np.isfinite(last).all()
+
+
+def test_names_are_isolated_where_they_are_modules():
+    problem = problem_of(ID)
+    names = ["imm", "mine:Mine", "exec:./run:2", "isolated:a:B", "runs/ppo"]
+    found = isolate_names(problem, names)
+    assert found == ["imm", "isolated:mine:Mine", "exec:./run:2", "isolated:a:B", "runs/ppo"]
+    for name, words in (("isolated:imm", "takes module:Class"), ("isolated:no_such:X", "no file no_such.py")):
+        with pytest.raises(ValueError, match=words):
+            competitor(ID, name)
+
+
+def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command):
+    """Nor where it is wrong: the sentence comes from the other process."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "spring.py").write_text("import sys\nsys.exit('no')\n")
+    words = ("evaluate", ID, "--isolated", "--episodes", 1, "--set", "horizon=5", "--policy", "spring:Spring")
+    code, shown, _ = command(*words)
+    assert code == 0
+    assert "1 of 1 episode lost: the program ended in episode 0 at measurement 1" in " ".join(shown.split())
+    (tmp_path / "spring.py").write_text("raise OSError('no')\n")
+    code, _, errors = command(*words)
+    assert (code, errors.count("\n")) == (2, 1)
+    assert "'isolated:spring:Spring' takes no part: OSError: no" in errors
+    assert "spring" not in sys.modules
+    assert "leave one of them out" in command(*words, "--trust")[2]
