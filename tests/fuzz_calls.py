@@ -42,7 +42,8 @@ MORE = {
     "names": ["p", "v"], "units": ["m", "m/s"], "measured": ["gps"], "weights": [1.0, 0.0],
     "filter_model": {"R": [[9]]}, "hypotheses": [{"Q": np.eye(2)}],
     "transition": [[0.9, 0.1], [0.2, 0.8]], "switching": False, "horizon": 20,
-    "sampling_interval": 0.5, "process_noise": 1.0, "decision_interval": 1,
+    "sampling_interval": 0.5, "process_noise": 1.0, "decision_interval": 1, "inputs": (),
+    "sensors": None, "drift": None, "diffusion": None, "integration_steps": 1,
 }  # fmt: skip
 EVALUATED = {
     "competitors": "imm", "scenario": "paper", "episodes": 2, "seed": 0, "split": "test", "control": "mode",

@@ -113,7 +113,7 @@ def main(seconds: float, rng: random.Random, names: list[str]) -> int:
             while True:
                 begun = len([*torn.rglob("checkpoint")])
                 number, last = rng.choice(SIGNALS), time.monotonic() > until
-                code = run(words, torn, None if last else rng.uniform(0.0, usual), number)
+                code = run(words, torn, None if last else rng.uniform(0.2, 1.0) * usual, number)
                 if code == 0:
                     break
                 kills[number] += 1
