@@ -366,7 +366,9 @@ def run_inner(reader: str, place: Path, flags: list[str]) -> None:
     def mutate(content: bytes, longest: int, seed: int) -> bytes:
         rng = random.Random(seed)
         if rng.random() < 0.5:
-            with contextlib.suppress(ValueError, LookupError, TypeError, OSError):  # it has lost its form before
+            with contextlib.suppress(
+                ValueError, LookupError, TypeError, OSError
+            ):  # it has lost its form before
                 return change_structure(reader, content, rng)[:longest]
         return atheris.Mutate(content, longest)
 
