@@ -186,6 +186,9 @@ def call_online(rng: random.Random) -> None:
     if rng.random() < 0.25:
         env = TARGET if rng.random() < 0.95 else rng.choice(ODD)
         given = mix(ONLINE, rng)
+        given["policy"] = (
+            "imm" if callable(given["policy"]) else given["policy"]
+        )  # errors of the caller's own code
         given["tracks"] = 2 if is_large(given["tracks"]) else given["tracks"]
         filter = filtergym.online(env, **given)
         filter.start(*([MEAN, COVARIANCE] if filter.tracks == 1 else start_of(filter.tracks)))

@@ -289,6 +289,7 @@ def test_splits_and_seeds_share_no_episode():
         {"competitors": {"imm": np.eye(2)}},
         {"backend": np.eye(2)},
         {"range_sigma": 10**400},
+        {"range_sigma": 1e308},
         {"env": np.eye(2)},
     ],
     ids=lambda odd: " ".join(f"{name} {type(value).__name__}" for name, value in odd.items()),

@@ -12,7 +12,6 @@ was expected.
 
 import dataclasses
 import math
-import sys
 import types
 import typing
 from collections.abc import Sequence
@@ -129,7 +128,8 @@ def _within(value: float, limits: Limits) -> bool:
     )
 
 
-LARGEST = sys.float_info.max
+LARGEST = 1e60
+"""Of a parameter: its fifth power is a number, too."""
 
 
 def quote_shortened(value: Any, most: int = 80) -> str:
@@ -164,9 +164,13 @@ def _number(name: str, value: Any, limits: Limits) -> None:
     # Compared, not converted: a whole number can be too large for a float.
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
-        raise ValueError(
-            f"{name} must be {f'a finite number {_limits_in_words(limits)}'.strip()}, got {quote_shortened(value)}"
+        stated = f"a finite number {_limits_in_words(limits)}".strip()
+        size = (
+            f" and {LARGEST:g} in size at most"
+            if isinstance(value, int | float) and abs(value) > LARGEST
+            else ""
         )
+        raise ValueError(f"{name} must be {stated}{size}, got {quote_shortened(value)}")
 
 
 def _integer(name: str, value: Any, limits: Limits) -> None:
