@@ -122,9 +122,9 @@ def main(seconds: float, rng: random.Random, names: list[str]) -> int:
                 path.name for path in torn.rglob("*") if path.name.startswith(".") or "partial" in path.name
             ]
             differing = [result for result in results if content(whole / result) != content(torn / result)]
-            if content(whole.with_suffix(".out")) != content(torn.with_suffix(".out")):
+            printed = [content(folder.with_suffix(".out")) for folder in (whole, torn)]
+            if name != "train" and printed[0] != printed[1]:  # which says that it goes on
                 differing.append("what is printed")
-                os.system(f"diff {whole.with_suffix('.out')} {torn.with_suffix('.out')}")
             wrong += bool(left or differing)
             told = ", ".join(f"{number.name} {count}" for number, count in kills.items())
             used = torn.with_suffix(".used").read_text()
