@@ -159,9 +159,9 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         growth = (self.white_intensity + 2.0 * self.coloured**2 * min(self.correlation_time, T)) * T
         if growth > MOST_RATIO * self.receiver_variance:
             raise ValueError(
-                "sampling_interval, coloured or white_intensity must be smaller, or receiver_intensity larger: from one "
-                f"measurement to the next the error gains {growth / self.receiver_variance:.1e} times the variance of "
-                f"the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
+                "sampling_interval, coloured or white_intensity must be smaller, or receiver_intensity larger: from "
+                f"one measurement to the next the error gains {growth / self.receiver_variance:.1e} times the variance "
+                f"of the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
             )
 
     @property
