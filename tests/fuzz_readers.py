@@ -107,7 +107,7 @@ def write_whole_seeds(reader: str, place: Path) -> None:
 
     def measured() -> None:
         for name in ("ManeuveringTarget", "RadarEsmTracking", "LooselyCoupledNavigation"):
-            recorded = filtergym.record(f"filtergym/{name}-v0", None, 2, horizon=8)
+            recorded = filtergym.record(f"filtergym/{name}-v0", None, 2, horizon=20)
             recorded.write(place.parent / "seed.nc")
             shutil.move(place.parent / "seed.nc", place / f"seed-{name}")
 
