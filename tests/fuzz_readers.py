@@ -233,6 +233,7 @@ def check_result(result) -> None:
 
     from filtergym import evaluate
 
+    found = {}
     if isinstance(result, Recording):
         P = np.asarray(result.initial.get("covariance", np.eye(1)))
         least = 0.0 if result.environment == ENVIRONMENT else -1e-9 * np.abs(P).max()
@@ -243,8 +244,6 @@ def check_result(result) -> None:
     elif callable(result):
         found = evaluate(ENVIRONMENT, {"read": result}, None, 1, horizon=3)
         assert np.isfinite(found["cost"]).all(), "its cost is not finite"
-    else:
-        return
     for name in ("log_likelihood", "nis", "mode_probability"):
         if name in found:
             assert not np.isinf(found[name]).any(), f"{name} of a replay is infinite"
