@@ -17,6 +17,7 @@ from typing import Any, get_type_hints
 import numpy
 
 from ..envs.contract.model import Model
+from ..envs.contract.parameters import quote_shortened
 from ..envs.contract.task import Task
 from ..envs.data.foreign_files import parse_json, read_content
 from ..envs.engine.catalogue import short_name, task_class
@@ -284,6 +285,8 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
             raise ValueError(
                 f"{name} must be finite numbers of shape {shape}, got shape {arrays[name].shape}"
             )
+    if not arrays["observation_scale"].all():
+        raise ValueError("observation_scale must not be zero")
     return width
 
 
@@ -325,7 +328,7 @@ class StoredPolicy:
         if self.header["interface"] != str(model.task.interface):
             raise ValueError(
                 f"{self.path} was trained when fields or actions of {model.task.id} meant something else (its "
-                f"interface {self.header['interface']}, now {model.task.interface}): train it again"
+                f"interface {quote_shortened(self.header['interface'])}, now {model.task.interface}): train it again"
             )
         self._check_reach(model)
         try:
@@ -354,7 +357,7 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
     """
     stored = StoredPolicy(path)
     if stored.header["environment"] != cls.id:
-        raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {cls.id}")
+        raise ValueError(f"{path} was trained on {quote_shortened(stored.header['environment'])}, not on {cls.id}")
     return EstimatorMaker(stored.control, stored) if stored.control in cls.trained_banks else stored
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.contract.task import Task
+from ..envs.data.flights import is_folder
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
@@ -30,7 +31,7 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
     path = Path(name)
-    if path.is_dir():
+    if is_folder(path):
         return _agent_of_run(cls, path, trust)
     if name.endswith(".safetensors"):
         return load_policy(cls, path)

@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import math
-import reprlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..envs.contract.parameters import quote_shortened
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
@@ -190,10 +190,10 @@ def read_artefact(path: Path, problem: Problem) -> Artefact:
     if not isinstance(table, dict) or not all(fits(table.get(key), kind) for key, kind in known.items()):
         raise ValueError(f"{path} is no fitted filter: filtergym advise writes one")
     if table["environment"] != problem.id:
-        raise ValueError(f"{path} is fitted to {table['environment']}, not to {problem.id}")
+        raise ValueError(f"{path} is fitted to {quote_shortened(table['environment'])}, not to {problem.id}")
     fitted = table.get("fitted", True)
     if fitted not in (True, False):
-        raise ValueError(f"{path}: fitted must be true or false, got {reprlib.repr(fitted)}")
+        raise ValueError(f"{path}: fitted must be true or false, got {quote_shortened(fitted)}")
     made = _make_fitted(path, problem, table["filter"], table["values"]) if fitted else None
     return Artefact(table["filter"], made, _read_setup(path, problem, table.get("log")))
 
@@ -250,7 +250,7 @@ def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, f
     if values.keys() != family.limits.keys():
         raise ValueError(
             f"{path} must give {name!r} a number for each of {', '.join(family.limits)}, got "
-            f"{', '.join(values):.200}"
+            f"{quote_shortened([*values])}"
         )
     try:
         values = check_values(values, family)

@@ -2,20 +2,22 @@
 
 import json
 import math
-import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..envs.contract.parameters import quote_shortened
 from ..envs.engine.catalogue import nearest, short_name
 from ..evaluation.competitors.kinds import Kind
-from ..evaluation.storage.files import write_text
+from ..evaluation.storage.files import whole_file
 from ..evaluation.storage.stored import fits, read_json
 from .table import Tunable
 
 FOLDER = Path("tuned")
 """Where tuned values of one's own are kept, below the working directory."""
+PATIENCE = 60.0
+"""s for which a search waits to put its values beside those of another one that ends at the same time."""
 
 
 @dataclass(frozen=True)
@@ -147,13 +149,15 @@ def check_values(values: Any, tunable: Tunable) -> dict[str, float]:
     """
     limits = tunable.limits
     if not fits(values, dict[str, float]) or values.keys() != limits.keys():
-        raise ValueError(f"it must give a number for each of {', '.join(limits)}, got {reprlib.repr(values)}")
+        raise ValueError(
+            f"it must give a number for each of {', '.join(limits)}, got {quote_shortened(values)}"
+        )
     for name, (low, high) in limits.items():
         # Values are stored rounded, so that one at a limit can lie just beyond it.
         beyond = tunable.beyond.get(name, 0.0)
         if not min(low, round_value(low)) - beyond <= values[name] <= max(high, round_value(high)) + beyond:
             raise ValueError(
-                f"{name} must be from {low - beyond:g} to {high + beyond:g}, got {reprlib.repr(values[name])}"
+                f"{name} must be from {low - beyond:g} to {high + beyond:g}, got {quote_shortened(values[name])}"
             )
     found: dict[str, float] = values
     return found
@@ -199,17 +203,12 @@ def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
         outcome: of a search.
         command: that made it.
         folder: of such files.
+
+    Raises:
+        ValueError: if the file cannot be written, or holds something else.
     """
     path = table_path(outcome.environment, folder)
-    existing = path.read_text(encoding="utf-8") if path.exists() else None
-    write_text(path, merge_tables(existing, outcome, command))
-    return path
-
-
-def merge_tables(existing: str | None, outcome: Tuned, command: str) -> str:
-    """JSON text of a table of tuned values with one policy's replaced."""
-    table: dict[str, Any] = json.loads(existing) if existing else {}
-    table[outcome.policy] = {
+    found = {
         "values": outcome.values,
         "scenario": outcome.scenario,
         "validation_cost": outcome.cost,
@@ -218,7 +217,10 @@ def merge_tables(existing: str | None, outcome: Tuned, command: str) -> str:
         "seed": outcome.seed,
         "command": command,
     }
-    return json.dumps(table, indent=1, sort_keys=True) + "\n"
+    with whole_file(path, PATIENCE) as partial:
+        merged = {**read_table(path), outcome.policy: found}
+        partial.write_text(json.dumps(merged, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return path
 
 
 def table_path(id: str, folder: Path = FOLDER) -> Path:

@@ -16,26 +16,50 @@ if (
 
 import importlib
 import os
+import time
 from typing import TYPE_CHECKING, Any
+
+_PATIENCE = 10.0
+"""s that a fork waits for imports of other threads."""
+
+
+def _is_importing() -> bool:
+    """Whether the thread that asks is importing itself."""
+    frame: Any = sys._getframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _half_imported() -> list[str]:
+    """Names of modules whose import has begun and not ended."""
+    modules = list(sys.modules.items())
+    return [n for n, m in modules if getattr(getattr(m, "__spec__", None), "_initializing", False)]
+
+
+def _await_imports() -> None:
+    """Let a fork wait until other threads have imported what they are importing: in the child they are not there, and
+    whoever imports the same would wait for them without end.
+    """
+    until = time.monotonic() + _PATIENCE
+    while not _is_importing() and _half_imported() and time.monotonic() < until:
+        time.sleep(0.002)
 
 
 def _forget_half_imported() -> None:
-    """Forget, in a process that was forked, what another thread was importing: that thread is not here, and whoever
-    imports the same would wait for it without end. It is imported anew, or refused by a library that cannot be.
+    """Forget in a forked process what is half imported even so, and the locks of the import system, which a thread that
+    is not here holds for ever. Such a module is imported anew, or refused by a library that cannot be.
     """
-    frame: Any = sys._getframe()
-    while frame is not None:  # the thread that forked is importing itself, and goes on with it
-        if frame.f_globals.get("__name__") == "importlib._bootstrap":
-            return
-        frame = frame.f_back
-    getattr(importlib._bootstrap, "_module_locks", {}).clear()
-    for name, module in list(sys.modules.items()):
-        if getattr(getattr(module, "__spec__", None), "_initializing", False):
+    if not _is_importing():
+        getattr(importlib._bootstrap, "_module_locks", {}).clear()
+        for name in _half_imported():
             del sys.modules[name]
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_half_imported)
+    os.register_at_fork(before=_await_imports, after_in_child=_forget_half_imported)
 
 from .envs.engine.catalogue import register  # noqa: E402  (its import may be forked, too)
 

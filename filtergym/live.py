@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
+from .envs.contract.parameters import Limits, check
 from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
@@ -56,6 +57,8 @@ def online(
         ValueError: for unknown names, and what needs the truth or later measurements.
     """
     problem = import_problem(env)
+    for what, value in (("regular", regular), ("second_sensor", second_sensor), ("trust", trust)):
+        check(what, value, bool, Limits())
     named = isinstance(policy, str | Path)
     name = str(policy) if named else type(policy).__name__
     maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)

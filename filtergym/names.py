@@ -14,6 +14,7 @@ from .agents.named_policies import find_learned_policy, pretrained_agents, with_
 from .baselines.fitted_filters import SUFFIX, LogSetup, read_artefact
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.contract.model import Model
+from .envs.contract.parameters import quote_shortened
 from .envs.data.recording import Recording
 from .envs.engine.backend import make_model
 from .envs.engine.catalogue import import_task, import_user_module, nearest
@@ -239,11 +240,12 @@ def competitors_of(
         competitors = [competitors]
     if not isinstance(competitors, Mapping | Sequence):
         raise ValueError(
-            f"competitors are a name, a sequence of names, or a mapping from names to policies, got {competitors!r}"
+            "competitors are a name, a sequence of names, or a mapping from names to policies, got "
+            f"{quote_shortened(competitors)}"
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     for name, entry in named.items():
-        if entry != name and _is_competitor(problem, name) and entry != find_competitor(problem, name):
+        if _is_competitor(problem, name) and not _is_same(entry, name, find_competitor(problem, name)):
             raise ValueError(
                 f"{name!r} is the name of what {problem.id} has already: call your own something else"
             )
@@ -253,6 +255,11 @@ def competitors_of(
         else with_normalisation(entry)
         for name, entry in named.items()
     }
+
+
+def _is_same(entry: Any, *known: Any) -> bool:
+    """Whether what a user gives under a name is one of what the name stands for already."""
+    return any(type(entry) is type(one) and bool(entry == one) for one in known)
 
 
 def _is_competitor(problem: Problem, name: str) -> bool:

@@ -9,6 +9,7 @@ import numpy
 
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
+from .envs.contract.parameters import read_numbers
 from .envs.linear.equations import StateSpaceModel, process_noise
 from .envs.linear.inputs import Input
 from .own_drifts import discretise_drift
@@ -142,7 +143,7 @@ def further_arguments(function: Any) -> tuple[str, ...]:
 
 def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:
     """Return finite numbers of a shape, None for any number, or raise ValueError."""
-    array = numpy.asarray(values, dtype=float)
+    array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if not fits or not numpy.isfinite(array).all() or not array.size:
         words = ", ".join("n" if size is None else str(size) for size in shape)

@@ -10,7 +10,7 @@ import numpy
 from . import register_task
 from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
-from .envs.contract.parameters import check_integer
+from .envs.contract.parameters import Limits, check, check_integer, quote_shortened
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition
 from .envs.linear.inputs import Input
@@ -113,8 +113,20 @@ def state_space(
     for parameter in parameters:
         if parameter not in allowed:
             raise nearest("argument of state_space", parameter, allowed)
+    if not isinstance(id, str):
+        raise ValueError(f"an id is a word such as 'mine/Tracker-v0', got {quote_shortened(id)}")
     mean = check_array("mean", mean, (None,))
     n = len(mean)
+    hypotheses, names, units, measured = (
+        _sequence(what, given)
+        for what, given in (
+            ("hypotheses", hypotheses),
+            ("names", names),
+            ("units", units),
+            ("measured", measured),
+        )
+    )
+    check("switching", switching, bool, Limits())
     sensors = _sensors(sensors, (h, R, measured))
     first = {"f": f, "Q": Q, "drift": drift, "diffusion": diffusion, "h": h, "R": R, "sensors": sensors}
     _check_motion(first)
@@ -122,7 +134,7 @@ def state_space(
     rates = [one.interval for one in sensors.values() if one.interval is not None]
     if rates:
         parameters.setdefault("sampling_interval", min(rates))
-    interval = float(parameters.get("sampling_interval", StateSpaceParameters.sampling_interval))
+    interval = float(StateSpaceParameters(**parameters).sampling_interval)
     inputs = _inputs(inputs)
     steps = check_integer("integration_steps", integration_steps, 1)
     around = Surroundings(mean, interval, inputs, steps)
@@ -134,7 +146,7 @@ def state_space(
         )
     world = tuple(make_model(_stack(one, n), around) for one in given)
     filters = world
-    if filter_model:
+    if filter_model is not None:
         filters = tuple(
             make_model(_stack(_replace("filter_model", one, filter_model), n), around) for one in given
         )
@@ -143,10 +155,12 @@ def state_space(
     if len({model.timed for model in (*world, *filters)}) > 1:
         raise ValueError("all models must take the interval, or none: write f(x, dt) and Q(dt) in each")
     count = len(world)
-    names = tuple(names) or tuple(f"x{i + 1}" for i in range(n))
-    units = tuple(units) or ("1",) * n
+    names = names or tuple(f"x{i + 1}" for i in range(n))
+    units = units or ("1",) * n
     if len(names) != n or len(units) != n:
-        raise ValueError(f"names and units must be {n} each, got {names!r} and {units!r}")
+        raise ValueError(
+            f"names and units must be {n} each, got {quote_shortened(names)} and {quote_shortened(units)}"
+        )
     m = world[0].h.size
     counts = [trace("h", one.h, n, None).size for one in sensors.values()] or [m]
     channels = find_channels(sensors, counts, interval)
@@ -159,7 +173,7 @@ def state_space(
         world,
         filters,
         _chain(transition, count),
-        bool(switching),
+        switching,
         mean,
         check_covariance("covariance", covariance, n),
         numpy.full(n, 1.0 / n) if weights is None else check_array("weights", weights, (n,)),
@@ -180,6 +194,16 @@ def state_space(
         setattr(sys.modules[module], name, cls)
     made: type[StateSpace] = cls
     return made
+
+
+def _sequence(what: str, given: Any) -> tuple[Any, ...]:
+    """Return words, or models, as a tuple."""
+    kind, of = (Mapping, "models") if what == "hypotheses" else (str, "words")
+    if isinstance(given, str) or not (
+        isinstance(given, Sequence) and all(isinstance(one, kind) for one in given)
+    ):
+        raise ValueError(f"{what} must be a sequence of {of}, got {quote_shortened(given)}")
+    return tuple(given)
 
 
 def _sensors(
@@ -217,9 +241,11 @@ def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> di
     unused = {*(("h", "R") if own else ("sensors",))}
     unused |= {"f", "Q"} if first["f"] is None else {"drift", "diffusion"}
     known = [name for name in EQUATIONS if name not in unused]
-    unknown = [name for name in part if name not in known]
+    unknown = [name for name in part if name not in known] if isinstance(part, Mapping) else [part]
     if unknown:
-        raise ValueError(f"{what} says {', '.join(known[:-1])} or {known[-1]}, got {unknown[0]!r}")
+        raise ValueError(
+            f"{what} says {', '.join(known[:-1])} or {known[-1]}, got {quote_shortened(unknown[0])}"
+        )
     if "sensors" in part:
         part = {**part, "sensors": replace_sensors(own, part["sensors"])}
     return {**first, **part}
@@ -235,12 +261,16 @@ def _stack(given: dict[str, Any], size: int) -> dict[str, Any]:
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
     """Return inputs by their names, or raise ValueError for what is none."""
-    if isinstance(given, str) or not all(isinstance(name, str) for name in given):
-        raise ValueError(f"inputs must be names, or a mapping from names to Input, got {given!r}")
+    if not isinstance(given, Mapping):
+        given = _sequence("inputs", given)
+    elif not all(isinstance(name, str) for name in given):
+        raise ValueError(
+            f"inputs must be names, or a mapping from names to Input, got {quote_shortened(given)}"
+        )
     found = dict(given) if isinstance(given, Mapping) else {name: Input() for name in given}
     for name, one in found.items():
         if not isinstance(one, Input):
-            raise ValueError(f"the input {name!r} must be an Input, got {one!r}")
+            raise ValueError(f"the input {name!r} must be an Input, got {quote_shortened(one)}")
     return found
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 
+from .envs.contract.parameters import quote_shortened
 from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.linear.sensors import PERIODS, Channel, Sensor
 from .own_equations import Function, check_array, check_covariance, trace
@@ -22,7 +23,7 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
         ValueError: for what is no sensor, or of another name.
     """
     if not isinstance(given, Mapping) or not all(isinstance(one, Sensor) for one in given.values()):
-        raise ValueError(f"sensors must be a mapping from names to Sensor, got {given!r}")
+        raise ValueError(f"sensors must be a mapping from names to Sensor, got {quote_shortened(given)}")
     if {*given} & {*NOISES}:
         raise ValueError(f"sensors cannot be called {' or '.join(NOISES)}, whose noises are others")
     if sensors is not None and not {*given} <= {*sensors}:

@@ -205,7 +205,8 @@ def _decode(path: Path, content: bytes) -> Submission:
     try:
         return msgspec.json.decode(content, type=Submission)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} holds no submission of filtergym: {error}") from error
+        reason = " ".join(str(error).split())  # it may quote the file
+        raise ValueError(f"{path} holds no submission of filtergym: {reason:.300}") from error
 
 
 # --- competitors

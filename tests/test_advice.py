@@ -296,7 +296,8 @@ def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypat
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"environment": "filtergym/UavAutopilot-v0"}, "is fitted to filtergym/UavAutopilot-v0, not to"),
+        ({"environment": "a\nb"}, r"is fitted to 'a\\nb', not to"),
+        ({"environment": "filtergym/UavAutopilot-v0"}, "is fitted to 'filtergym/UavAutopilot-v0', not to"),
         ({"filter": "nobody"}, "has no filter 'nobody' that can be fitted"),
         (
             {"values": {"log10_jerk": 1.0}},

@@ -181,12 +181,22 @@ def stored(tmp_path):
     return store
 
 
+def test_an_observation_that_is_divided_by_zero_is_refused(stored):
+    path = stored()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(np.ones(1, np.float32).tobytes(), bytes(4), 1))
+    with pytest.raises(
+        ValueError, match="is not a learned policy of filtergym: observation_scale must not be zero"
+    ):
+        learned_policy.load_policy(task_class(ID), path)
+
+
 def test_policy_of_another_environment_is_refused(stored):
     from filtergym.agents.learned_policy import load_policy
 
     assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
     path = stored(environment="filtergym/Other-v0")
-    with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
+    with pytest.raises(ValueError, match="was trained on 'filtergym/Other-v0', not on " + ID):
         load_policy(problem_of(ID).task, path)
     fields = [field.name for field in make_model(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))
@@ -197,7 +207,7 @@ def test_policy_of_another_environment_is_refused(stored):
 def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command):
     now = make_model(ID).task.interface
     path = stored(interface=str(now - 1))
-    with pytest.raises(ValueError, match=rf"its interface {now - 1}, now {now}\): train it again"):
+    with pytest.raises(ValueError, match=rf"its interface '{now - 1}', now {now}\): train it again"):
         evaluate(ID, [str(path)], episodes=1)
     code, _, error = command("evaluate", ID, "--policy", path, "--episodes", 1)
     assert code == 2

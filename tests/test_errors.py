@@ -276,3 +276,28 @@ def test_splits_and_seeds_share_no_episode():
     ]
     assert len(set(drawn)) == 3000
     assert episode_seeds("test", 0, 5, first=3) == episode_seeds("test", 0, 8)[3:]
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"progress": [1.0]},
+        {"control": np.eye(2)},
+        {"scenario": np.eye(2)},
+        {"competitors": np.eye(2)},
+        {"competitors": "é" * 500},
+        {"competitors": {"imm": np.eye(2)}},
+        {"backend": np.eye(2)},
+        {"range_sigma": 10**400},
+        {"range_sigma": 1e308},
+        {"env": np.eye(2)},
+    ],
+    ids=lambda odd: " ".join(f"{name} {type(value).__name__}" for name, value in odd.items()),
+)
+def test_odd_arguments_of_an_evaluation_get_one_sentence(odd):
+    given = {"env": ID, "competitors": "imm", "episodes": 1, "horizon": 4, **odd}
+    with pytest.raises(ValueError, match=r".{20}") as error:
+        evaluate(**given)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1000
+    assert "ambiguous" not in str(error.value)  # NumPy's

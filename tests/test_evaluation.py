@@ -2,6 +2,8 @@
 
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -10,7 +12,7 @@ import xarray
 from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.baselines.tuned_values import merge_tables
+from filtergym.baselines.tuned_values import save_tuned
 from filtergym.baselines.tuning import Candidate, Search, episode_costs, geometric_cost, tune
 from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -174,11 +176,15 @@ def test_shipped_values_are_used_unless_there_are_ones_own(tmp_path, monkeypatch
         problem_of(ENV).tuned_values.values("hard-imm")
 
 
-def test_merging_keeps_the_other_policies():
+def test_searches_that_end_together_lose_no_values(tmp_path):
     outcome = tune(problem_of(ENV), "fixed-best", Search(20 * 8 * 100, episodes=8))
-    table = json.loads(merge_tables('{"imm": {"values": {}}}', outcome, "a command"))
-    assert set(table) == {"imm", "fixed-best"}
-    assert math.isfinite(table["fixed-best"]["validation_cost"])
+    names = [f"policy-{i}" for i in range(16)]
+    save = lambda name: save_tuned(replace(outcome, policy=name), "a command", tmp_path)  # noqa: E731
+    with ThreadPoolExecutor(8) as threads:
+        (path,) = set(threads.map(save, names))
+    table = json.loads(path.read_text())
+    assert set(table) == {*names}
+    assert math.isfinite(table["policy-7"]["validation_cost"])
 
 
 def test_tracks_are_kept_of_as_many_episodes_as_are_drawn_in_whatever_pieces(monkeypatch):

@@ -13,12 +13,12 @@ from filtergym.agents.learned_policy import PRETRAINED, load_policy
 from filtergym.agents.settings import read_config
 from filtergym.baselines.fitted_filters import families_of, read_artefact
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.parameters import quote_shortened
 from filtergym.envs.data import foreign_files
 from filtergym.envs.data.foreign_files import (
     open_foreign,
     parse_apart,
     parse_json,
-    quote_shortened,
     read_yaml,
 )
 from filtergym.evaluation.storage.stored import read_json

@@ -358,7 +358,7 @@ def test_a_file_is_an_estimator(stored, command):
 
 
 def test_a_file_is_refused_elsewhere(stored):
-    with pytest.raises(ValueError, match=f"was trained on {RADAR}, not on {FUSION}"):
+    with pytest.raises(ValueError, match=f"was trained on '{RADAR}', not on {FUSION}"):
         filtergym.evaluate(FUSION, [str(stored)], episodes=1)
     with pytest.raises(ValueError, match="does not act: of kind estimator"):
         filtergym.make_policy(RADAR, str(stored))
@@ -367,7 +367,7 @@ def test_a_file_is_refused_elsewhere(stored):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"interface": "1"}, r"its interface 1, now 2\): train it again"),
+        ({"interface": "1"}, r"its interface .1., now 2\): train it again"),
         ({"fields": json.dumps(["innovation_along"])}, "is not a learned policy of filtergym"),
         ({"control": "gain"}, "was trained on other fields"),
     ],

@@ -555,12 +555,17 @@ def test_wrong_arguments_get_one_sentence(name):
         with pytest.raises(ValueError, match=r"x must (be|have)") as error:
             filter.update(4.0, x=value, y=1e4)
         assert len(str(error.value)) < 200
-        with pytest.raises(ValueError, match="time must be finite seconds"):
+        with pytest.raises(ValueError, match=r"time must be (numbers|finite seconds)"):
             filter.update(value, x=1e4, y=1e4)
         with pytest.raises(ValueError, match=r"mean must (be|have)"):
             filter.start(value, COVARIANCE)
         with pytest.raises(ValueError, match=r"tracks are numbers from 0 to 0|cannot start"):
             filter.start(STATE, COVARIANCE, tracks=value if value is not np.inf else "x")
+        with pytest.raises(ValueError, match=r"time must be|each of the two|values are given"):
+            filter.start_from({"time": value, "x": 1e4, "y": 2e4}, value)
+    for what in ("regular", "control", "backend", "tracks"):
+        with pytest.raises(ValueError, match=f"{what}"):
+            filtergym.online(RADAR, name, **{what: np.eye(2)})
     filter.update(4.0, x=1e4, y=2e4)
     with pytest.raises(
         ValueError, match=r"measurements of filtergym/ManeuveringTarget-v0 are at least .* s apart"

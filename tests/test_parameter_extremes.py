@@ -162,6 +162,15 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("UavAutopilot", {"actuator_disturbance": 0.0}),
         ("UavAutopilot", {"gain_decades": 1e6}),
         ("UavAutopilot", {"lift_incidence": -1e6}),
+        ("UavAutopilot", {"sensor_sigmas": (0.5, 1e-6, 0.5), "wide_band_scale": 1e6}),
+        (
+            "UavAutopilot",
+            {"mass": 1e-6, "chord": 1e-6}
+            | dict.fromkeys(("moment_disturbance", "gust_sigma", "actuator_disturbance"), 1e-6),
+        ),
+        ("ManeuveringTarget", {"glint_factor": 1e6}),
+        ("ManeuveringTarget", {"coloured_sigma": (0.0, 1e5)}),
+        ("ManeuveringTarget", {"bias": 1e5}),
         ("UavAutopilot", {"moment_rate": 1e6}),
         (
             "UavAutopilot",
@@ -175,6 +184,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
             },
         ),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
+        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "coloured": 1e5}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
         ("TightlyCoupledNavigation", {"singer_sigma": 1e6}),

@@ -562,6 +562,13 @@ def test_another_interval_than_the_models_is_refused(make, time):
         ({"hypotheses": [{"Q": Q}], "transition": [[0.9, 0.2], [0.5, 0.5]]}, "transition must hold probabilities"),
         ({"horizon": 0}, "horizon must be"),
         ({"orizon": 5}, "did you mean 'horizon'"),
+        ({"Q": [[1.0], [0.5, 1.0]]}, "Q must be numbers, got"),
+        ({"mean": ["x", 1]}, "mean must be numbers, got"),
+        ({"names": 5}, "names must be a sequence of words, got 5"),
+        ({"hypotheses": [5]}, "hypotheses must be a sequence of models"),
+        ({"filter_model": 5}, "filter_model says f, Q, h or R, got 5"),
+        ({"sampling_interval": "x"}, "sampling_interval must be a finite number"),
+        ({"switching": np.eye(2)}, "switching must be True or False"),
     ],
 )  # fmt: skip
 def test_what_is_no_model_is_refused(make, wrong, sentence):

@@ -227,7 +227,7 @@ def test_other_arrays_do_not_hold(edited, command, tmp_path):
 def test_arrays_of_another_environment_are_refused(edited, command):
     other = PRETRAINED / "UavAutopilot-v0" / "bptt-small.safetensors"
     text = refused(command, edited("agent", lambda content: with_agent(content, other)))
-    assert "was trained on filtergym/UavAutopilot-v0" in text
+    assert "was trained on 'filtergym/UavAutopilot-v0'" in text
 
 
 @pytest.mark.parametrize("content", [b"", b"half", b"\xff" * 8, b"\x08" + 7 * b"\0" + b'{"a":{}}'])
@@ -386,6 +386,8 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
+    (tmp_path / "named.json").write_text(json.dumps({"x" * 10_000: 0}))
+    assert len(refused(command, tmp_path / "named.json")) < 1000
     assert "there is no file" in refused(command, tmp_path / "none.json")
     assert "it is no file but a folder, a device or a pipe" in refused(command, "/dev/zero")
 

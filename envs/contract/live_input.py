@@ -1,10 +1,11 @@
 """Measurements that come one by one from outside: values by their names, made into the task's ``Measurement``."""
 
-import reprlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy
+
+from .parameters import quote_shortened, read_numbers
 
 if TYPE_CHECKING:
     from .task import Task
@@ -64,13 +65,10 @@ class LiveInput:
             ValueError: for what is no number, or another shape.
         """
         value: Any = values.get(name)
-        try:
-            array = numpy.asarray(numpy.nan if value is None else value, dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"{name} must be numbers, got {_shortened(value)}") from None
+        array = read_numbers(name, numpy.nan if value is None else value)
         if (numpy.abs(array) > LARGEST).any():
             raise ValueError(
-                f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {_shortened(value)}"
+                f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {quote_shortened(value)}"
             )
         if array.shape == shape:
             array = array[..., None]
@@ -95,10 +93,14 @@ class LiveInput:
 
     def check_names(self, values: Mapping[str, Any], known: Mapping[str, str]) -> None:
         """Raise ValueError for a value of another name."""
+        if not isinstance(values, Mapping):
+            raise ValueError(f"values are given by name, got {quote_shortened(values)}")
         unknown = [name for name in values if name not in known]
         if unknown:
             listed = ", ".join(f"{name} ({text})" for name, text in known.items())
-            raise ValueError(f"unknown value {unknown[0]!r}: {self.task.id} takes {listed or 'no more'}")
+            raise ValueError(
+                f"unknown value {quote_shortened(unknown[0])}: {self.task.id} takes {listed or 'no more'}"
+            )
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Initial estimate of the task's NamedTuple, and memory.
@@ -172,10 +174,5 @@ class LiveInput:
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
 
 
-def _shortened(value: Any) -> str:
-    """Return a value as Python writes it, cut where it is long, also a number of more digits than Python writes."""
-    return reprlib.repr(value if not isinstance(value, int) or abs(value) < 1e300 else float("inf"))
-
-
 def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name}={_shortened(value)}" for name, value in values.items()) or "nothing"
+    return ", ".join(f"{name}={quote_shortened(value)}" for name, value in values.items()) or "nothing"

@@ -11,7 +11,7 @@ was expected.
 """
 
 import dataclasses
-import sys
+import math
 import types
 import typing
 from collections.abc import Sequence
@@ -102,7 +102,7 @@ def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
         _sequence(name, value, typing.get_args(hint), limits)
     elif hint is bool:
         if not isinstance(value, bool):
-            raise ValueError(f"{name} must be True or False, got {value!r}")
+            raise ValueError(f"{name} must be True or False, got {quote_shortened(value)}")
     elif hint is int:
         _integer(name, value, limits)
     elif hint is float:
@@ -128,23 +128,56 @@ def _within(value: float, limits: Limits) -> bool:
     )
 
 
-LARGEST = sys.float_info.max
+LARGEST = 1e60
+"""Of a parameter: its fifth power is a number, too."""
+
+
+def quote_shortened(value: Any, most: int = 80) -> str:
+    """Return a value as Python writes it, on one line and cut where it is long: nobody wants two megabytes."""
+    if isinstance(value, int) and abs(value) >= 10**most:
+        return f"a whole number of {value.bit_length() * math.log10(2.0):,.0f} digits"
+    if isinstance(value, str | bytes | list | tuple):
+        value = value[: most + 1]
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # a whole number of too many digits, inside of something
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
+def read_numbers(name: str, value: Any) -> numpy.ndarray:
+    """Return an array of floats of what a user gave.
+
+    Raises:
+        ValueError: for what is no number, or rows of several lengths.
+    """
+    try:
+        found = numpy.asarray(value)
+        if found.dtype.kind in "iufb" or (found.dtype.kind == "O" and found.size):
+            return found.astype(float)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueError(f"{name} must be numbers, got {quote_shortened(value)}")
 
 
 def _number(name: str, value: Any, limits: Limits) -> None:
     # Compared, not converted: a whole number can be too large for a float.
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
-        raise ValueError(
-            f"{name} must be {f'a finite number {_limits_in_words(limits)}'.strip()}, got {value!r}"
+        stated = f"a finite number {_limits_in_words(limits)}".strip()
+        size = (
+            f" and {LARGEST:g} in size at most"
+            if isinstance(value, int | float) and abs(value) > LARGEST
+            else ""
         )
+        raise ValueError(f"{name} must be {stated}{size}, got {quote_shortened(value)}")
 
 
 def _integer(name: str, value: Any, limits: Limits) -> None:
     is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_whole or not _within(value, limits):
         stated = f" of {_limits_in_words(limits)}" if _limits_in_words(limits) else ""
-        raise ValueError(f"{name} must be an integer{stated}, got {value!r}")
+        raise ValueError(f"{name} must be an integer{stated}, got {quote_shortened(value)}")
 
 
 def check_integer(name: str, value: Any, at_least: int) -> int:
@@ -160,9 +193,11 @@ def check_integer(name: str, value: Any, at_least: int) -> int:
 
 def _word(name: str, value: Any, limits: Limits) -> None:
     if limits.choices and value not in limits.choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, limits.choices))}, got {value!r}")
+        raise ValueError(
+            f"{name} must be one of {', '.join(map(repr, limits.choices))}, got {quote_shortened(value)}"
+        )
     if not isinstance(value, str):
-        raise ValueError(f"{name} must be a word, got {value!r}")
+        raise ValueError(f"{name} must be a word, got {quote_shortened(value)}")
 
 
 _KINDS = {float: "numbers", int: "integers", str: "words"}
@@ -173,25 +208,27 @@ def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: Limits) -> Non
     if not isinstance(value, Sequence) or isinstance(value, str) or (count and len(value) != count):
         kind = _KINDS.get(of[0], "rows")
         raise ValueError(
-            f"{name} must be {f'{count} {kind}' if count else f'a sequence of {kind}'}, got {value!r}"
+            f"{name} must be {f'{count} {kind}' if count else f'a sequence of {kind}'}, got {quote_shortened(value)}"
         )
     for i, item in enumerate(value):
         check(f"{name}[{i}]", item, of[0] if count is None else of[i], limits)
     if limits.ascending and of[0] in (int, float) and value[0] > value[1]:
-        raise ValueError(f"{name} must be in ascending order, got {value!r}")
+        raise ValueError(f"{name} must be in ascending order, got {quote_shortened(value)}")
     if limits.stochastic and of[0] is float and abs(sum(value) - 1.0) > 1e-9:
-        raise ValueError(f"{name} must sum to 1, got {value!r} with sum {sum(value):.12g}")
+        raise ValueError(f"{name} must sum to 1, got {quote_shortened(value)} with sum {sum(value):.12g}")
 
 
 def check_length(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
     """Check the length of a sequence that depends on other parameters."""
     if len(value) != count:
-        raise ValueError(f"{name} must be {count} {what}, got {value!r}")
+        raise ValueError(f"{name} must be {count} {what}, got {quote_shortened(value)}")
 
 
 def square_matrix(name: str, rows: Sequence[Sequence[float]], size: int) -> None:
     """Check the shape of a matrix of transition probabilities that depends on other parameters."""
     if len(rows) != size:
-        raise ValueError(f"{name} must have {size} rows (row = from, column = to), got {rows!r}")
+        raise ValueError(
+            f"{name} must have {size} rows (row = from, column = to), got {quote_shortened(rows)}"
+        )
     for i, row in enumerate(rows):
         check_length(f"{name}[{i}]", row, size)

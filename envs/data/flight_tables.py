@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import numpy
 
+from ..contract.parameters import quote_shortened
 from .foreign_files import (
     MOST_NUMBERS,
     limits,
     open_foreign,
     parse_apart,
     parse_json,
-    quote_shortened,
     read_content,
     refuse_memory,
 )

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters.geodesy import east_north
-from ..contract.parameters import Limits, check
+from ..contract.parameters import Limits, check, quote_shortened
 from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
 from .flight_tables import (
     FLIGHT_SUFFIXES,
@@ -183,12 +183,13 @@ def names_flights(source: Any) -> bool:
     if isinstance(source, str):
         if source.startswith(TRAFFIC):
             return True
-        is_path = bool(suffix_of(Path(source))) or glob.has_magic(source) or _is_folder(Path(source))
+        is_path = bool(suffix_of(Path(source))) or glob.has_magic(source) or is_folder(Path(source))
         return bool(source) and is_path
     return isinstance(source, list | tuple) and len(source) > 0
 
 
-def _is_folder(path: Path) -> bool:
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder of this name; not for a name that no folder can have."""
     try:
         return path.is_dir()
     except (OSError, ValueError):  # a name that no file can have
@@ -239,11 +240,13 @@ def files_of(source: str | Path) -> list[Path]:
         ValueError: for what is no path, and where there are none.
     """
     if not isinstance(source, str | Path):
-        raise ValueError(f"files are named by a path or a pattern such as 'plots/*.csv', got {source!r}")
+        raise ValueError(
+            f"files are named by a path or a pattern such as 'plots/*.csv', got {quote_shortened(source)}"
+        )
     if isinstance(source, str) and source.startswith(TRAFFIC):
         return [_traffic_sample(source.removeprefix(TRAFFIC))]
     path = Path(source)
-    if _is_folder(path):
+    if is_folder(path):
         found = sorted(file for file in path.iterdir() if suffix_of(file))
         if not found:
             raise ValueError(
@@ -252,7 +255,7 @@ def files_of(source: str | Path) -> list[Path]:
         return found
     if glob.has_magic(str(source)) and not path.exists():
         found = sorted(
-            Path(file) for file in glob.glob(str(source), recursive=True) if not _is_folder(Path(file))
+            Path(file) for file in glob.glob(str(source), recursive=True) if not is_folder(Path(file))
         )
         if not found:
             raise ValueError(f"no file matches {str(source)!r}")

@@ -75,14 +75,6 @@ def refuse_memory(what: str) -> ValueError:
     )
 
 
-def quote_shortened(value: Any, most: int = 80) -> str:
-    """Return a value as Python writes it, cut where it is long: nobody wants to be told two megabytes."""
-    if isinstance(value, int) and abs(value) >= 10**most:
-        return f"a whole number of {value.bit_length() * math.log10(2.0):,.0f} digits"
-    text = repr(value if not isinstance(value, str | bytes) else value[: most + 1])
-    return text if len(text) <= most else f"{text[:most]}..."
-
-
 @contextlib.contextmanager
 def open_foreign(path: Path, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
     """Open a file for reading, if what was opened is one and is not too large.

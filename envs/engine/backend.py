@@ -46,7 +46,7 @@ def make_model(
     check("threads", threads, int, Limits(at_least=1))
     xp, device = array_backend(backend, device)
     control = cls.controls[0] if control is None else control
-    if control not in (*cls.controls, *cls.trained_banks):
+    if not isinstance(control, str) or control not in (*cls.controls, *cls.trained_banks):
         raise nearest("control", control, cls.controls)
     task = make_task(cls, scenario, xp, device, **keywords)
     if backend == "compiled" or (backend == "auto" and AVAILABLE):
@@ -75,7 +75,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
         ValueError: for an unknown backend, a device that NumPy does not have, or a device that is not there.
         ImportError: if torch is asked for and not installed.
     """
-    if backend not in BACKENDS:
+    if not isinstance(backend, str) or backend not in BACKENDS:
         raise nearest("backend", backend, BACKENDS)
     if backend != "torch":
         if device not in (None, "cpu"):

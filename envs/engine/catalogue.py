@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from ..contract.failures import own_line
+from ..contract.parameters import quote_shortened
 
 if TYPE_CHECKING:
     from ..contract.task import Task
@@ -72,7 +73,7 @@ class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (a name says what it
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
     """Say which name is unknown and what was probably meant."""
-    return ValueError(f"unknown {kind} {name!r}: {_meant(name, valid)}")
+    return ValueError(f"unknown {kind} {quote_shortened(name)}: {_meant(name, valid)}")
 
 
 def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None) -> str:
@@ -187,7 +188,7 @@ def task_class(id: str) -> "type[Task]":
     """
     if not isinstance(id, str):
         raise ValueError(
-            f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {id!r}"
+            f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {quote_shortened(id)}"
         )
     module, colon, own = id.rpartition(":")
     known = catalogue()

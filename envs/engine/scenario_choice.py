@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy
 
+from ..contract.parameters import quote_shortened
 from ..contract.task import Scenario, Task
 from ..data.flight_tables import FLIGHT_SUFFIXES
 from ..data.flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
@@ -171,7 +172,7 @@ def _read_recording(
     rename: Mapping[str, str] | None,
 ) -> Recording:
     """Read one file."""
-    if not file.is_file():
+    if not file.exists():
         raise ValueError("there is no such file")
     if names_environment(file):
         if truth is not None:
@@ -225,7 +226,8 @@ def find_scenario(
     name = cls.default_scenario if scenario is None else scenario
     if not isinstance(name, str):
         raise ValueError(
-            f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got {name!r}: "
+            f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got "
+            f"{quote_shortened(name)}: "
             f"choose from {', '.join(cls.scenarios)}; a mixture of scenarios is a dictionary of weights"
         )
     if name not in cls.scenarios:

@@ -77,7 +77,7 @@ def check_action(space: gymnasium.Space, action: Any, count: int | None) -> Arra
 
 
 def _action_error(expected: str, action: Array) -> ValueError:
-    shown = numpy.array2string(host_array(action), threshold=8)
+    shown = " ".join(numpy.array2string(host_array(action), threshold=8).split())
     return ValueError(f"expected {expected}, got {action.dtype} of shape {tuple(action.shape)}: {shown}")
 
 

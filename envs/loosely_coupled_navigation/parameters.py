@@ -9,6 +9,10 @@ from ..contract.parameters import TaskParameters, check, field_limits, parameter
 
 AXES = ("x", "y", "z")
 
+MOST_RATIO = 1e15
+"""Of the variance that is gained from one measurement to the next and that of the receiver: a covariance after the
+update holds both. With 1e16 none came out indefinite, with 1e18 some."""
+
 
 @dataclass(frozen=True)
 class LooselyCoupledNavigationParameters(TaskParameters):
@@ -150,6 +154,14 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         if not (self.coloured or self.white_intensity):
             raise ValueError(
                 "coloured and white_intensity must not both be 0: the plain scheme needs a noise"
+            )
+        T = self.sampling_interval
+        growth = (self.white_intensity + 2.0 * self.coloured**2 * min(self.correlation_time, T)) * T
+        if growth > MOST_RATIO * self.receiver_variance:
+            raise ValueError(
+                "sampling_interval, coloured or white_intensity must be smaller, or receiver_intensity larger: from "
+                f"one measurement to the next the error gains {growth / self.receiver_variance:.1e} times the variance "
+                f"of the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
             )
 
     @property

@@ -75,7 +75,7 @@ class PlotInput(LiveInput):
         """Start a track as a log's starts: the second plot, and the difference of both over the time between them."""
         plots = [{name: value for name, value in plot.items() if name != "time"} for plot in (first, second)]
         position = numpy.stack([self._position(plot) for plot in plots])
-        lasted = float(second["time"]) - float(first["time"])
+        lasted = second["time"] - first["time"]
         if not numpy.isfinite(position).all() or not 0.0 < lasted < numpy.inf:
             raise ValueError(
                 f"a track starts from two plots, the second later, got {first!r:.200} and {second!r:.200}"

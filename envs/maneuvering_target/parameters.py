@@ -8,6 +8,9 @@ PLOT_SLOTS = 12
 """Plots of a scan at most, where there is clutter."""
 MOST_FALSE_PLOTS = 3.0
 """In the window on average: one more than there are slots for then comes in one scan of 14,000."""
+LARGEST_ERROR = 1e3
+"""Standard deviations by which a measurement is wrong: filters that take it for an outlier keep covariances positive
+definite up to some 3000 (``filters/contaminated_normal.py``), and a normal number reaches three."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +62,16 @@ class ManeuveringTargetParameters(TaskParameters):
     never)."""
     glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """That both errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
-    glint_factor: float = parameter(5.0, above=0.0)
+    glint_factor: float = parameter(5.0, above=0.0, at_most=LARGEST_ERROR)
     """Their standard deviation over that of the others (ours)."""
-    coloured_sigma: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    coloured_sigma: tuple[float, float] = parameter(
+        (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
+    )
     """Limits of the standard deviation of coloured errors along x and y, first-order Gauss-Markov, beside the white
     ones and in units of theirs; each episode draws its own, and nobody says so (ours; the paper: none)."""
     coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
     """Limits of their correlation time, s; each episode draws its own (ours)."""
-    bias: float = parameter(0.0, at_least=0.0)
+    bias: float = parameter(0.0, at_least=0.0, at_most=LARGEST_ERROR)
     """Constant errors along x and y, in units of the white ones' standard deviations, are drawn within this for each
     episode, and nobody says so (ours; the paper: none)."""
     clutter_density: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)

@@ -153,11 +153,12 @@ class UavAutopilotParameters(TaskParameters):
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """Probability of an episode without dropouts in which all levels and factors are one. Ours."""
 
-    gain_decades: float = parameter(0.5, above=0.0, at_most=8.0)
+    gain_decades: float = parameter(0.5, above=0.0, at_most=4.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the
     circle for every positive scale, so the value is what is useful, and no more, because an agent that explores
-    over decades learns to shun them. The limit is half the digits of a number."""
-    process_decades: float = parameter(1.5, above=0.0, at_most=8.0)
+    over decades learns to shun them. From the smallest scale to the largest the limit is half the
+    digits of a number."""
+    process_decades: float = parameter(1.5, above=0.0, at_most=4.0)
     """Decades by which an action can scale the process noise under control ``noise``. Ours: what levels from 0.2 to
     5 are worth, and a little more."""
     sensor_decades: float = parameter(0.8, above=0.0, at_most=4.0)

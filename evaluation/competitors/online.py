@@ -5,7 +5,6 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 
 import copy
 import importlib.metadata
-import reprlib
 from collections.abc import Callable, Mapping
 from datetime import timedelta
 from typing import Any
@@ -15,7 +14,7 @@ import numpy
 from ...compiler.functions import map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
-from ...envs.contract.parameters import check_integer
+from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
 from ...envs.engine.episode_noise import MeasurementRow
 from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
@@ -148,6 +147,13 @@ class OnlineFilter:
             self.input.check_names(measured, {**self.input.values, "time": "s"})
             if measured.get("time") is None:
                 raise ValueError("each of the two measurements needs its time")
+        times = [self._times(measured["time"]) for measured in (first, second)]
+        if any((time != time[0]).any() for time in times):
+            raise ValueError("several tracks start from two measurements of one time each")
+        first, second = (
+            {**measured, "time": float(time[0])}
+            for measured, time in zip((first, second), times, strict=True)
+        )
         self.start(**self.input.start_from(first, second), time=second["time"])
 
     def update(self, time: Any = None, **values: Any) -> Estimate:
@@ -186,7 +192,7 @@ class OnlineFilter:
         together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
         if not ((at > last).all() or together):
             raise ValueError(
-                f"time must increase: the last measurement was at {_plain(last)} s, got {reprlib.repr(_plain(at))}"
+                f"time must increase: the last measurement was at {_plain(last)} s, got {quote_shortened(_plain(at))}"
             )
         if not together:
             self._check_interval(at - last, at)
@@ -224,7 +230,7 @@ class OnlineFilter:
         before, after = taken[:place], taken[place:]
         if not all((one.time > at).all() for one in after):
             raise ValueError(
-                f"a measurement of several tracks is late for all of them alike, got {reprlib.repr(at.tolist())}"
+                f"a measurement of several tracks is late for all of them alike, got {quote_shortened(at.tolist())}"
             )
         again = [(at, values), *((one.time, one.values) for one in after)]
         if before and (before[-1].time == at).all():
@@ -327,7 +333,7 @@ class OnlineFilter:
             ValueError: for anything else, and for what another filter has returned.
         """
         if not isinstance(state, OnlineState):
-            raise ValueError(f"restore takes what save has returned, got {reprlib.repr(state)}")
+            raise ValueError(f"restore takes what save has returned, got {quote_shortened(state)}")
         if state.owner != self._owner:
             raise ValueError(
                 f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
@@ -388,13 +394,10 @@ class OnlineFilter:
         return self._state
 
     def _times(self, time: Any) -> numpy.ndarray:
-        try:
-            found = numpy.asarray(time, dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            found = numpy.array(numpy.nan)
+        found = read_numbers("time", time)
         if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
             raise ValueError(
-                f"time must be finite seconds, a number or ({self.tracks},) numbers, got {reprlib.repr(time)}"
+                f"time must be finite seconds, a number or ({self.tracks},) numbers, got {quote_shortened(time)}"
             )
         return numpy.broadcast_to(found, (self.tracks,)).copy()
 
@@ -422,7 +425,7 @@ class OnlineFilter:
         if (interval < least).any():
             why = f": the gains of {self.name!r} are made for {usual:g} s and make speeds of noise below"
             raise ValueError(
-                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {reprlib.repr(_plain(at))} s "
+                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {quote_shortened(_plain(at))} s "
                 f"after {_plain(self._running().input['time'])} s{why if share > LEAST_INTERVAL else ''}"
             )
 
@@ -440,7 +443,7 @@ class OnlineFilter:
             which = f" of track {track}" if self.tracks > 1 else ""
             raise ValueError(
                 f"the initial covariance{which} must be symmetric and positive definite, got "
-                f"{reprlib.repr(covariance[..., track].tolist())}"
+                f"{quote_shortened(covariance[..., track].tolist())}"
             )
 
     def _padded(self, part: Any) -> Any:
@@ -460,7 +463,10 @@ class OnlineFilter:
     def _merge(self, begun: OnlineState, tracks: Any) -> OnlineState:
         """Let some tracks begin, and the others go on."""
         chosen = numpy.zeros(self.tracks, dtype=bool)
-        numbers = numpy.asarray(tracks)
+        try:
+            numbers = numpy.asarray(tracks)
+        except ValueError:  # rows of several lengths
+            numbers = numpy.array(None)
         if numbers.dtype.kind not in "iub" or (numbers.dtype.kind == "b") != (
             numbers.shape == (self.tracks,)
         ):
@@ -469,7 +475,7 @@ class OnlineFilter:
             chosen[numbers] = True
         except IndexError:
             raise ValueError(
-                f"tracks are numbers from 0 to {self.tracks - 1}, got {reprlib.repr(tracks)}"
+                f"tracks are numbers from 0 to {self.tracks - 1}, got {quote_shortened(tracks)}"
             ) from None
         old = self._running()
         return old._replace(
@@ -530,6 +536,6 @@ def _supply(given: Mapping[str, Any], late: Mapping[str, Any]) -> dict[str, Any]
 def _numbers(value: Any) -> numpy.ndarray:
     """What a sensor said, as numbers; NaN where it is none, which whoever takes it in says."""
     try:
-        return numpy.asarray(numpy.nan if value is None else value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
+        return read_numbers("it", numpy.nan if value is None else value)
+    except ValueError:
         return numpy.array(numpy.nan)

@@ -12,7 +12,7 @@ import gymnasium
 import numpy
 
 from ...envs.contract.model import Model
-from ...envs.contract.parameters import check_integer
+from ...envs.contract.parameters import check_integer, quote_shortened
 from ...envs.contract.task import Scenario, Task
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import importable_name, nearest, task_class
@@ -50,6 +50,8 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     Raises:
         ValueError: if the competitor cannot act in the control that is demanded, or in none.
     """
+    if control is not None and not isinstance(control, str):  # an array equals no word, and no truth
+        raise nearest("control", control, cls.controls)
     if kind != "policy":
         return cls.controls[0]
     own = getattr(maker, "control", None)
@@ -193,6 +195,8 @@ def run_experiment(
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
             the control.
     """
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress is a function of the measurements done, got {quote_shortened(progress)}")
     plan = plan_of(experiment, competitors)
     workers = check_workers(workers)
     block = block_of(next(iter(plan.models.values())).task.horizon)
@@ -391,7 +395,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     episodes, seed, split, control = (
         experiment.episodes, experiment.seed, experiment.split, experiment.control
     )  # fmt: skip
-    if control is not None and control not in cls.controls:
+    if control is not None and not (isinstance(control, str) and control in cls.controls):
         raise nearest("control", control, cls.controls)
     if not competitors:
         raise ValueError("name at least one policy")

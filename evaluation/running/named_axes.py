@@ -185,7 +185,7 @@ def with_named_axes(
     if model.task.interval is not None:
         elapsed = (
             "time",
-            model.task.interval * times,
+            float(model.task.interval) * times,
             {"units": "s", "long_name": "since the start of the track"},
         )
         dataset = dataset.assign_coords(elapsed=elapsed)

@@ -136,14 +136,20 @@ def _partial(path: Path) -> Path:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
     """Give a new file that takes the place of an old one only when it is complete.
+
+    What is read of the old one in the meantime is what the new one replaces: no other process writes it.
+
+    Args:
+        path: of the file.
+        patience: how long to wait for another process that writes it, s.
 
     Raises:
         ValueError: if it cannot be written.
     """
     partial = _partial(writable_file(path))
-    with _explain_refusals(f"file {path}"), _make_folder(path.parent), _hold_alone(partial):
+    with _explain_refusals(f"file {path}"), _make_folder(path.parent), _hold_alone(partial, patience):
         try:
             yield partial
             partial.replace(os.path.realpath(path))
@@ -152,36 +158,31 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _hold_alone(partial: Path) -> Iterator[None]:
-    """Make a file that nobody else writes, and hold it.
-
-    Raises:
-        ValueError: if another process writes it.
-    """
-    handle = _open_locked(partial)
+def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
+    """Make a file that nobody else writes, and hold it; arguments and errors as of :func:`whole_file`."""
+    handle = _open_locked(partial, time.monotonic() + patience)
     try:
         yield
     finally:
         os.close(handle)
 
 
-def _open_locked(partial: Path) -> int:
-    """Make a file that nobody else writes, and hold it.
-
-    Raises:
-        ValueError: if another process writes it.
-    """
+def _open_locked(partial: Path, until: float) -> int:
+    """Make a file that nobody else writes, and lock it, or try again until a time of the monotonic clock."""
     while True:
         handle = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            if not _lock(handle):
+            if _lock(handle):
+                # Between the two the other one may have moved it into its place.
+                with suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(handle), os.stat(partial)):
+                        return handle
+            elif time.monotonic() >= until:
                 raise ValueError(
                     f"another process writes {partial.name[1:-8]} now: wait until it ends, or write elsewhere"
                 )
-            # Between the two the other one may have moved it into its place.
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle), os.stat(partial)):
-                    return handle
+            else:
+                time.sleep(0.02)
         except BaseException:
             os.close(handle)
             raise

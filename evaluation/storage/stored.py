@@ -1,10 +1,10 @@
 """What was written as JSON is what is read, or is refused."""
 
-import reprlib
 import types
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints, is_typeddict
 
+from ...envs.contract.parameters import quote_shortened
 from ...envs.data import foreign_files
 
 Stored = TypeVar("Stored")
@@ -32,7 +32,7 @@ def restore(cls: type[Stored], values: Any) -> Stored:
         ValueError: if a field is missing, unknown, or not of its declared type.
     """
     if not isinstance(values, dict):
-        raise ValueError(f"expected the fields of a {cls.__name__}, got {reprlib.repr(values)}")
+        raise ValueError(f"expected the fields of a {cls.__name__}, got {quote_shortened(values)}")
     try:
         found = cls(**values)
     except TypeError as error:
@@ -40,7 +40,7 @@ def restore(cls: type[Stored], values: Any) -> Stored:
     for name, hint in get_type_hints(cls).items():
         value = getattr(found, name)
         if not fits(value, hint):
-            raise ValueError(f"{name} must be {getattr(hint, '__name__', hint)}, got {reprlib.repr(value)}")
+            raise ValueError(f"{name} must be {getattr(hint, '__name__', hint)}, got {quote_shortened(value)}")
     return found
 
 

@@ -1,12 +1,12 @@
 """Small datasets as JSON: curves and tracks, for whoever has neither NetCDF nor Python."""
 
-import reprlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy
 import xarray
 
+from ...envs.contract.parameters import quote_shortened
 from .stored import fits
 
 PARTS = ("coords", "variables", "attrs")
@@ -48,7 +48,7 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
         ValueError: if it is none: its parts do not fit together, or hold anything but numbers and words.
     """
     if not isinstance(stored, dict) or not all(isinstance(stored.get(part), dict) for part in PARTS):
-        raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {reprlib.repr(stored)}")
+        raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {quote_shortened(stored)}")
 
     def read(name: str, entry: Any) -> tuple[list[str], numpy.ndarray]:
         if not (isinstance(entry, list) and len(entry) == 2 and fits(entry[0], list[str])):
