@@ -357,7 +357,9 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
     """
     stored = StoredPolicy(path)
     if stored.header["environment"] != cls.id:
-        raise ValueError(f"{path} was trained on {quote_shortened(stored.header['environment'])}, not on {cls.id}")
+        raise ValueError(
+            f"{path} was trained on {quote_shortened(stored.header['environment'])}, not on {cls.id}"
+        )
     return EstimatorMaker(stored.control, stored) if stored.control in cls.trained_banks else stored
 
 

@@ -26,6 +26,7 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.stress.alterations import ALTERATIONS
 from filtergym.evaluation.stress.crash_test import CrashTest, Finding
+
 from filtergym.names import find_competitor
 
 FOLDER = Path(__file__).parent.parent / "docs" / "records" / "stress"

@@ -122,7 +122,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
             measurement: of :meth:`advance`.
         """
         if not self.stated_field:
-            raise NotImplementedError(f"{type(self).__name__} needs reading_deviations, or a stated_field of variances")
+            raise NotImplementedError(
+                f"{type(self).__name__} needs reading_deviations, or a stated_field of variances"
+            )
         return self.xp.sqrt(getattr(measurement, self.stated_field))
 
     def error_cost(self, error: Array) -> Array:

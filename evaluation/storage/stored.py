@@ -40,7 +40,9 @@ def restore(cls: type[Stored], values: Any) -> Stored:
     for name, hint in get_type_hints(cls).items():
         value = getattr(found, name)
         if not fits(value, hint):
-            raise ValueError(f"{name} must be {getattr(hint, '__name__', hint)}, got {quote_shortened(value)}")
+            raise ValueError(
+                f"{name} must be {getattr(hint, '__name__', hint)}, got {quote_shortened(value)}"
+            )
     return found
 
 

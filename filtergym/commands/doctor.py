@@ -52,13 +52,16 @@ def _libraries() -> Iterator[tuple[str, str]]:
     requirements = [Requirement(text) for text in importlib.metadata.requires(PACKAGE) or ()]
     extras = importlib.metadata.metadata(PACKAGE).get_all("Provides-Extra") or ()
     for extra in ("", *(name for name in extras if name not in DEVELOPMENT)):
-        wanted = [
-            each
-            for each in requirements
-            if (each.marker is None) == (not extra) and (not extra or each.marker.evaluate({"extra": extra}))
-        ]
+        wanted = [each for each in requirements if _belongs(each, extra)]
         found = [f"{each.name} {_version(each)}" for each in wanted]
         yield f"[{extra}]" if extra else "libraries", ", ".join(found)
+
+
+def _belongs(requirement: Requirement, extra: str) -> bool:
+    """Whether an extra asks for it; of what is always needed no extra, named by nothing."""
+    if requirement.marker is None:
+        return not extra
+    return bool(extra) and requirement.marker.evaluate({"extra": extra})
 
 
 def _version(wanted: Requirement) -> str:

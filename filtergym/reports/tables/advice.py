@@ -87,7 +87,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
-    rest = []
+    rest: list[Competitor] = []
     for each in advice.competitors:  # a filter that answers as another does in this log needs no row
         same = (c for c in [*keep, *rest] if c[3:7] == each[3:7])
         if each not in keep and (math.isnan(each.log_likelihood) or next(same, None) is None):
