@@ -1,7 +1,7 @@
 """Every ranked competitor as C99: compiled, run over recorded episodes, and compared with what it estimated itself.
 
-A line for each: operations and bytes of state in double; bytes of the source, of code and constants as ``-Os`` makes them
-of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
+A line for each: operations and bytes of state in double; bytes of the source, of code and constants as ``-Os`` makes
+them of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
 standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM
 makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written says why.
 Times are of processor time, the least of several runs.
