@@ -131,6 +131,8 @@ def align(inertial: Any, fixes: Any, standing: float = 0.2, moving: float = 2.0)
     check_rest(bias.to_numpy(), numpy.array([forward, right, down]))
     inertial = inertial[(inertial.index >= begin) & (inertial.index <= fixes.index[-1])].copy()
 
+    if not len(inertial):
+        raise ValueError("the IMU says nothing between the standstill and the last fix")
     first = fixes.iloc[int(numpy.argmax(speed > moving))]
     before = inertial.index < first.name
     turned = numpy.trapezoid(inertial.gyro_z[before] - bias.gyro_z, inertial.index[before])
