@@ -261,9 +261,8 @@ def _stack(given: dict[str, Any], size: int) -> dict[str, Any]:
 
 def _inputs(given: Mapping[str, Input] | Sequence[str]) -> dict[str, Input]:
     """Return inputs by their names, or raise ValueError for what is none."""
-    if not isinstance(given, Mapping):
-        given = _sequence("inputs", given)
-    elif not all(isinstance(name, str) for name in given):
+    is_list = isinstance(given, Mapping | Sequence) and not isinstance(given, str)
+    if not is_list or not all(isinstance(name, str) for name in given):
         raise ValueError(
             f"inputs must be names, or a mapping from names to Input, got {quote_shortened(given)}"
         )

@@ -717,7 +717,7 @@ def test_wrong_tables_are_one_sentence(case, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("empty.csv", b"", "it has the columns none"),
+        ("empty.csv", b"", "it is empty: a recording needs a line of columns"),
         ("binary.csv", b"\xff\xfe\x00\x01" * 9, "it is no text in UTF-8"),
         ("empty.nc", b"", "it is empty"),
         ("binary.nc", b"\x00\x01" * 99, "it is no NetCDF"),

@@ -8,6 +8,7 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.functions import map_arrays
 from filtergym.evaluation.stress.alterations import ALTERATIONS, EVERY, SETTLED
 from filtergym.evaluation.stress.crash_test import CrashTest
+from own_models import forget
 
 from filtergym import state_space
 
@@ -145,7 +146,8 @@ UNSCENTED_MISTAKES = ("points too close", "weights do not sum to one", "no angle
 def radar():
     """The crash test of the model, nothing altered."""
     problem = Problem.of(state_space("tests/Radar-v0", **MODEL))
-    return CrashTest(problem.experiment(None, 32), 0, None, [UNALTERED._replace(length=80)])
+    yield CrashTest(problem.experiment(None, 32), 0, None, [UNALTERED._replace(length=80)])
+    forget("tests/Radar-v0")
 
 
 def unaltered(test, maker):

@@ -165,11 +165,8 @@ def _number(name: str, value: Any, limits: Limits) -> None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
         stated = f"a finite number {_limits_in_words(limits)}".strip()
-        size = (
-            f" and {LARGEST:g} in size at most"
-            if isinstance(value, int | float) and abs(value) > LARGEST
-            else ""
-        )
+        is_too_large = isinstance(value, int | float) and abs(value) > LARGEST and _within(value, limits)
+        size = f" and {LARGEST:g} in size at most" if is_too_large else ""
         raise ValueError(f"{name} must be {stated}{size}, got {quote_shortened(value)}")
 
 

@@ -179,7 +179,7 @@ class LevelBank(Steerable["UavAutopilot", Measurement, Levels]):
         self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
         self.settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0, **dict.fromkeys(sensors, 1.5)}
-        heights, designed = numpy.log(levels) / math.log(levels[-1]), numpy.arange(each) == 0
+        heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
         self.raised = constant(raised)[:, :, None]
         """By how much the first two settings multiply each weight, logarithmically, ``(2, H, 1)``."""

@@ -152,9 +152,11 @@ def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
     with _explain_refusals(f"file {path}"), _make_folder(path.parent), _hold_alone(partial, patience):
         try:
             yield partial
-            partial.replace(os.path.realpath(path))
-        finally:
+        except BaseException:
             partial.unlink(missing_ok=True)
+            raise
+        # From here on a file of this name is of whoever writes next.
+        partial.replace(os.path.realpath(path))
 
 
 @contextmanager

@@ -35,6 +35,8 @@ def protocol_sentences(results: Sequence[Result]) -> list[str]:
         results: as of :func:`outcome_sentences`.
     """
     records = [result.records[0] for result in results if result.default or not _any_default(results)]
+    if not records:
+        return []
     episodes = sorted({record.episodes for record in records})
     first = records[0]
     each = " to ".join(f"{number:,}" for number in dict.fromkeys((episodes[0], episodes[-1])))
