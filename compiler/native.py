@@ -106,8 +106,8 @@ HOT = 2_000_000
 """Lanes after which a program is worth the time that optimisation takes: three to five times that of the quick setting,
 for code that takes up to a third less. Both are in proportion to the program's length, so the lanes are not."""
 IN_LOOPS = 10
-"""How many times sooner that is so where the quick code is loops, which take 1.4 to 2.2 times as long: by then they have
-lost about the time in which a straight line is compiled, and whoever stops just before or goes on loses no more."""
+"""How many times sooner that is so where the quick code is loops, which take 1.4 to 2.2 times as long: by then they
+have lost about the time in which a straight line is compiled, and whoever stops or goes on loses no more."""
 LONG, LONGEST = 20_000, 100_000
 """Steps of a program from which on optimisation saves nothing, because its numbers do not fit into the nearest caches;
 and from which on a straight line saves nothing either, because its code does not."""
