@@ -138,7 +138,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     for name in names:
         if name.startswith(GATED) and is_module(name.removeprefix(GATED)):
             raise ValueError(f"{name!r} acts in this process, beside the truth: an estimator can be isolated")
-    prefixes = (EXEC, ISOLATED, GATED)
+    prefixes = (EXEC, FILE, ISOLATED, GATED)
     return [ISOLATED + name if is_module(name) and not name.startswith(prefixes) else name for name in names]
 
 

@@ -5,9 +5,7 @@ the fields of parameters and measurement, the scenarios' descriptions, the first
 and what references know.
 """
 
-import ast
 import inspect
-import textwrap
 import typing
 from typing import Any
 
@@ -15,7 +13,7 @@ from filtergym.baselines.problem import Problem
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.parameters import Limits, field_limits
-from filtergym.envs.contract.task import Task
+from filtergym.envs.contract.task import Task, field_texts
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import nearest
 from filtergym.papers.grid import markdown_table
@@ -26,20 +24,8 @@ PARTS_SHOWN = 4
 
 def field_documentation(cls: type) -> dict[str, str]:
     """Docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
-    found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if not inspect.get_annotations(base) or base.__module__ in ("builtins", "typing"):
-            continue
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        assert isinstance(definition, ast.ClassDef)
-        for statement, after in zip(definition.body, [*definition.body[1:], None], strict=True):
-            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-                continue
-            text = ""
-            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                text = " ".join(str(after.value.value).split())
-            found[statement.target.id] = text.replace("``", "`")
-    return found
+    texts = (item for base in reversed(cls.__mro__) for item in field_texts(base).items())
+    return {name: text.replace("``", "`") for name, text in texts}
 
 
 def measurement_class(cls: type[Task]) -> Any:

@@ -346,15 +346,15 @@ def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
             yield prefix + name, value
 
 
-def field_words(cls: type) -> dict[str, str]:
-    """What a NamedTuple's text says below each of its fields; nothing where there is no text."""
+def field_texts(cls: type) -> dict[str, str]:
+    """What the text of a class says below each of its own fields, in one line; nothing where there is no text."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
         return {}
     lines = tree.body if isinstance(tree, ast.ClassDef) else []
     return {
-        field.target.id: _without_shapes(below.value.value)
+        field.target.id: " ".join(below.value.value.split())
         for field, below in pairwise(lines)
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
@@ -362,6 +362,9 @@ def field_words(cls: type) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _without_shapes(text: str) -> str:
-    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
-    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")
+def field_words(cls: type) -> dict[str, str]:
+    """The same without shapes such as ``(2, N)``, which are those of many tracks."""
+    return {
+        name: re.sub(r"(, |^)``\([^`]*\)``\.?", "", text).replace("`", "")
+        for name, text in field_texts(cls).items()
+    }

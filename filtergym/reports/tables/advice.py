@@ -89,8 +89,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     room = MOST_ROWS - len(keep)
     rest: list[Competitor] = []
     for each in advice.competitors:  # a filter that answers as another does in this log needs no row
-        same = (c for c in [*keep, *rest] if c[3:7] == each[3:7])
-        if each not in keep and (math.isnan(each.log_likelihood) or next(same, None) is None):
+        if each not in keep and not any(_answers_alike(each, other) for other in [*keep, *rest]):
             rest.append(each)
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
@@ -123,6 +122,12 @@ def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
 def price_cells(price: Mapping[str, int] | None) -> tuple[str, ...]:
     """Cells of a price, in the order of ``PRICES``."""
     return tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
+
+
+def _answers_alike(one: Competitor, other: Competitor) -> bool:
+    """Whether two filters say the same of every number of a log: likelihoods that are not known are not the same."""
+    compared = "log_likelihood", "gain", "difference", "prediction"
+    return all(getattr(one, name) == getattr(other, name) for name in compared)
 
 
 def reading_lines(recording: Recording) -> Iterator[str]:
@@ -294,13 +299,17 @@ def verdict(advice: Advice) -> str:
         f"same measurements, {where}."
     )
     if one.relative_error.low <= 0.0 <= one.relative_error.high:
-        costs = [advice.prices[each] for each in (rival, one.name)]
+        costs = _operations(advice, rival, one.name)
+        is_dearer = advice.prices.operations(rival) > advice.prices.operations(one.name)
         text += " The difference may be chance"
-        if costs[0] and costs[1] and costs[0]["operations"] > costs[1]["operations"]:
-            text += f"; {rival} takes {costs[0]['operations']:,} operations an update for {costs[1]['operations']:,}."
-        else:
-            text += f": {rival} is good enough."
+        text += f"; {rival} {costs}." if costs and is_dearer else f": {rival} is good enough."
     return text
+
+
+def _operations(advice: Advice, name: str, other: str) -> str:
+    """What an update of a filter takes beside another's; nothing where one of them is not known."""
+    one, two = (advice.prices.operations(each) for each in (name, other))
+    return f"takes {one:,.0f} operations an update for {two:,.0f}" if max(one, two) < math.inf else ""
 
 
 def _amount(advice: Advice, relative: Estimate) -> str:
@@ -406,13 +415,10 @@ def _dearer(advice: Advice) -> Iterator[str]:
     if advice.dearer is None or math.isnan(advice.dearer[1].value):
         return
     name, gain = advice.dearer
-    one, other = (advice.prices[each] for each in (advice.advised.name, name))
-    costs = ""
-    if one is not None and other is not None:
-        costs = f" and takes {other['operations']:,} operations an update for {one['operations']:,}"
+    costs = _operations(advice, name, advice.advised.name)
     yield (
         f"{name} is likelier where filters were chosen: it would bring {_interval(gain, '+.3f')} nats per measurement"
-        f"{costs}."
+        f"{' and ' * bool(costs)}{costs}."
     )
 
 
