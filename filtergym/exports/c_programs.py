@@ -39,20 +39,24 @@ static long number_of(const char *name) {{
     return place == NULL ? 0 : strtol(place + strlen(name), NULL, 10);
 }}
 
-/* What was not received comes as NaN; the filter weighs it by its availability, and any number will do. */
-static void clear_missing(double *row) {{
+/* What was not received comes as NaN. In its place stands what the sensor said last, zero before: an agent may be
+   shown the reading that a sensor holds, and a filter weighs the number by its availability. */
+static void hold_missing(double *row, double *last) {{
     static const int available[] = {{{available}-1}};
     int i, missing = 0;
     for (i = 0; available[i] >= 0; ++i) missing |= !(row[available[i]] > 0.0);
-    for (i = 0; missing && i < COLUMNS - {initial}; ++i)
-        if (row[i] != row[i]) row[i] = 0.0;
+    for (i = 0; i < COLUMNS - {initial}; ++i)
+        if (row[i] == row[i])
+            last[i] = row[i];
+        else if (missing)
+            row[i] = last[i];
 }}
 
 /* Answers every measurement of some tracks until there are no more. */
 static int serve(void) {{
     const long tracks = number_of("\\"tracks\\": ");
     {own}_state *states;
-    double *rows;
+    double *rows, *last;
     long t;
     int i, j;
     if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
@@ -65,7 +69,8 @@ static int serve(void) {{
     }}
     states = malloc((size_t)tracks * sizeof *states);
     rows = malloc((size_t)tracks * (COLUMNS + ANSWER) * sizeof *rows);
-    if (states == NULL || rows == NULL) return 2;
+    last = calloc((size_t)tracks * (COLUMNS - {initial}), sizeof *last);
+    if (states == NULL || rows == NULL || last == NULL) return 2;
     puts("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"}}");
     fflush(stdout);
     if (fread(rows, {initial} * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
@@ -79,7 +84,7 @@ static int serve(void) {{
         for (t = 0; t < tracks; ++t) {{
             {own}_measurement measurement;
             {own}_estimate estimate;
-            clear_missing(rows + t * (COLUMNS - {initial}));
+            hold_missing(rows + t * (COLUMNS - {initial}), last + t * (COLUMNS - {initial}));
             set_measurement(&measurement, rows + t * (COLUMNS - {initial}));
             if ({own}_update(&states[t], &measurement, &estimate) >= {upper}_REJECTED) {{
                 for (i = 0; i < ANSWER; ++i) *answer++ = (double)NAN;
@@ -94,6 +99,7 @@ static int serve(void) {{
     }}
     free(states);
     free(rows);
+    free(last);
     return 0;
 }}
 

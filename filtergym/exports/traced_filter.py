@@ -194,7 +194,9 @@ def steps_of(
             "run as arrays"
         )
     steered = steer(Model(traced, control), policy)
-    return FilterSteps(steered, None, steered.decider), network
+    # Where a field says by its name what is received, the program around the filter puts a number there.
+    masked = None if traced.world.received_field else functools.partial(clear_missing, traced)
+    return FilterSteps(steered, masked, steered.decider), network
 
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
