@@ -12,6 +12,7 @@ from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import read_recording
 from filtergym.evaluation.competitors.kinds import kind_of
+from filtergym.evaluation.competitors.online_state import History
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
 
@@ -545,6 +546,37 @@ def test_a_state_goes_back_to_the_filter_that_it_is_of():
     with pytest.raises(TypeError, match="a running filter cannot be copied or pickled: make another"):
         pickle.dumps(filter)
     filter.restore(pickle.loads(pickle.dumps(filter.save())))
+
+
+FORGED = {
+    "filter": [None, 5, (), np.zeros(3)],
+    "input": [None, 5, {}, {"time": np.zeros(1)}, {"time": np.full(1, np.nan), "count": np.zeros(1)}],
+    "fresh": [None, "x", np.ones(7, dtype=bool)],
+    "measurements": [None, -1, "x", 1.5],
+    "too_late": [None, "x"],
+    "history": [None, (), 5],
+}
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt"])
+def test_a_forged_state_is_refused_in_a_sentence_and_the_filter_goes_on(name):
+    filter, other = (filtergym.online(RADAR, name, lag=3) for _ in range(2))
+    for each in (filter, other):
+        each.start(STATE, COVARIANCE)
+        each.update(10.0, x=20310.0, y=30640.0)
+    saved = filter.save()
+    taken = saved.history.taken[0]
+    histories = [History((one,)) for one in (None, 5, taken._replace(before=None), taken._replace(time="x"))]
+    parts = {**FORGED, "history": [*FORGED["history"], *histories]}
+    if name == "bptt":
+        parts |= {"policy": [5, "x"]}
+    for part, values in parts.items():
+        for value in values:
+            with pytest.raises(ValueError, match="cannot go on from this state, which is not what save has"):
+                filter.restore(saved._replace(**{part: value}))
+    one, two = (each.update(20.0, x=20200.0, y=30700.0) for each in (filter, other))
+    np.testing.assert_array_equal(one.mean, two.mean)
+    np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
 @pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt-small"])
