@@ -277,6 +277,8 @@ def test_the_example_of_the_page_prints_what_the_page_says(capsys):
         (lambda f: f.update(x=1.0, y=2.0), "has not been started: call start first"),
         (lambda f: f.start(STATE), "needs covariance at the start, finite, got mean="),
         (lambda f: f.start(STATE[:3], COVARIANCE), r"mean must have shape \(4,\), got \(3,\)"),
+        (lambda f: f.start(5.0, COVARIANCE), r"mean must have shape \(4,\), got \(\)"),
+        (lambda f: f.start(STATE, COVARIANCE[0, 0]), r"covariance must have shape \(4, 4\), got \(\)"),
         (lambda f: f.start(STATE, COVARIANCE, position=3), "unknown value 'position'"),
         (lambda f: f.start(STATE, COVARIANCE, time=np.nan), "time must be finite seconds"),
         (lambda f: f.update(1.0, X=1.0), r"unknown value 'X': .* takes x \(m, east"),
@@ -546,6 +548,16 @@ def test_a_state_goes_back_to_the_filter_that_it_is_of():
     with pytest.raises(TypeError, match="a running filter cannot be copied or pickled: make another"):
         pickle.dumps(filter)
     filter.restore(pickle.loads(pickle.dumps(filter.save())))
+
+
+def test_a_number_is_no_vector_of_equal_ones_and_one_of_each_track_no_vector():
+    filter, axes = filtergym.online(LOOSE, "plain-reduced", tracks=2, axes=3), 3
+    filter.start(np.zeros(axes), np.eye(axes))
+    for wrong in (5.0, [1.0, 2.0], np.zeros((axes, 3))):
+        with pytest.raises(ValueError, match=r"ins must have shape \(3,\), or \(..., 2\) for 2 tracks, got"):
+            filter.update(ins=wrong)
+    filter.update(ins=np.zeros(axes))
+    filter.update(ins=np.zeros((axes, 2)))
 
 
 FORGED = {
