@@ -185,6 +185,8 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "coloured": 1e5}),
+        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "drift": 1e6}),
+        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "receiver_factor": (1e-6, 1e-6)}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
         ("TightlyCoupledNavigation", {"singer_sigma": 1e6}),
