@@ -190,6 +190,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
         ("TightlyCoupledNavigation", {"singer_sigma": 1e6}),
+        ("TightlyCoupledNavigation", {"gravity": 1e6, "initial_attitude_sigma": 180.0}),
         ("TightlyCoupledNavigation", {"reset_acceleration_sigma": 1e6}),
         ("TightlyCoupledNavigation", {"increment_sigma": 1e6, "initial_velocity_sigma": 1e6}),
     ],
