@@ -201,6 +201,40 @@ def test_what_no_filter_can_answer_is_refused(environment, parameters):
     assert caught.type is ValueError, "not one of NumPy or SciPy, which names no parameter"
 
 
+def deviations(one, other):
+    """Largest difference of means in standard deviations, of two runs."""
+    return max(
+        float(np.max(np.abs(x - y) / np.sqrt(np.einsum("iin->in", P))))
+        for (x, P), (y, _) in zip(one, other, strict=True)
+    )
+
+
+def flown(backend, initial_sigmas):
+    """Means and covariances of an aircraft whose elevator may be anywhere at the start, in closed loop."""
+    keywords = {"control": "mode", "scenario": "gust-front", "horizon": 60, "decision_interval": 1}
+    model = make_model(
+        "filtergym/UavAutopilot-v0", backend=backend, initial_sigmas=initial_sigmas, **keywords
+    )
+    lanes = Lanes(model, 3)
+    for lane in range(3):
+        lanes.seed(lane, np.random.default_rng(lane))
+    lanes.restart()
+    rng, found = np.random.default_rng(0), []
+    for step in range(DECISIONS):
+        for own, _ in lanes.decide(actions(model.action_space, rng, step)):
+            found.append((np.array(model.mean(own)), np.array(model.covariance(own))))
+    return found
+
+
+def test_backends_differ_by_what_the_last_digit_of_a_parameter_makes():
+    """Where the loop is ill-conditioned they differ by more than rounding: by no more than NumPy from itself."""
+    sigmas = (1.0, 1.0, 1.0, 1e6, 1.146)
+    own = flown("numpy", sigmas)
+    beside = flown("numpy", tuple(float(np.nextafter(sigma, np.inf)) for sigma in sigmas))
+    assert deviations(own, beside) > 1e-4
+    assert deviations(own, flown("compiled", sigmas)) < 10.0 * deviations(own, beside)
+
+
 @pytest.mark.parametrize(("control", "intensity"), [("mode", 0.0), ("weights", 1e-300)])
 def test_a_scheme_that_knows_no_noise_is_not_certain(control, intensity):
     """Of LooselyCoupledNavigation, whose plain scheme knows the white noise alone."""
