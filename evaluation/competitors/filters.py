@@ -316,7 +316,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def feedback(self, state: Checked, measurement: Any) -> Array | None:
         """What a program reports, where that is a number and the episode not lost; else what the estimate says."""
-        own = self.own.feedback(None, measurement) if isinstance(self.own, HeldInPython) else None
+        own = self.own.feedback(state.own, measurement) if isinstance(self.own, HeldInPython) else None
         if own is None:
             return None
         usable = numpy.isfinite(own).all(axis=0) & (state.fault == 0.0)

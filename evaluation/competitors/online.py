@@ -368,7 +368,7 @@ class OnlineFilter:
             self._resume(one)
             check_integer("measurements", one.measurements, 0)
             check_integer("too_late", one.too_late, 0)
-            if numpy.shape(one.fresh) != (self.tracks,):
+            if numpy.asarray(one.fresh).shape != (self.tracks,):
                 raise ValueError(f"fresh must say which of {self.tracks} tracks have just begun")
             self._check_input(one.input)
             if not self.model.filter.in_python:
