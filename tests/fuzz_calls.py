@@ -213,8 +213,13 @@ def call_online(rng: random.Random) -> None:
         check_estimate(filter.predict(rng.choice(ODD)))
     else:
         first, second = {"time": 0.0, "x": 2e4, "y": 3e4}, {"time": 4.0, "x": 2e4, "y": 3e4}
-        if rng.random() < 0.4:
+        chance = rng.random()
+        if chance < 0.2:
             filter.restore(rng.choice(ODD))
+        elif chance < 0.6:
+            saved = filter.save()
+            filter.restore(saved._replace(**{rng.choice(saved._fields): rng.choice(ODD)}))
+            check_estimate(filter.update(5.0, x=20310.0, y=30640.0))
         else:
             filter.start_from(mix(first, rng), rng.choice((second, rng.choice(ODD))))
 

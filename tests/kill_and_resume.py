@@ -3,7 +3,7 @@
 ``python tests/kill_and_resume.py SECONDS [SEED] [COMMAND ...]`` takes each command in turn: once undisturbed, then
 interrupted by SIGINT, SIGTERM and SIGKILL until the seconds are over, then left alone. What it prints and writes must
 be equal, but for lines that tell times, and nothing unfinished be left. It says how often each was killed, and how
-many kept parts the last attempt used.
+many kept parts the last attempt used; ``advise`` and ``export``, which take seconds, keep none and begin anew.
 """
 
 import os

@@ -336,9 +336,10 @@ class OnlineFilter:
         """
         if not isinstance(state, OnlineState):
             raise ValueError(f"restore takes what save has returned, got {quote_shortened(state)}")
-        if state.owner != self._owner:
+        if not isinstance(state.owner, tuple) or state.owner != self._owner:
+            owner = ", ".join(map(str, state.owner)) if isinstance(state.owner, tuple) else "no filter"
             raise ValueError(
-                f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
+                f"this state is of {quote_shortened(owner or 'no filter')}, and the filter is {', '.join(self._owner)}"
             )
         state = state if self._lag else state._replace(history=History())
         kept = None if self._state is None else self._snapshot()
