@@ -3,7 +3,7 @@ filter that is told the true model.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy
@@ -20,8 +20,8 @@ from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
 
-SENSOR_NOISE = "_noise"
-"""Ends the name of a factor on R of a sensor."""
+NOISE = "_noise"
+"""Ends the name of a factor on R of a sensor, or on a source of Q."""
 UNCERTAIN = 1e-9
 """Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
 
@@ -85,16 +85,21 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         task: the problem.
         process_noise: factor on Q.
         measurement_noise: factor on R.
-        **sensor_noises: factors on R of some sensors, by their names with ``_noise``.
+        **noises: factors on some sources of Q, and on R of some sensors, by their names with ``_noise``.
     """
 
     def __init__(
-        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
         self.equations = task.believed[0]
         self.factor = process_noise
-        self.R = self.equations.sensor_noise(measurement_noise, _by_sensor(sensor_noises))
+        self.of_sources, of_sensors = _split(task, noises)
+        self.R = self.equations.sensor_noise(measurement_noise, of_sensors)
+
+    def process_noise(self, mean: Array, measurement: Measurement) -> Array:
+        """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
+        return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
     def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
@@ -103,7 +108,7 @@ class Extended(Filter[StateSpace, Measurement, Track]):
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
         mean, carried = self.equations.carry(state.mean, state.covariance, given.measurement)
-        Q = self.factor * self.equations.process_noise(mean, given.measurement)
+        Q = self.process_noise(mean, given.measurement)
         result = _update(self.equations, mean, carried + Q, self.R, given.measurement, self.xp)
         return Track(
             result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
@@ -121,9 +126,9 @@ class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`."""
 
     def __init__(
-        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
-        super().__init__(task, process_noise, measurement_noise, **sensor_noises)
+        super().__init__(task, process_noise, measurement_noise, **noises)
         usual = task.definition.usual_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
@@ -138,18 +143,24 @@ class Unscented(Extended):
             state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
         )
         spread = spread + self.equations.input_noise(state.mean, measurement)
-        Q = self.factor * self.equations.process_noise(mean, measurement)
+        Q = self.process_noise(mean, measurement)
         own = self.equations
-        z, h, near = _numbers(measurement, self.xp), own.measure, own.measure(mean)
+        z, near = _numbers(measurement, self.xp), own.measure(mean, measurement)
+
+        def h(x: Array) -> Array:
+            return own.measure(x, measurement)
 
         def h_near(x: Array) -> Array:
             """Measurements of sigma points, angles near that of the mean."""
-            return near[:, None] + own.subtract(own.measure(x), near[:, None])
+            return near[:, None] + own.subtract(h(x), near[:, None])
 
         if own.wraps:
-            z, h = near + own.subtract(z, near), h_near
+            z = near + own.subtract(z, near)
+        R = self.R if own.model.D is None else self.R + own.measured_input_noise(mean, measurement)
         gates = own.within_gates if own.gated else None
-        result = unscented_update(mean, spread + Q, z, h, self.R, measurement.available, gates)
+        result = unscented_update(
+            mean, spread + Q, z, h_near if own.wraps else h, R, measurement.available, gates
+        )
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 
@@ -157,11 +168,11 @@ class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
     def __init__(
-        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **sensor_noises: Any
+        self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
         factors = process_noise, measurement_noise
-        self.bank = HypothesisBank(task, "evidence", *factors, **_by_sensor(sensor_noises))
+        self.bank = HypothesisBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Mixture:
         """Start where everyone starts."""
@@ -216,18 +227,35 @@ class KnownModel:
         return *after, after, _likelihood(chosen, measurement.available, xp)
 
 
-def _by_sensor(noises: Mapping[str, Any]) -> dict[str, Any]:
-    """Factors by the names of the sensors."""
-    return {name.removesuffix(SENSOR_NOISE): factor for name, factor in noises.items()}
+def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Factors by the names of the sources of Q, and by those of the sensors.
+
+    Raises:
+        ValueError: for what is neither.
+    """
+    named = {name.removesuffix(NOISE): factor for name, factor in noises.items()}
+    sources = task.definition.filters[0].sources
+    known = [*sources, *(channel.name for channel in task.definition.channels)]
+    unknown = [name for name in named if name not in known]
+    if unknown:
+        raise ValueError(f"noises are of {', '.join(known)}, got {unknown[0]!r}")
+    of_sources = {name: factor for name, factor in named.items() if name in sources}
+    return of_sources, {name: factor for name, factor in named.items() if name not in sources}
 
 
 def _scales(task: type[StateSpace]) -> dict[str, tuple[float, float, float]]:
     """What is tuned: lower limit, value without tuning, upper limit."""
-    channels = task.definition.channels
-    noises = (
-        [channel.name + SENSOR_NOISE for channel in channels] if len(channels) > 1 else ["measurement_noise"]
-    )
-    return {"log10_process_noise": (-4.0, 0.0, 4.0), **{f"log10_{name}": (-2.0, 0.0, 2.0) for name in noises}}
+
+    def names(of: Iterable[str], else_all: str) -> list[str]:
+        several = [name + NOISE for name in of]
+        return several if len(several) > 1 else [else_all]
+
+    process = names(task.definition.filters[0].sources, "process_noise")
+    sensors = names([channel.name for channel in task.definition.channels], "measurement_noise")
+    return {
+        **{f"log10_{name}": (-4.0, 0.0, 4.0) for name in process},
+        **{f"log10_{name}": (-2.0, 0.0, 2.0) for name in sensors},
+    }
 
 
 def state_space_baselines(task: type[StateSpace]) -> Baselines:

@@ -141,7 +141,9 @@ def _predict(
     rows += [measurement.interval[None]] if model.timed else []
     rows += [measurement.inputs] if definition.inputs else []
     given = numpy.concatenate([numpy.reshape(row, (len(row), -1)) for row in rows])
-    predicted = model.h.value(model.f.value(given, numpy), numpy).reshape(-1, *mean.shape[1:])
+    moved = model.f.value(given, numpy)
+    known = numpy.concatenate([moved, given[len(given) - model.h.given :]])
+    predicted = model.h.value(known, numpy).reshape(-1, *mean.shape[1:])
     measured = numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
     for channel in definition.channels:
         if channel.period is not None:

@@ -166,7 +166,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             root = semidefinite_root(equations.process_noise(state, passed)) if q is None else q[:, :, None]
             state = state + apply(root, process)
             moved.append(state)
-            measured.append(equations.measure(state) + apply(r[:, :, None], sensors))
+            measured.append(equations.measure(state, passed) + apply(r[:, :, None], sensors))
         state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
         here = None
         if self.loses:
