@@ -206,6 +206,7 @@ BASELINES = Baselines(
         "innovation-adaptive",
         "gust-imm",
         "level-bank",
+        "level-bank-4",
         "random",
         "true-state",
         "matched",
