@@ -100,10 +100,14 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         """Start where everyone starts."""
         return Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
 
+    def process_noise(self, mean: Array, measurement: Measurement) -> Array:
+        """Q at the predicted mean, ``(n, n, N)`` or ``(n, n, 1)``."""
+        return self.factor * self.equations.process_noise(mean, measurement)
+
     def update(self, state: Track, given: Input) -> Track:
         """Predict and update."""
         mean, carried = self.equations.carry(state.mean, state.covariance, given.measurement)
-        Q = self.factor * self.equations.process_noise(mean, given.measurement)
+        Q = self.process_noise(mean, given.measurement)
         result = _update(self.equations, mean, carried + Q, self.R, given.measurement, self.xp)
         return Track(
             result.mean, result.covariance, _likelihood(result, given.measurement.available, self.xp)
@@ -138,7 +142,7 @@ class Unscented(Extended):
             state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
         )
         spread = spread + self.equations.input_noise(state.mean, measurement)
-        Q = self.factor * self.equations.process_noise(mean, measurement)
+        Q = self.process_noise(mean, measurement)
         own = self.equations
         z, h, near = _numbers(measurement, self.xp), own.measure, own.measure(mean)
 

@@ -215,28 +215,46 @@ DEVIATIONS = ("receiver", "position", "compass", "reading")
 """What is tuned."""
 
 
-class WheelAndReceiver(Extended):
-    """The extended Kalman filter of the drives with deviations of its own.
+class WithNoises(Extended):
+    """The Kalman filter as written with noises of its own.
 
     Args:
         task: the problem.
+        Q: covariance of the process noise, ``(n, n)``.
+        R: of the measurement noise, ``(m, m)``.
+    """
+
+    def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
+        super().__init__(task)
+        self.Q, self.R = (task.constant(noise)[:, :, None] for noise in (Q, R))
+
+    def process_noise(self, mean: Any, measurement: Any) -> Any:
+        """Its own, whatever the state."""
+        return self.Q
+
+
+def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
+    """Return what makes a Kalman filter with these noises."""
+
+    def make(task: Any) -> WithNoises:
+        return WithNoises(task, Q, R)
+
+    make.kind, make.traceable = "estimator", True  # type: ignore[attr-defined]
+    return make
+
+
+def wheel_and_receiver(
+    receiver: float = 1.0, position: float = 0.1, compass: float = 0.001, reading: float = 0.05
+) -> Any:
+    """Return what makes the extended Kalman filter of the drives with deviations of its own.
+
+    Args:
         receiver: of a position, m.
         position: of the motion beyond the model, m each second.
         compass: of the change of the compass's error, rad each second.
         reading: of its cosine and sine.
     """
-
-    def __init__(
-        self,
-        task: Any,
-        receiver: float = 1.0,
-        position: float = 0.1,
-        compass: float = 0.001,
-        reading: float = 0.05,
-    ) -> None:
-        super().__init__(task)
-        self.Q = task.constant(process_noise(position, compass))[:, :, None]
-        self.R = task.constant(sensor_noise(receiver, reading))[:, :, None]
+    return with_noises(process_noise(position, compass), sensor_noise(receiver, reading))
 
 
 # --- stored sets
@@ -438,12 +456,7 @@ def tune_drives(recording: Recording) -> dict[str, float]:
 
     def cost(logarithms: numpy.ndarray) -> float:
         values = (10.0**value for value in logarithms.tolist())
-        deviations = dict(zip(DEVIATIONS, values, strict=True))
-
-        def made(task: Any) -> WheelAndReceiver:
-            return WheelAndReceiver(task, **deviations)
-
-        made.kind, made.traceable = "estimator", True  # type: ignore[attr-defined]
+        made = wheel_and_receiver(**dict(zip(DEVIATIONS, values, strict=True)))
         found = filtergym.evaluate(Drives.id, {"candidate": made}, recording)
         return math.log(float(found.cost.mean("time").mean()))
 
@@ -465,12 +478,11 @@ def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[s
         file.write_text(json.dumps(tune_drives(stored_drives(folder, "val")[0])), encoding="utf-8")
     values = json.loads(file.read_text(encoding="utf-8"))
 
-    def with_tuned(task: Any) -> WheelAndReceiver:
-        return WheelAndReceiver(task, **values)
-
-    with_tuned.kind, with_tuned.traceable = "estimator", True  # type: ignore[attr-defined]
     dataset = filtergym.evaluate(
-        Drives.id, {"extended": "extended", "extended, tuned": with_tuned}, recording, timed=True
+        Drives.id,
+        {"extended": "extended", "extended, tuned": wheel_and_receiver(**values)},
+        recording,
+        timed=True,
     )
     drives = [str(name) for name in dataset.flight.values]
     rows: list[dict[str, Any]] = [{"name": "receiver alone", "rmse": held}]
