@@ -109,7 +109,7 @@ def _table(found: ProtocolResult) -> Table:
     table.add_column("environment", no_wrap=True)
     if several:
         table.add_column("competitor", overflow="fold")
-    for title in ("cost vs paper, %", "lost tracks, %", "ANEES", "worst held-out, %", "ns", "paper's\nns"):
+    for title in ("cost vs paper, %", "lost\n%", "ANEES", "worst held-out, %", "ns (paper's)"):
         table.add_column(title, justify="right")
     for one in found.environments:
         table.add_row(
@@ -128,14 +128,11 @@ def _table(found: ProtocolResult) -> Table:
 
 
 def _environment_cells(one: EnvironmentResult) -> list[str]:
-    worst = "-"
-    if one.worst is not None:
-        worst = f"{100.0 * one.worst[1]:+,.1f} {one.worst[0]}"
+    worst = "-" if one.worst is None else f"{100.0 * one.worst[1]:+,.1f}\n{one.worst[0]}"
     return [
         _percent(one.cost),
-        with_interval(one.lost, 100.0, digits=2, negligible=0.005),
+        with_interval(one.lost, 100.0, digits=2, negligible=0.005).partition(" ")[0],
         consistency(one.anees),
         worst,
-        time_text(one.time),
-        time_text(one.paper_time),
+        f"{time_text(one.time)} ({time_text(one.paper_time)})",
     ]
