@@ -29,6 +29,7 @@ import torch
 from ..envs.contract.model import Model
 from ..envs.contract.parameters import check_integer
 from ..envs.engine.catalogue import nearest
+from ..envs.engine.rollout import Reward
 from ..envs.engine.scenario_choice import find_mixture
 from ..envs.interface.vector_environment import TaskVectorEnv
 from ..evaluation.competitors.kinds import Policy
@@ -41,7 +42,7 @@ from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
 from .training_run import TrainingRun, schedule
 from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
-from .unrolled import Unrolled
+from .unrolled import Teacher, Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")
 """A linear rule; one hidden layer; a gated recurrent unit, which remembers."""
@@ -62,6 +63,8 @@ class NetworkPolicy(torch.nn.Module):
         hidden_size: of the memory or of the hidden layer; a linear rule has neither.
         first_action: about what is answered before anything is learned; default: the middle of the box.
         network: one of ``NETWORKS``.
+        longest_memory: decisions after which the slowest units of a memory that was just made still remember a third;
+            the quickest forget most at once, the others lie between. None: all forget a half at every decision.
         fields_kept: how many fields of the observation the agent reads that is saved; None: all.
 
     Raises:
@@ -83,6 +86,7 @@ class NetworkPolicy(torch.nn.Module):
         first_action: Sequence[float] | None = None,
         network: str = "recurrent",
         fields_kept: int | None = None,
+        longest_memory: float | None = None,
     ) -> None:
         super().__init__()
         if network not in NETWORKS:
@@ -98,6 +102,11 @@ class NetworkPolicy(torch.nn.Module):
         hidden = [torch.nn.Linear(observations, hidden_size)] if network == "feedforward" else []
         self.hidden = torch.nn.ModuleList(hidden)
         self.head = torch.nn.Linear(observations if network == "linear" else hidden_size, space.shape[0])
+        if self.gru is not None and longest_memory is not None:
+            # Of the update gate, whose logistic function is the share that is kept.
+            keep = self.gru.bias_ih[hidden_size : 2 * hidden_size]
+            with torch.no_grad():
+                keep += torch.linspace(-1.0, math.log(max(longest_memory - 1.0, 0.5)), hidden_size)
         with torch.no_grad():
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
@@ -312,6 +321,7 @@ class Descent:
             values.get("first_action"),
             values.get("network", "recurrent"),
             values.get("fields_kept"),
+            values.get("longest_memory"),
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()
@@ -323,10 +333,13 @@ class Descent:
         """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
+        kind, teacher = _reward_to_descend(self.run), self.values.get("teacher")
         if env.backend == "compiled":
-            return Unrolled(
-                env, policy, truncation, _reward_to_descend(self.run), gate, largest
-            ).descend_episodes
+            beside = None if teacher is None else Teacher(env, teacher)
+            reward = Reward(kind, 0.0 if teacher is None else self.values["teacher_share"])
+            return Unrolled(env, policy, truncation, reward, beside, gate, largest).descend_episodes
+        if teacher is not None:
+            raise ValueError(f"a teacher needs the compiled backend: algorithm {self.run.algorithm!r} runs on torch here")
         return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
 
     def update(self) -> float:

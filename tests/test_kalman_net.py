@@ -48,9 +48,9 @@ def network(model, answer=0.0):
     return LearnedPolicy(model, arrays, "tanh")
 
 
-def episodes(id, count, steps, **keywords):
+def episodes(id, count, steps, name="kalman-net", **keywords):
     """Initial, and the measurements of episodes of the training distribution."""
-    model = make_model(id, NAME, **keywords)
+    model = make_model(id, name, **keywords)
     rng = np.random.default_rng(2)
     draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
     truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
