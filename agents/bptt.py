@@ -27,8 +27,9 @@ import numpy
 import torch
 
 from ..envs.contract.model import Model
-from ..envs.contract.parameters import check_integer
+from ..envs.contract.parameters import Limits, check, check_integer
 from ..envs.engine.catalogue import nearest
+from ..envs.engine.reward import LIKELIHOOD_WEIGHTS
 from ..envs.engine.rollout import Reward
 from ..envs.engine.scenario_choice import find_mixture
 from ..envs.interface.vector_environment import TaskVectorEnv
@@ -63,8 +64,6 @@ class NetworkPolicy(torch.nn.Module):
         hidden_size: of the memory or of the hidden layer; a linear rule has neither.
         first_action: about what is answered before anything is learned; default: the middle of the box.
         network: one of ``NETWORKS``.
-        longest_memory: decisions after which the slowest units of a memory that was just made still remember a third;
-            the quickest forget most at once, the others lie between. None: all forget a half at every decision.
         fields_kept: how many fields of the observation the agent reads that is saved; None: all.
 
     Raises:
@@ -86,7 +85,6 @@ class NetworkPolicy(torch.nn.Module):
         first_action: Sequence[float] | None = None,
         network: str = "recurrent",
         fields_kept: int | None = None,
-        longest_memory: float | None = None,
     ) -> None:
         super().__init__()
         if network not in NETWORKS:
@@ -102,11 +100,6 @@ class NetworkPolicy(torch.nn.Module):
         hidden = [torch.nn.Linear(observations, hidden_size)] if network == "feedforward" else []
         self.hidden = torch.nn.ModuleList(hidden)
         self.head = torch.nn.Linear(observations if network == "linear" else hidden_size, space.shape[0])
-        if self.gru is not None and longest_memory is not None:
-            # Of the update gate, whose logistic function is the share that is kept.
-            keep = self.gru.bias_ih[hidden_size : 2 * hidden_size]
-            with torch.no_grad():
-                keep += torch.linspace(-1.0, math.log(max(longest_memory - 1.0, 0.5)), hidden_size)
         with torch.no_grad():
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
@@ -285,6 +278,22 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
+def _reward_with_teacher(run: TrainingRun) -> Reward:
+    """Reward whose gradient is followed, with the share of it that a teacher gives.
+
+    Raises:
+        ValueError: if a teacher cannot give it.
+    """
+    kind, values = _reward_to_descend(run), run.hyperparameters
+    if values.get("teacher") is None:
+        return Reward(kind)
+    if kind not in LIKELIHOOD_WEIGHTS:
+        raise nearest("reward of a student", kind, LIKELIHOOD_WEIGHTS)
+    share = values.get("teacher_share", 1.0)
+    check("teacher_share", share, float, Limits(above=0.0, at_most=1.0))
+    return Reward(kind, share)
+
+
 def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     """Return the agent that a network in training is by now."""
     network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
@@ -321,7 +330,6 @@ class Descent:
             values.get("first_action"),
             values.get("network", "recurrent"),
             values.get("fields_kept"),
-            values.get("longest_memory"),
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()
@@ -333,13 +341,15 @@ class Descent:
         """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
-        kind, teacher = _reward_to_descend(self.run), self.values.get("teacher")
+        teacher = self.values.get("teacher")
         if env.backend == "compiled":
+            reward = _reward_with_teacher(self.run)
             beside = None if teacher is None else Teacher(env, teacher)
-            reward = Reward(kind, 0.0 if teacher is None else self.values["teacher_share"])
             return Unrolled(env, policy, truncation, reward, beside, gate, largest).descend_episodes
         if teacher is not None:
-            raise ValueError(f"a teacher needs the compiled backend: algorithm {self.run.algorithm!r} runs on torch here")
+            raise ValueError(
+                f"teacher {teacher!r} needs compiled episodes, and these run on torch: leave it out"
+            )
         return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
 
     def update(self) -> float:

@@ -156,7 +156,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"first_action", "max_action_grad", "network", "fields_kept", "teacher", "teacher_share", "longest_memory"}
+        known |= {"first_action", "max_action_grad", "network", "fields_kept", "teacher", "teacher_share"}
     else:
         from .sb3_training import ALGORITHMS
 

@@ -261,7 +261,7 @@ class Teacher:
 
     Args:
         env: whose episodes they are, with compiled backend.
-        name: of an estimator, smoother, reference or policy of the environment's own.
+        name: of an estimator of the environment's own, or of a reference, which is told more.
 
     Raises:
         ValueError: if there is none, it cannot run as compiled code, or the world follows its estimates.
@@ -269,9 +269,14 @@ class Teacher:
 
     def __init__(self, env: TaskVectorEnv, name: str) -> None:
         competitor = Problem.of(type(env.task)).competitor(name)
+        kind = kind_of(competitor)
+        if kind not in ("estimator", "reference"):
+            raise ValueError(f"a teacher is an estimator or a reference, but {name!r} is of kind {kind}")
         if env.task.closes_loop:
-            raise ValueError(f"{name!r} cannot teach in {env.task.id}: what is measured follows its own estimates there")
-        model = put_in_loop(env.model, competitor, kind_of(competitor), name, env.num_envs)
+            raise ValueError(
+                f"{name!r} cannot teach in {env.task.id}: what is measured follows its own estimates there"
+            )
+        model = put_in_loop(env.model, competitor, kind, name, env.num_envs)
         if not can_step(model, _estimate):
             raise ValueError(f"{name!r} cannot teach: it does not run as compiled code")
         self._lanes = Lanes(model, env.num_envs, report=_estimate)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.agents.learned_estimator import EstimatorMaker
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract import student
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.filter import Initial
@@ -10,7 +11,7 @@ from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine import reward
 from filtergym.envs.maneuvering_target.kalman_net import LARGEST_ACCELERATION, LEAST_SPEED
 from models import Asked, make_model
-from test_kalman_net import RADAR, episodes, network
+from test_kalman_net import AIRCRAFT, RADAR, episodes, network
 
 NAME = "student"
 
@@ -131,3 +132,69 @@ def test_what_a_teacher_says_is_the_expected_reward(kind, monkeypatch):
     (first, error_1), (second, error_2) = expected
     assert abs((found[0] - found[1]) - (first - second)) < 5.0 * np.hypot(error_1, error_2)
     assert abs(first - second) > 20.0 * np.hypot(error_1, error_2)
+
+
+def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
+    """Against differences of the cost, which is that of a window of twelve scans, over the same episodes."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("llvmlite")
+    from filtergym.agents.bptt import NetworkPolicy
+    from filtergym.agents.unrolled import Teacher, Unrolled
+    from filtergym.envs.engine.rollout import Reward
+    from filtergym.envs.interface.vector_environment import TaskVectorEnv
+
+    keywords = {"control": NAME, "backend": "compiled", "autoreset_mode": "Disabled", "max_episode_steps": 12}
+    env = TaskVectorEnv(RADAR, 5, **keywords)
+    torch.manual_seed(0)
+    policy = NetworkPolicy(len(env.model.fields), env.model.action_space, 6).double()
+    teacher = Teacher(env, "kalman-imm")
+    found = {}
+    for share in (0.0, 0.7, 1.0):
+        reward_of_it = Reward("cost-and-covariance", share)
+        unrolled = Unrolled(env, policy, 12, reward_of_it, teacher if share else None)
+
+        def cost(unrolled=unrolled):
+            env.reset(seed=3)  # and the next episodes are those that are flown
+            policy.zero_grad()
+            return unrolled.descend_episodes(lambda: None)
+
+        found[share] = cost()
+        gradients = [parameter.grad.clone() for parameter in policy.parameters()]
+        for parameter, gradient in zip(policy.parameters(), gradients, strict=True):
+            place = int(gradient.abs().argmax())
+            flat, step = parameter.data.view(-1), 1e-5
+            before = float(flat[place])
+            ends = []
+            for sign in (1.0, -1.0):
+                flat[place] = before + sign * step
+                ends.append(cost())
+            flat[place] = before
+            slope = (ends[0] - ends[1]) / (2.0 * step)
+            # The error of central differences, of the second order in the step.
+            assert slope == pytest.approx(float(gradient.view(-1)[place]), rel=1e-4)
+    assert found[0.7] == pytest.approx(0.3 * found[0.0] + 0.7 * found[1.0], rel=1e-12)
+    assert found[0.0] != pytest.approx(found[1.0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("id", "overrides", "message"),
+    [
+        (RADAR, {"teacher": "semi-marko"}, "unknown policy 'semi-marko': did you mean 'semi-markov'"),
+        (RADAR, {"teacher": "imm"}, "a teacher is an estimator or a reference, but 'imm' is of kind policy"),
+        (RADAR, {"teacher": "semi-markov", "teacher_share": 0.0}, "teacher_share must be"),
+        (
+            AIRCRAFT,
+            {"teacher": "level-bank"},
+            "cannot teach in .*: what is measured follows its own estimates",
+        ),
+    ],
+)
+def test_who_cannot_teach_is_refused(id, overrides, message):
+    pytest.importorskip("torch")
+    pytest.importorskip("llvmlite")
+    from filtergym.agents.bptt import Descent
+    from filtergym.agents.training_run import RunOptions, new_run
+
+    run = new_run(problem_of(id), RunOptions(NAME, envs=2, overrides=overrides))
+    with pytest.raises(ValueError, match=message):
+        Descent(run).flight()

@@ -88,15 +88,15 @@ LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0, "cost-and-covaria
 def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
     """Expected reward, up to a constant, if the truth is distributed as a teacher says, ``(N,)``.
 
-    With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is expected
-    to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A charge is a square of errors, and adds what the teacher's own errors are
-    charged, which the student cannot change: it is charged for d.
+    With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
+    expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A charge is a square of errors, and adds what the teacher's own
+    errors are charged, which the student cannot change: it is charged for d.
 
     Args:
         kind: of reward, one of ``LIKELIHOOD_WEIGHTS``.
         model: of the student.
         state: its episodes after the action.
-        mean: of the teacher, m, ``(C, N)``.
+        mean: of the teacher, ``(C, N)``.
         covariance: S, ``(C, C, N)``.
     """
     world, difference = model.task.world, model.mean(state) - mean
