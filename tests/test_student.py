@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.agents.learned_estimator import EstimatorMaker
+from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract import student
 from filtergym.envs.contract.draws import Draws
@@ -62,8 +63,6 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
             np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-7, atol=1e-5)
             scale = np.sqrt(np.outer(np.diag(P), np.diag(P)))
             np.testing.assert_allclose(state.covariance[:, :, i] / scale, P / scale, atol=1e-7)
-            shown = np.sqrt(np.diag(U @ P @ U.T))
-            np.testing.assert_allclose(state.deviation[:, i], shown, rtol=1e-7)
             before_motion[:, i] = a[22:]
         np.testing.assert_array_equal(state.motion, np.clip(action[22:], -1.0, 1.0))
 
@@ -86,8 +85,13 @@ def test_of_a_radar_a_turned_and_moved_problem_has_turned_and_moved_estimates(an
     measurements = [m._replace(variance=1e4 * ones, available=ones[0]) for m in measurements]
     both, there, *other = turned_about(angle, (3e4, -2e4), initial, measurements)
     # Where nothing was received the position is zero, which would turn with the others: here all is.
-    estimator = Asked(EstimatorMaker(NAME, lambda model: network(model, "random"))(model.task))
-    found = []
+
+    def tame(model):
+        """A network whose answers are small: one that loses the track would let rounding grow."""
+        arrays = network(model, "random").arrays
+        return LearnedPolicy(model, arrays | {"weight_0": 0.2 * arrays["weight_0"]}, "tanh")
+
+    estimator, found = Asked(EstimatorMaker(NAME, tame)(model.task)), []
     for start, seen in ((initial, measurements), other):
         memory, track = estimator.start(start, 8), []
         for measurement in seen:

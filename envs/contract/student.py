@@ -26,7 +26,7 @@ import numpy
 
 from ...filters.small_matrices import apply, outer, product, transpose
 from .filter import Bank, Initial, Measurement, TaskT
-from .observation import ACTION, KEPT_AS_LOG, SIGNED_LOG, Array, Block
+from .observation import SIGNED_LOG, Array, Block
 
 OFFSET_REACH = 2.0
 """Largest correction that does not depend on the innovation, in units of the component."""
@@ -56,8 +56,6 @@ class Track(NamedTuple):
     """``(C, N)``; predicted between :meth:`StudentBank.predict` and the action."""
     covariance: Array
     """As it was reported last, ``(C, C, N)``."""
-    deviation: Array
-    """Likewise, standard deviations in the frame of then, ``(C, N)``."""
     motion: Array
     """Answered last of the motion, in [-1, 1], ``(k, N)``; one row of zeros where nothing is."""
     view: View
@@ -115,10 +113,11 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """The innovation, what was answered last, and what the environment shows."""
-        xp = self.xp
-        components = [component.name for component in self.task.components]  # type: ignore[attr-defined]
-        motion = Block("motion", lambda f, _: f.motion, "last answer on the motion", self.motions, ACTION)
+        """The innovation, and what the environment shows; what was answered before, only the network's memory knows.
+
+        Shown again, answers that vary little before anything is learned would be normalised by that little, and
+        gradients would grow with every scan that they flow back.
+        """
         return (
             Block(
                 "innovation",
@@ -127,27 +126,16 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
                 self.axes,
                 SIGNED_LOG,
             ),
-            Block(
-                "deviation",
-                lambda f, _: xp.log(f.deviation / f.view.unit),
-                "the deviation that was reported last, in the frame, over its unit",
-                components,
-                KEPT_AS_LOG,
-            ),
-            *((motion,) if self.motions else ()),
             *self.features,
         )
 
     def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
-        frame, none, rotated = self.rotate(initial.mean), 0.0 * initial.mean, initial.covariance
-        if frame is not None:
-            rotated = product(product(frame, rotated), transpose(frame))
-        deviation = self.xp.sqrt(self.xp.stack([rotated[i, i] for i in range(self.size)]))
+        frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)
-        view = View(initial.mean, frame, deviation, innovation)
-        return Track(initial.mean, initial.covariance, deviation, motion, view)
+        view = View(initial.mean, frame, none + 1.0, innovation)
+        return Track(initial.mean, initial.covariance, motion, view)
 
     def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict by the motion that was answered, and compare."""
@@ -175,13 +163,8 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
         covariance = outer(rotated[:, 0], rotated[:, 0])
         for column in range(1, C):
             covariance = covariance + outer(rotated[:, column], rotated[:, column])
-        reported = [
-            xp.sqrt(sum((row[j] * row[j] for j in range(1, i + 1)), row[0] * row[0]))
-            for i, row in enumerate(factor)
-        ]
         return state._replace(
             mean=state.mean + (unit * correction if inverse is None else apply(inverse, unit * correction)),
             covariance=covariance,
-            deviation=xp.stack(reported),
             motion=motion if self.motions else state.motion,
         )
