@@ -233,6 +233,29 @@ def converse(program, given):
 
 
 @pytest.mark.parametrize(
+    ("environment", "name", "scenario", "keywords"),
+    [
+        (
+            "LooselyCoupledNavigation",
+            "plain-reduced",
+            "random",
+            {"manoeuvre_rate": (1e-6, 1e-6)},
+        ),  # 1e13 m away
+        ("RadarEsmTracking", "forgetting-joint-type", "paper", {"range_sigma": 1e-6}),
+        ("UavAutopilot", "bptt-small", "gyro-bias", {"sensor_bias": (1e6, 1e6)}),
+        ("ManeuveringTarget", "kalman-imm", "glint", {"glint_factor": 1e3, "range_sigma": 1e-6}),
+    ],
+)
+def test_at_the_ends_of_parameters_c_differs_by_the_last_digit(environment, name, scenario, keywords):
+    keywords = {"horizon": 30, **keywords}
+    traced, given = replayed(environment, name, keywords, scenario, episodes=2, measurements=12)
+    largest = max(np.nanmax(np.abs(given.measurements)), np.abs(given.mean).max())
+    writer = Writer(name, traced, c_source.DOUBLE, given.components)
+    writer.limit = 1e-8 + 4.0 * np.spacing(largest) / given.sigma.min()
+    compile_and_test(writer, given, compiler())  # which fails beyond that
+
+
+@pytest.mark.parametrize(
     ("environment", "name", "scenario", "horizon"),
     [
         ("UavAutopilot", "bptt-small", None, 200),  # is shown readings that sensors hold in dropouts
