@@ -166,10 +166,10 @@ $(DONE)/own_logs:
 
 $(DONE)/sensing:
 	for seed in 0 1; do (cd docs/examples && $(CURDIR)/$(BIN)/filtergym train budgeted_sensing:mine/BudgetedSensing-v0 --algo ppo \
-	  --scenario narrow --steps 640000 --seed $$seed --config budgeted_sensing.yml --out $(CURDIR)/runs/ppo-$$seed); done
-	$(BIN)/python benchmarks/budgeted_sensing.py --agent runs/ppo-0 --agent runs/ppo-1 > build/sensing.txt
+	  --scenario narrow --steps 640000 --seed $$seed --config budgeted_sensing.yml --out runs/ppo-$$seed); done
+	$(BIN)/python benchmarks/budgeted_sensing.py --agent docs/examples/runs/ppo-0 --agent docs/examples/runs/ppo-1 > build/sensing.txt
 	$(table) build/sensing.txt --name budgeted_sensing --name budgeted_schedules \
-	  --command "python benchmarks/budgeted_sensing.py --agent runs/ppo-0 --agent runs/ppo-1"
+	  --command "python benchmarks/budgeted_sensing.py --agent docs/examples/runs/ppo-0 --agent docs/examples/runs/ppo-1"
 	$(finish)
 
 $(DONE)/cold:
