@@ -208,6 +208,34 @@ STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
 """Of the search, their decimal logarithms."""
 
 
+class WithNoises(Extended):
+    """The Kalman filter as written with noises of its own.
+
+    Args:
+        task: the problem.
+        Q: covariance of the process noise, ``(n, n)``.
+        R: of the measurement noise, ``(m, m)``.
+    """
+
+    def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
+        super().__init__(task)
+        self.Q, self.R = (task.constant(noise)[:, :, None] for noise in (Q, R))
+
+    def process_noise(self, mean: Any, measurement: Any) -> Any:
+        """Its own, whatever the state."""
+        return self.Q
+
+
+def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
+    """Return what makes a Kalman filter with these noises."""
+
+    def make(task: Any) -> WithNoises:
+        return WithNoises(task, Q, R)
+
+    make.kind, make.traceable = "estimator", True  # type: ignore[attr-defined]
+    return make
+
+
 # --- stored sets
 
 
