@@ -148,6 +148,7 @@ def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], tr
         return step(state, Past(measurement, truth, None))
     xp = namespace(measurement.available)
     (oldest, *others), late = state.past, measurement.late_available
+    assert late is not None
     first = oldest.measurement
     both = xp.where(late > 0.0, measurement.late, _numbers(first, xp)), xp.maximum(first.available, late)
     oldest = oldest._replace(measurement=first._replace(values=both[0], available=both[1]))

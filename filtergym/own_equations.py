@@ -91,7 +91,7 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
 
     def noise(parts: Sequence[Any]) -> numpy.ndarray | VectorFunction:
         if "dt" not in takes:
-            return sum(check_covariance("Q", Q, n) for Q in parts)
+            return numpy.sum([check_covariance("Q", Q, n) for Q in parts], axis=0)
         entries = lambda v: _sum([_entries(Q(v[n])) for Q in parts])  # noqa: E731
         return trace("Q", entries, 0, n * n, n + 1 + len(around.inputs))
 
@@ -147,7 +147,7 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
         found = discretised(diffusion)
         return trace("drift", lambda v: _entries(found.noise(v[:n], v[n], v[n + 1 :])), 0, n * n, n + 1 + p)
 
-    total = sum(parts.values())
+    total = numpy.sum([*parts.values()], axis=0)
     motion = discretised(total).motion
     sources = {name: noise(one) for name, one in parts.items() if name}
     return _Motion(*_with_inputs("drift", motion, True, around), noise(total), sources)

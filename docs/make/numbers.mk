@@ -58,7 +58,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -162,6 +162,14 @@ $(DONE)/online: $(DONE)/ship-ManeuveringTarget
 $(DONE)/own_logs:
 	$(BIN)/python benchmarks/own_logs.py > build/own_logs.txt
 	$(table) build/own_logs.txt --name own_logs --command "python benchmarks/own_logs.py"
+	$(finish)
+
+$(DONE)/sensing:
+	for seed in 0 1; do (cd docs/examples && $(CURDIR)/$(BIN)/filtergym train budgeted_sensing:mine/BudgetedSensing-v0 --algo ppo \
+	  --scenario narrow --steps 640000 --seed $$seed --config budgeted_sensing.yml --out runs/ppo-$$seed); done
+	$(BIN)/python benchmarks/budgeted_sensing.py --agent docs/examples/runs/ppo-0 --agent docs/examples/runs/ppo-1 > build/sensing.txt
+	$(table) build/sensing.txt --name budgeted_sensing --name budgeted_schedules \
+	  --command "python benchmarks/budgeted_sensing.py --agent docs/examples/runs/ppo-0 --agent docs/examples/runs/ppo-1"
 	$(finish)
 
 $(DONE)/cold:
