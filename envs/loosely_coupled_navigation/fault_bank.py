@@ -114,8 +114,8 @@ FEW = TRAINING._replace(
     levels=(0.2, 1.0, 10.0, 100.0),
 )
 """Four filters: the modelled noises, others, and two onsets of a pull in these. Sizes and values chosen on the
-validation split, by cost and by the density of the truth: with the middle of each limit of ``TRAINING`` the bank costs a few
-percent less, and errs by nearly twice the variance that it states (ANEES 1.9)."""
+validation split, by cost and by the density of the truth: with the middle of each limit of ``TRAINING`` the bank costs
+a few percent less, and errs by nearly twice the variance that it states (ANEES 1.9)."""
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:
