@@ -14,7 +14,7 @@ from collections.abc import Collection
 import numpy
 import xarray
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.evaluation.running.times import EQUAL_TIMES, FRONT_MARK, Point, front, time_of
+from filtergym.evaluation.running.times import EQUAL_TIMES, FRONT_MARK, Point, front, time_of, time_text
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
 from filtergym.papers.grid import markdown_table
 
@@ -61,7 +61,7 @@ def main() -> None:
         results = filtergym.evaluate(id, [*learned, *classical], episodes=episodes, seed=0, timed=True)
         rows += rows_of(results, name, learned)
     header = [
-        "environment", "competitor", "ns", "times", "less the quickest agent, %", "ANEES", "opponent",
+        "environment", "competitor", "", "ns", "times", "less the quickest agent, %", "ANEES", "opponent",
         "less the opponent, %",
     ]  # fmt: skip
     print("\n".join(markdown_table(header, rows)))
@@ -90,9 +90,9 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
         rows.append(
             [
                 environment if not rows else "",
-                f"{'**' if name in learned else ''}`{name}`{'**' if name in learned else ''}"
-                + (f" {FRONT_MARK}" if name in on_front else ""),
-                f"{own:.0f}",
+                f"`{name}`",
+                "learned" if name in learned else "",
+                f"{time_text(times[name])}{f' {FRONT_MARK}' if name in on_front else ''}",
                 f"{own / times[quickest].nanoseconds:.1f}",
                 percent(against[name]) if name != quickest else "0",
                 f"{numpy.mean(nees.sel(policy=name).values):.2f}",
