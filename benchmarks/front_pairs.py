@@ -1,76 +1,111 @@
-"""Learned competitors against the best classical one of the same time, paired on the same episodes, in Markdown.
+"""Learned competitors and the strong filters of every size on one front of cost and time, paired, in Markdown.
 
     python benchmarks/front_pairs.py
 
-Who is compared with whom follows from the table of time budgets in the documentation: on either side the one that costs
-least on the training distribution in so many nanoseconds. Differences are geometric means of the episodes' ratios, with
-95 % bootstrap intervals; beside them the ratio of the means.
+Everybody meets the same episodes of the training distribution. Costs are against the quickest agent that learned, times
+in multiples of its. The opponent of a learned competitor is the classical one that costs least in at most its time, and
+the other way round; an asterisk marks who is on the front of all (:func:`~filtergym.evaluation.running.times.front`).
+Differences are geometric means of the episodes' ratios, with 95 % bootstrap intervals.
 """
 
 import argparse
+from collections.abc import Collection
 
-from filtergym.evaluation.statistics.bootstrap import Bootstrap
+import numpy
+import xarray
+from filtergym.agents.named_policies import pretrained_agents
+from filtergym.evaluation.running.times import EQUAL_TIMES, FRONT_MARK, Point, front, time_of, time_text
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
 from filtergym.papers.grid import markdown_table
 
 import filtergym
 
-PAIRS: dict[str, tuple[int, tuple[tuple[str, str], ...]]] = {
+CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     "LooselyCoupledNavigation": (
-        1200,
-        (
-            ("bptt-linear", "augmented-sage-husa"),
-            ("bptt-small", "augmented-sage-husa"),
-            ("kalman-net", "augmented-sage-husa"),
-        ),
+        2500,
+        ("plain-reduced", "augmented-sage-husa", "fault-bank-4", "fault-bank"),
     ),
     "ManeuveringTarget": (
         5000,
         (
-            ("bptt-linear", "adaptive-rearm-tuned"),
-            ("bptt-small", "adaptive-rearm-tuned"),
-            ("bptt-small", "kalman-imm-turn-tuned"),
-            ("kalman-net", "kalman-imm-turn-tuned"),
+            *("adaptive-rearm-tuned", "kalman-imm-tuned", "kalman-imm-turn-tuned"),
+            *(f"semi-markov-{H}{tuned}" for H in (3, 5, 9) for tuned in ("", "-tuned")),
+            *("semi-markov-15", "semi-markov", "semi-markov-wide"),
         ),
     ),
     "RadarEsmTracking": (
-        5000,
-        (
-            ("bptt-small", "forgetting-joint-type-tuned"),
-            ("kalman-net", "forgetting-joint-type-tuned"),
-            ("bptt", "forgetting-joint-type-tuned"),
-        ),
+        2000,
+        ("quasi-optimal", "leaky-tuned", "forgetting-joint-type-tuned", "exact-bayes-9", "exact-bayes"),
+    ),
+    "TightlyCoupledNavigation": (
+        400,
+        ("multi-hypothesis", "stuck-check", "fixed-robust-tuned", "huber-stuck-check", "fault-hypotheses"),
     ),
     "UavAutopilot": (
         1000,
-        (
-            ("bptt-linear", "sage-husa-tuned"),
-            ("bptt-small", "gust-imm-tuned"),
-            ("kalman-net", "gust-imm-tuned"),
-            ("kalman-net", "level-bank"),
-        ),
+        ("sage-husa-tuned", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
     ),
 }
-"""Episodes, and learned and classical competitors, by environment."""
+"""Episodes, and the classical competitors that are best in some time, by environment."""
 
 
 def main() -> None:
     """Evaluate, and print the table."""
-    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--environment", choices=CLASSICAL, action="append", help="default: all")
     rows = []
-    for name, (episodes, pairs) in PAIRS.items():
-        names = sorted({each for pair in pairs for each in pair})
-        results = filtergym.evaluate(f"filtergym/{name}-v0", names, episodes=episodes, seed=0)
-        cost = {each: results["cost"].sel(policy=each).values.mean(axis=1) for each in names}
-        bootstrap = Bootstrap(episodes)
-        for learned, classical in pairs:
-            found = bootstrap.geometric_difference(cost[learned], cost[classical])
-            means = cost[learned].mean() / cost[classical].mean() - 1.0
-            difference = " ".join(
-                (f"{100.0 * found.value:+.1f}", f"[{100.0 * found.low:+.1f}, {100.0 * found.high:+.1f}]")
-            )
-            rows.append([name, f"`{learned}`", f"`{classical}`", difference, f"{100.0 * means:+.1f}"])
-    header = ["environment", "learned", "classical", "learned less classical, % of the cost", "means, %"]
+    for name in parser.parse_args().environment or CLASSICAL:
+        episodes, classical = CLASSICAL[name]
+        id = f"filtergym/{name}-v0"
+        learned = pretrained_agents(id)
+        results = filtergym.evaluate(id, [*learned, *classical], episodes=episodes, seed=0, timed=True)
+        rows += rows_of(results, name, learned)
+    header = [
+        "environment", "competitor", "", "ns", "times", "less the quickest agent, %", "ANEES", "opponent",
+        "less the opponent, %",
+    ]  # fmt: skip
     print("\n".join(markdown_table(header, rows)))
+
+
+def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str]) -> list[list[str]]:
+    """Return the rows of an environment, the quickest competitor first."""
+    names = [str(name) for name in results["policy"].values]
+    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
+    times = {name: time_of(results.sel(policy=name)) for name in names}
+    nees = results["nees"].mean("time") / results.sizes["component"]
+    bootstrap = Bootstrap(results.sizes["episode"])
+    quickest = min(learned, key=lambda name: times[name].nanoseconds)
+    against = {name: bootstrap.geometric_difference(cost[name], cost[quickest]) for name in names}
+    points = [Point(name, "estimator", times[name], against[name].value) for name in names]
+    on_front = front(points)
+    rows = []
+    for name in sorted(names, key=lambda name: times[name].nanoseconds):
+        own = times[name].nanoseconds
+        others = [
+            other
+            for other in names
+            if (other in learned) != (name in learned) and times[other].nanoseconds <= EQUAL_TIMES * own
+        ]
+        opponent = min(others, key=lambda other: against[other].value, default="")
+        rows.append(
+            [
+                environment if not rows else "",
+                f"`{name}`",
+                "learned" if name in learned else "",
+                f"{time_text(times[name])}{f' {FRONT_MARK}' if name in on_front else ''}",
+                f"{own / times[quickest].nanoseconds:.1f}",
+                percent(against[name]) if name != quickest else "0",
+                f"{numpy.mean(nees.sel(policy=name).values):.2f}",
+                f"`{opponent}`" if opponent else "",
+                percent(bootstrap.geometric_difference(cost[name], cost[opponent])) if opponent else "",
+            ]
+        )
+    return rows
+
+
+def percent(found: Estimate) -> str:
+    """Return a difference and its interval."""
+    return f"{100.0 * found.value:+.1f} [{100.0 * found.low:+.1f}, {100.0 * found.high:+.1f}]"
 
 
 if __name__ == "__main__":

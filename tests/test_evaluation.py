@@ -136,6 +136,19 @@ def test_tuning_improves_on_fresh_episodes_and_is_repeatable():
     assert geometric_cost(episode_costs(candidate)) == pytest.approx(first.untuned_cost, rel=1e-12)
 
 
+def test_a_search_weighs_the_density_of_the_truth_where_it_is_declared():
+    id, name = "filtergym/LooselyCoupledNavigation-v0", "augmented-sage-husa"
+    tunable = replace(baselines_of(id).tunable[name], likelihood=True)
+    seeds = episode_seeds("validation", 0, 8)
+    found = episode_costs(Candidate(problem_of(id), "random", tunable, tunable.start, seeds))
+    data = evaluate(id, [name], episodes=8, split="validation").isel(policy=0)
+    # One component: the variance is the squared error over the normalised one.
+    squared, nees = data["error"].isel(component=0) ** 2, data["nees"]
+    density = -0.5 * (np.log(2.0 * np.pi * squared / nees) + nees)
+    expected = data["cost"].mean("time") * np.exp(-density.mean("time"))
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
 def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
     """On the training episodes the largest value is the best, on fresh ones the start is."""
     tunable = baselines_of(ENV).tunable["fixed-best"]

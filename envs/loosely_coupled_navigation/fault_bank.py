@@ -104,8 +104,18 @@ VAGUE = FaultPrior(
     rate=3.0,
     outlier=0.01,
 )
-FEW = TRAINING._replace(points=1, onsets=2, levels=(0.2, 1.0, 10.0, 100.0))
-"""Four filters: the modelled noises, others, and two onsets of a pull in these."""
+FEW = TRAINING._replace(
+    points=1,
+    drift=(0.5, 0.5),
+    intensity=(0.15, 0.15),
+    wandering=(0.45, 0.45),
+    onset_rate=0.35,
+    onsets=2,
+    levels=(0.2, 1.0, 10.0, 100.0),
+)
+"""Four filters: the modelled noises, others, and two onsets of a pull in these. Sizes and values chosen on the
+validation split, by cost and by the density of the truth: with the middle of each limit of ``TRAINING`` the bank costs
+a few percent less, and errs by nearly twice the variance that it states (ANEES 1.9)."""
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:
