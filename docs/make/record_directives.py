@@ -100,7 +100,7 @@ class _Rendered(SphinxDirective):
 
 
 class ResultsTable(_Rendered):
-    """``{results-table} ENVIRONMENT``: everybody in its training distribution; several, or some, by options."""
+    """``{results-table} ENVIRONMENT``: all competitors in its training distribution; several, or some, by options."""
 
     option_spec: ClassVar[Any] = {
         "scenario": directives.unchanged,
@@ -176,7 +176,7 @@ class PublicFigure(_Rendered):
 
 
 class BudgetsTable(_Rendered):
-    """``{budgets-table}``: who costs least in so much time, classical and learned, in all environments."""
+    """``{budgets-table}``: who has the lowest error cost in so much time, classical and learned, everywhere."""
 
     def markdown(self) -> str:
         """Return one table."""
