@@ -494,7 +494,10 @@ def _text(value: float, digits: int) -> str:
 
 def problem_table(figures: Mapping[str, Any]) -> dict[str, Any]:
     """Columns and rows of the table of the problems of state-space models."""
-    rows = [["linear, stored set", "measurement as it is", _text(figures["noise_floor_db"], 3), "", "", ""]]
+    rows = []
+    if "noise_floor_db" in figures:
+        floor = _text(figures["noise_floor_db"], 3)
+        rows.append(["linear, stored set", "measurement as it is", floor, "", "", ""])
     for row in figures["rows"]:
         told = " (reference)" if row["kind"] == "reference" else ""
         runs = f"{row['seeds']}, {row['spread_db']:.2f} dB apart" if row["seeds"] > 1 else ""

@@ -34,7 +34,12 @@ def problems():
 
 
 def test_records_hold_the_tables_of_their_figures(problems):
-    for name, table in ((problems.PROBLEMS, problems.problem_table), (problems.DRIVES, problems.drive_table)):
+    tables = {
+        problems.PROBLEMS: problems.problem_table,
+        "public_optimised": problems.problem_table,
+        problems.DRIVES: problems.drive_table,
+    }
+    for name, table in tables.items():
         data = json.loads((problems.RECORDS / f"{name}.json").read_text(encoding="utf-8"))["data"]
         assert table(data.pop("figures")) == data
 

@@ -10,6 +10,7 @@ const IN_VIEW = 1000;          // steps that are kept and drawn
 const MOST_ROWS = 20000;       // of a file
 const GLINT_FACTOR = 5;        // as in the scenario `glint`
 const TURN_RATE = 6;           // by the keys, degrees/s
+const PIECE = 25;              // points of a line that are drawn at once
 const NEWEST = 40;             // steps of a track that are drawn in full colour
 const HOW = "Move the pointer over the map, or steer with the arrow keys. Or drop a table (CSV) with time, x, y on it.";
 const SETTINGS = {
@@ -184,7 +185,7 @@ class View {
     if (this.canvas.width !== size.width || this.canvas.height !== size.height) Object.assign(this.canvas, size);
     this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.context.clearRect(0, 0, width, height);
-    Object.assign(this.context, { font: "12px system-ui, sans-serif", lineJoin: "round", lineCap: "round" });
+    Object.assign(this.context, { font: "12px system-ui, sans-serif", lineJoin: "bevel", lineCap: "round" });
     return [width, height];
   }
 
@@ -193,23 +194,18 @@ class View {
   }
 
   /* points: [x, y] or null for a gap. */
-  path(points) {
-    this.context.beginPath();
-    points.forEach((point, i) => point && this.context[points[i - 1] ? "lineTo" : "moveTo"](...point));
-  }
-
+  /* In pieces: the time that a long line takes grows faster than its length. */
   line(points, colour, { width = 1.5, alpha = 1 } = {}) {
-    this.path(points);
-    Object.assign(this.context, { strokeStyle: colour, lineWidth: width, globalAlpha: alpha });
-    this.context.stroke();
-    this.context.globalAlpha = 1;
-  }
-
-  area(points, colour, alpha = 1) {
-    this.path(points);
-    Object.assign(this.context, { fillStyle: colour, globalAlpha: alpha });
-    this.context.fill();
-    this.context.globalAlpha = 1;
+    const { context } = this;
+    Object.assign(context, { strokeStyle: colour, lineWidth: width, globalAlpha: alpha });
+    for (let first = 0; first < points.length; first += PIECE) {
+      context.beginPath();
+      for (let i = first; i < Math.min(first + PIECE + 1, points.length); i += 1) {
+        if (points[i]) context[i > first && points[i - 1] ? "lineTo" : "moveTo"](...points[i]);
+      }
+      context.stroke();
+    }
+    context.globalAlpha = 1;
   }
 
   text(words, x, y, align = "left") {
@@ -229,18 +225,22 @@ function ellipse({ mean, covariance: P }, toPixel) {
   });
 }
 
-function drawMap(view, steps, filters, target, region) {
-  const [width, height] = view.begin();
+/* From metres to pixels of a view, with one scale for both axes. */
+function scaleOf([width, height], region) {
   const scale = Math.min(width / region.width, height / region.height);
   const [left, low] = [(width - scale * region.width) / 2, (height - scale * region.height) / 2];
-  const toPixel = (x, y) => [left + scale * (x - region.x), height - low - scale * (y - region.y)];
+  return { scale, toPixel: (x, y) => [left + scale * (x - region.x), height - low - scale * (y - region.y)] };
+}
+
+function drawMap(view, steps, filters, region) {
+  const size = view.begin();
+  const { scale, toPixel } = scaleOf(size, region);
   view.context.fillStyle = view.colour("plot");
   for (const [x, y] of steps.filter(({ seen }) => seen).map((step) => toPixel(step.x, step.y))) {
     view.context.fillRect(x - 1.5, y - 1.5, 3, 3);
   }
   const truth = steps.map((s) => (Number.isFinite(s.truth_x) ? toPixel(s.truth_x, s.truth_y) : null));
-  const now = target ? [toPixel(target.x, target.y)] : [];
-  view.line([...truth, ...now], view.colour("text"), { alpha: 0.5 });
+  view.line(truth, view.colour("text"), { alpha: 0.5 });
   for (const filter of filters) {
     const colour = view.colour(filter.name);
     const estimates = steps.map((step) => step.estimates[filter.name]);
@@ -250,10 +250,14 @@ function drawMap(view, steps, filters, target, region) {
     view.line(points.slice(split), colour);
     if (estimates.at(-1)?.taken) view.line(ellipse(estimates.at(-1), toPixel), colour, { width: 2 });
   }
-  view.line([...now, ...now], view.colour("text"), { width: 9 });
   const length = 10 ** Math.floor(Math.log10(region.width / 4));
-  view.line([[12, height - 12], [12 + scale * length, height - 12]], view.colour("text"), { width: 2 });
-  view.text(length >= 1000 ? `${length / 1000} km` : `${length} m`, 12, height - 18);
+  view.line([[12, size[1] - 12], [12 + scale * length, size[1] - 12]], view.colour("text"), { width: 2 });
+  view.text(length >= 1000 ? `${length / 1000} km` : `${length} m`, 12, size[1] - 18);
+}
+
+function drawTarget(view, target, region) {
+  const { toPixel } = scaleOf(view.begin(), region);
+  view.line(Array(2).fill(toPixel(target.x, target.y)), view.colour("text"), { width: 9 });
 }
 
 /* Distance to the truth, m; where that is not known, the innovation in sigma of a coordinate. */
@@ -265,11 +269,10 @@ function errorOf(step, name, known) {
 }
 
 /* Whether the truth lies outside the ellipse; null where that cannot be said. */
-function isOutside(step, name) {
-  const estimate = step.estimates[name];
-  if (!estimate?.taken || !Number.isFinite(step.truth_x)) return null;
-  const [[a, b], [, c]] = estimate.covariance;
-  const [x, y] = [estimate.mean[0] - step.truth_x, estimate.mean[1] - step.truth_y];
+function isOutside({ estimates, truth_x, truth_y }, name) {
+  if (!estimates[name]?.taken || !Number.isFinite(truth_x)) return null;
+  const { mean, covariance: [[a, b], [, c]] } = estimates[name];
+  const [x, y] = [mean[0] - truth_x, mean[1] - truth_y];
   return c * x * x - 2 * b * x * y + a * y * y > 4 * (a * c - b * b);
 }
 
@@ -287,7 +290,7 @@ function drawErrors(view, steps, filters, known) {
   }
   filters.forEach((filter, place) => {
     const points = errors[place].map((error, i) => (Number.isFinite(error) ? [toX(i), toY(error)] : null));
-    view.line(points, view.colour(filter.name), { width: 1.2 });
+    view.line(points, view.colour(filter.name), { width: 1 });
   });
   view.text(known ? "error of position, m" : "innovation, sigma", left, 12);
 }
@@ -296,20 +299,19 @@ function drawErrors(view, steps, filters, known) {
 function drawWeights(view, steps, filter) {
   const [width, height] = view.begin();
   const [top, bottom] = [18, height - 2];
-  const there = steps.map((step) => step.estimates[filter.name]?.weights);
-  const toX = (i) => (width * i) / Math.max(steps.length - 1, 100);
-  const sums = there.map(() => 0);
+  const toX = (i) => Math.round((width * i) / Math.max(steps.length, 100));
+  const heights = steps.map(() => 0);
   filter.weightNames.forEach((_, hypothesis) => {
-    const lower = sums.slice();
-    there.forEach((weights, i) => (sums[i] += weights ? weights[hypothesis] : 0));
-    const toPoint = (sum, i) => [toX(i), bottom - (bottom - top) * Math.min(sum, 1)];
-    const points = [...sums.map(toPoint), ...lower.map(toPoint).reverse()];
-    view.area(points, view.colour(filter.name), [0.25, 0.55, 0.9][hypothesis]);
+    Object.assign(view.context, { fillStyle: view.colour(filter.name), globalAlpha: [0.25, 0.55, 0.9][hypothesis] });
+    steps.forEach((step, i) => {
+      const own = (step.estimates[filter.name]?.weights[hypothesis] ?? 0) * (bottom - top);
+      heights[i] += own;
+      view.context.fillRect(toX(i), bottom - heights[i], toX(i + 1) - toX(i), own);
+    });
   });
-  const frame = [[0, top], [width, top], [width, bottom], [0, bottom], [0, top]];
-  view.line(frame, view.colour("text"), { width: 1, alpha: 0.2 });
-  const order = filter.weightNames.length > 1 ? ", from below" : "";
-  view.text(`${filter.name}: ${filter.weightNames.join(", ")}${order}`, 0, 12);
+  view.context.globalAlpha = 1;
+  view.line([[0, top], [width, top]], view.colour("text"), { width: 1, alpha: 0.2 });
+  view.text(`${filter.name}, from below: ${filter.weightNames.join(", ")}`, 0, 12);
 }
 
 function element(tag, properties = {}, ...children) {
@@ -324,7 +326,15 @@ class Playground {
     Object.assign(this, { root, filters, paused });
     this.settings = Object.fromEntries(Object.entries(SETTINGS).map(([name, { value }]) => [name, value]));
     this.build();
-    this.views = [this.map, this.errors, ...this.weights].map((canvas) => new View(canvas));
+    this.views = [this.layer, this.map, this.errors, ...this.weights].map((canvas) => new View(canvas));
+    const [above, map, errors, ...weights] = this.views;
+    this.parts = [
+      (steps, shown) => drawMap(map, steps, shown, this.region(steps)),
+      (steps, shown, known) => drawErrors(errors, steps, shown, known),
+      ...weights.map((view, i) => (steps) => drawWeights(view, steps, this.filters[i])),
+      (steps, shown, known) => this.tabulate(steps, known),
+    ];
+    Object.assign(this, { above, waiting: new Set() });
     this.restart();
     this.listen();
     root.dataset.state = "ready";
@@ -332,10 +342,11 @@ class Playground {
   }
 
   build() {
-    const words = "Map of a target and four filters. Arrow keys steer the target, space pauses.";
-    this.map = element("canvas", { className: "map", tabIndex: 0, role: "img", ariaLabel: words });
-    this.errors = element("canvas", { className: "errors" });
-    this.weights = this.filters.map(() => element("canvas", { className: "weights" }));
+    const ariaLabel = "Map of a target and four filters. Arrow keys steer the target, space pauses.";
+    const canvas = (className, more = {}) => element("canvas", { className, ...more });
+    this.map = canvas("map", { tabIndex: 0, role: "img", ariaLabel });
+    [this.layer, this.errors] = [canvas("map layer"), canvas("errors")];
+    this.weights = this.filters.map(() => canvas("weights"));
     const button = (words) => element("button", { type: "button", textContent: words });
     [this.pause, this.again] = [button(this.paused ? "Go on" : "Pause"), button("Start again")];
     this.file = element("input", { type: "file", accept: ".csv,text/csv" });
@@ -364,9 +375,10 @@ class Playground {
     const table = element("table", {}, element("tr", {}, ...this.heads), ...rows);
     const part = (className, ...children) => element("div", { className }, ...children);
     const file = element("label", {}, "your file ", this.file);
+    const controls = part("controls", this.pause, this.again, file, this.endLabel);
     const middle = part("columns", table, part("sliders", ...sliders));
-    this.root.append(this.map, part("controls", this.pause, this.again, file, this.endLabel), this.status, middle);
-    this.root.append(this.errors, part("columns", ...this.weights));
+    const weights = part("columns", ...this.weights);
+    this.root.append(this.map, this.layer, controls, this.status, middle, this.errors, weights);
   }
 
   listen() {
@@ -441,21 +453,20 @@ class Playground {
     }
   }
 
+  /* The target moves in every frame. What depends on the steps is drawn one part a frame: a thousand take long. */
   frame(before, now) {
     requestAnimationFrame((later) => this.frame(now, later));
     if (!this.visible) return;
-    const live = this.text === null;
-    if (live && !this.paused) this.advance(Math.min((now - before) / 1000, 0.1) * HASTE);
-    const steps = live ? this.track.steps : this.track.steps.slice(0, this.end.value).slice(-IN_VIEW);
-    const shown = this.filters.filter((filter) => filter.shown);
-    const [map, errors, ...weights] = this.views;
-    if (live || this.stale) drawMap(map, steps, shown, live ? this.target : null, this.region(steps));
-    if (!this.stale) return;
-    const known = steps.some((step) => Number.isFinite(step.truth_x));
-    drawErrors(errors, steps, shown, known);
-    weights.forEach((view, i) => drawWeights(view, steps, this.filters[i]));
-    this.tabulate(steps, known);
+    if (this.text === null && !this.paused) this.advance(Math.min((now - before) / 1000, 0.1) * HASTE);
+    if (this.stale) this.parts.forEach((part) => this.waiting.add(part));
     this.stale = false;
+    const [part] = this.waiting;
+    this.waiting.delete(part);
+    const live = this.text === null;
+    const steps = live ? this.track.steps : this.track.steps.slice(0, this.end.value).slice(-IN_VIEW);
+    part?.(steps, this.filters.filter((filter) => filter.shown), steps.some((step) => Number.isFinite(step.truth_x)));
+    if (live) drawTarget(this.above, this.target, this.region(steps));
+    else this.above.begin();
   }
 
   /* Let the target move; whenever a scan is due, the filters get what it says. */

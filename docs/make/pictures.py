@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
-from filtergym.evaluation.figures.looks import styles
+from filtergym.evaluation.figures.looks import COLOURS, styles
 from filtergym.evaluation.figures.print_layout import (
     add_title,
     figure_with_axes,
+    figure_with_pairs,
     in_print,
     logarithmic,
 )
@@ -150,3 +151,62 @@ def draw_differences(
     axis.set_xlabel(f"cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4, axis="x")
     return add_title(figure, title)
+
+
+PUBLIC_FILTERS = ("extended", "extended, tuned", "kalman-imm, tuned", "OKF", "kalman-net", "known-model")
+"""Of those on KalmanNet's problems: as written, rivals that are tuned, the learned one, and the reference."""
+LEARNED = "kalman-net", "KalmanNet"
+
+
+@in_print
+def draw_public_problems(
+    rows: Sequence[Mapping[str, Any]], drives: Mapping[str, Sequence[float]], *, columns: int = 2
+) -> Any:
+    """Dots with intervals: the mean squared error of filters on KalmanNet's problems; and of each of NCLT's drives.
+
+    Args:
+        rows: of the records, all with ``problem``, ``name``, ``mse_db``, ``low_db`` and ``high_db``.
+        drives: filter -> RMSE a coordinate of every test drive, m.
+        columns: of a paper, as wide as which it is.
+    """
+    [exact] = [row for row in rows if row["problem"] == "linear, exact"]
+    panels = list(dict.fromkeys(row["problem"] for row in rows if row is not exact))
+    figure, axes = figure_with_pairs(len(panels) // 2 + 1, columns)
+    figure.set_figheight(0.7 * figure.get_figheight())
+    cells = axes.ravel().tolist()
+    for axis, title in zip(cells, panels, strict=False):
+        own = {row["name"]: row for row in rows if row["problem"] == title}
+        if title.startswith("linear"):  # the same tracks
+            own["known-model"] = exact
+        shown = [name for name in PUBLIC_FILTERS if name in own]
+        for place, name in enumerate(shown):
+            value, low, high = (own[name][key] for key in ("mse_db", "low_db", "high_db"))
+            axis.errorbar(value, place, xerr=[[value - low], [high - value]], **_look_of(name))
+        _name_rows(axis, title, shown, "mean squared error, dB")
+    axis = cells[len(panels)]
+    for place, (name, errors) in enumerate(drives.items()):
+        for error in errors:
+            axis.errorbar(error, place, **_look_of(name))
+    axis.set_xscale("log")
+    logarithmic(axis.xaxis)
+    _name_rows(axis, "NCLT, three drives", list(drives), "RMSE, m")
+    rest = cells[len(panels) + 1]
+    rest.axis("off")
+    words = {"extended": "as written, or published", "OKF": "tuned on training data", "kalman-net": "learned"}
+    handles = [rest.errorbar([], [], label=text, **_look_of(name)) for name, text in words.items()]
+    rest.legend(handles=handles, loc="center", frameon=False)
+    return figure
+
+
+def _look_of(name: str) -> dict[str, Any]:
+    learned = name.startswith(LEARNED)
+    colour = COLOURS[1] if learned else COLOURS[0] if name == "OKF" or "tuned" in name else "0.45"
+    return {"fmt": "D" if learned else "o", "ms": 4.0, "color": colour, "elinewidth": 1.2}
+
+
+def _name_rows(axis: Any, title: str, names: Sequence[str], quantity: str) -> None:
+    axis.set_yticks(range(len(names)), names)
+    axis.set_ylim(len(names) - 0.5, -0.5)
+    axis.set_title(title, loc="left")
+    axis.set_xlabel(quantity)
+    axis.grid(alpha=0.25, lw=0.4)

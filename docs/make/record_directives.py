@@ -4,6 +4,7 @@ A mistake in a name is a warning, with which a build under ``-W`` ends. CONTRIBU
 """
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from filtergym.evaluation.figures.print_layout import save
 from filtergym.evaluation.storage.files import write_text
 from filtergym.papers.grid import markdown_table
 from front import budgets_markdown, draw_fronts, panels_of
+from pictures import draw_public_problems
 from playground import page_script, read_modules
 from records import (
     BENCHMARK,
@@ -153,6 +155,24 @@ class FrontFigure(_Rendered):
             raise ValueError(f"the records of {', '.join(names)} hold no times")
         words = f"Cost against processor time of every competitor: {', '.join(names)}"
         return "_".join(["front", *self.name_given.split()]), words, draw_fronts(panels)
+
+
+class PublicFigure(_Rendered):
+    """``{public-figure}``: KalmanNet's problems, with rivals that are tuned."""
+
+    def figure(self) -> tuple[str, str, Any]:
+        """Return all problems in one picture."""
+        figures = {name: self.record(f"public_{name}").data for name in ("problems", "optimised", "drives")}
+        rows = [row for name in ("problems", "optimised") for row in figures[name]["figures"]["rows"]]
+        drives = {
+            re.sub("(, architecture 1)?, of filternet", " (filternet)", name): [
+                float(error) for error in errors
+            ]
+            for whose, name, *errors in (row[:5] for row in figures["drives"]["rows"])
+            if not name.startswith("wheels")
+        }
+        words = "Errors of filters on the problems that learned Kalman filters are published on"
+        return "public_problems", words, draw_public_problems(rows, drives)
 
 
 class BudgetsTable(_Rendered):
@@ -322,6 +342,7 @@ DIRECTIVES = {
     "comparison": ComparisonTables,
     "comparison-overview": ComparisonOverview,
     "front-figure": FrontFigure,
+    "public-figure": PublicFigure,
     "budgets-table": BudgetsTable,
     "seeds": SeedsTables,
     "seed-profiles": SeedProfiles,
