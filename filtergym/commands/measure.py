@@ -199,10 +199,10 @@ def evaluate_policies(
         raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
     if protocol is not None:
         check_options(ctx)
-        rename = isolate_names if isolated else None
+        isolating = isolate_names if isolated else None
         with limit_programs(time_limit, memory_limit), Workers(jobs, cluster) as workers:
             evaluate_protocol(
-                protocol, policy or [], workers, json, trust, rename, backend=backend, threads=threads
+                protocol, policy or [], workers, json, trust, isolating, backend=backend, threads=threads
             )
         return
     keywords = parse_settings(settings or [])
