@@ -27,8 +27,10 @@ import numpy
 import torch
 
 from ..envs.contract.model import Model
-from ..envs.contract.parameters import check_integer
+from ..envs.contract.parameters import Limits, check, check_integer
 from ..envs.engine.catalogue import nearest
+from ..envs.engine.reward import LIKELIHOOD_WEIGHTS
+from ..envs.engine.rollout import Reward
 from ..envs.engine.scenario_choice import find_mixture
 from ..envs.interface.vector_environment import TaskVectorEnv
 from ..evaluation.competitors.kinds import Policy
@@ -41,7 +43,7 @@ from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
 from .training_run import TrainingRun, schedule
 from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
-from .unrolled import Unrolled
+from .unrolled import Teacher, Unrolled
 
 NETWORKS = ("linear", "feedforward", "recurrent")
 """A linear rule; one hidden layer; a gated recurrent unit, which remembers."""
@@ -276,6 +278,22 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
+def _reward_with_teacher(run: TrainingRun) -> Reward:
+    """Reward whose gradient is followed, with the share of it that a teacher gives.
+
+    Raises:
+        ValueError: if a teacher cannot give it.
+    """
+    kind, values = _reward_to_descend(run), run.hyperparameters
+    if values.get("teacher") is None:
+        return Reward(kind)
+    if kind not in LIKELIHOOD_WEIGHTS:
+        raise nearest("reward of a student", kind, LIKELIHOOD_WEIGHTS)
+    share = values.get("teacher_share", 1.0)
+    check("teacher_share", share, float, Limits(above=0.0, at_most=1.0))
+    return Reward(kind, share)
+
+
 def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:
     """Return the agent that a network in training is by now."""
     network = LearnedPolicy(model, policy.arrays(), "tanh", ACTIVATION, policy.fields(model))
@@ -323,10 +341,15 @@ class Descent:
         """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
+        teacher = self.values.get("teacher")
         if env.backend == "compiled":
-            return Unrolled(
-                env, policy, truncation, _reward_to_descend(self.run), gate, largest
-            ).descend_episodes
+            reward = _reward_with_teacher(self.run)
+            beside = None if teacher is None else Teacher(env, teacher)
+            return Unrolled(env, policy, truncation, reward, beside, gate, largest).descend_episodes
+        if teacher is not None:
+            raise ValueError(
+                f"teacher {teacher!r} needs compiled episodes, and these run on torch: leave it out"
+            )
         return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
 
     def update(self) -> float:

@@ -20,7 +20,7 @@ OPTIONS = ("control", "scenario", "backend")
 """Keywords of an environment that a run has options for."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training takes."""
-ESTIMATORS = ("kalman-net",)
+ESTIMATORS = ("kalman-net", "student")
 """Algorithms that make a learned estimator: they steer a filter of their own (``Task.trained_banks``)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
@@ -156,7 +156,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"first_action", "max_action_grad", "network", "fields_kept"}
+        known |= {"first_action", "max_action_grad", "network", "fields_kept", "teacher", "teacher_share"}
     else:
         from .sb3_training import ALGORITHMS
 

@@ -61,6 +61,7 @@ FILES = {
     "bptt-linear": "bptt_linear",
     "bptt-small": "bptt_small",
     "kalman-net": "kalman_net",
+    "student": "student",
 }
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 LIBRARIES = ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib")

@@ -11,9 +11,15 @@ from typing import Any
 import numpy
 import torch
 
-from ..envs.contract.observation import DecisionMeans
-from ..envs.engine.rollout import Rollout
+from ..baselines.problem import Problem
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.observation import Array, DecisionMeans
+from ..envs.engine.compiled import can_step
+from ..envs.engine.lanes import Lanes
+from ..envs.engine.rollout import Reward, Rollout
 from ..envs.interface.vector_environment import TaskVectorEnv
+from ..evaluation.competitors.filters import put_in_loop
+from ..evaluation.competitors.kinds import kind_of
 from .gate import Gate
 
 LIMIT = 10.0
@@ -250,6 +256,49 @@ def _add_gradient(parameter: Any, gradient: numpy.ndarray) -> None:
     parameter.grad = added if parameter.grad is None else parameter.grad + added
 
 
+class Teacher:
+    """A filter that takes in the measurements of episodes, and whose estimates a student learns from.
+
+    Args:
+        env: whose episodes they are, with compiled backend.
+        name: of an estimator of the environment's own, or of a reference, which is told more.
+
+    Raises:
+        ValueError: if there is none, it cannot run as compiled code, or the world follows its estimates.
+    """
+
+    def __init__(self, env: TaskVectorEnv, name: str) -> None:
+        competitor = Problem.of(type(env.task)).competitor(name)
+        kind = kind_of(competitor)
+        if kind not in ("estimator", "reference"):
+            raise ValueError(f"a teacher is an estimator or a reference, but {name!r} is of kind {kind}")
+        if env.task.closes_loop:
+            raise ValueError(
+                f"{name!r} cannot teach in {env.task.id}: what is measured follows its own estimates there"
+            )
+        model = put_in_loop(env.model, competitor, kind, name, env.num_envs)
+        if not can_step(model, _estimate):
+            raise ValueError(f"{name!r} cannot teach: it does not run as compiled code")
+        self._lanes = Lanes(model, env.num_envs, report=_estimate)
+
+    def estimates(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Return means ``(measurements, C, width)`` and covariances ``(measurements, C, C, width)`` of episodes.
+
+        Args:
+            identities: of the episodes, ``(2, width)``.
+        """
+        self._lanes.begin(identities[:, : self._lanes.count])
+        found: tuple[numpy.ndarray, numpy.ndarray] = self._lanes.run(_estimate)[0]
+        return found
+
+
+def _estimate(model: Model, episode: Episode) -> tuple[Array, Array]:
+    return model.mean(episode), model.covariance(episode)
+
+
+COST = Reward("cost")
+
+
 class Unrolled:
     """Windows of decisions of N compiled episodes under a policy, flown and differentiated.
 
@@ -258,7 +307,8 @@ class Unrolled:
             noise.
         policy: a :class:`~.bptt.NetworkPolicy`.
         truncation: most decisions of a window.
-        reward: that is ascended, as in :mod:`~..envs.reward`: the agent's own part of it.
+        reward: that is ascended: the agent's own part of it.
+        teacher: whose estimates are learned from, where the reward has a share of them.
         gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
         largest: see :func:`.bptt.descend_episodes`.
     """
@@ -268,7 +318,8 @@ class Unrolled:
         env: TaskVectorEnv,
         policy: Any,
         truncation: int,
-        reward: str = "cost",
+        reward: Reward = COST,
+        teacher: Teacher | None = None,
         gate: Gate | None = None,
         largest: float | None = None,
     ) -> None:
@@ -276,6 +327,7 @@ class Unrolled:
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation, self._largest = min(truncation, env.last_decision), largest
         self._rollout = Rollout(env.model, reward, lanes.width, self._truncation * self._interval)
+        self._teacher, self._flown = teacher, 0
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
         self._gate: Any = gate
         self._gate_memory: Any = None
@@ -297,6 +349,8 @@ class Unrolled:
     def _begin(self) -> None:
         self._observation = self._env.reset()[0].T
         self._rollout.load(self._lanes.state)
+        if self._teacher is not None:
+            self._taught, self._flown = self._teacher.estimates(self._lanes.noise.identities), 0
         self._policy.begin()
         self._gate_memory, self._start = None, numpy.ones(self._env.num_envs, dtype=bool)
 
@@ -309,6 +363,11 @@ class Unrolled:
         rollout, policy, count, interval = self._rollout, self._policy, self._lanes.count, self._interval
         paid = 0.0
         policy.read()
+        if self._teacher is not None:
+            window = slice(self._flown, self._flown + decisions * interval)
+            for given, answers in zip(rollout.teacher, self._taught, strict=True):
+                given[: decisions * interval] = answers[window].reshape(-1, *given.shape[1:])
+            self._flown = window.stop
         for decision in range(decisions):
             action = policy.forward(decision, self._observation)
             if self._gate is not None:

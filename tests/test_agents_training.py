@@ -49,8 +49,9 @@ SMALL = {
     "bptt-linear": {"fields_kept": 2, "truncation": 40},
     "bptt-small": {"hidden_size": 4, "fields_kept": 3, "truncation": 40},
     "kalman-net": {"hidden_size": 4, "truncation": 40},
+    "student": {"hidden_size": 4, "truncation": 40},
 }  # fmt: skip
-CONTROL = {"dqn": "mode", "kalman-net": "kalman-net"}
+CONTROL = {"dqn": "mode", "kalman-net": "kalman-net", "student": "student"}
 
 
 @pytest.fixture(autouse=True)
@@ -84,7 +85,8 @@ def weights(algorithm, folder):
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "bptt-linear", "bptt-small", "kalman-net"]
+    "algorithm",
+    ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "bptt-linear", "bptt-small", "kalman-net", "student"],
 )
 def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
     # Interrupted at about a third, in the middle of an episode; bptt and kalman-net learn from whole ones.

@@ -127,6 +127,7 @@ def random_policy(env, dtype, network="recurrent"):
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "recurrent"),
         pytest.param("ManeuveringTarget", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
         ("ManeuveringTarget", "kalman-net", {}, 0.01, "recurrent"),
+        ("ManeuveringTarget", "student", {}, None, "recurrent"),
         ("LooselyCoupledNavigation", "kalman-net", {"decision_interval": 2}, None, "recurrent"),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
         ("UavAutopilot", "gain", {}, None, "recurrent"),

@@ -1,4 +1,4 @@
-"""The learned estimator kalman-net: its filters against matrices written out, its training, its file."""
+"""Learned estimators: the filters of kalman-net against matrices written out, their training, their files."""
 
 import json
 
@@ -27,6 +27,7 @@ NAME = "kalman-net"
 SATELLITES = "filtergym/TightlyCoupledNavigation-v0"
 SHORT = {SATELLITES: {"horizon": 60, "backend": "numpy"}}
 """Of what takes long to compile."""
+TRAINED = [(id, name) for id, cls in catalogue().items() for name in cls.trained_banks]
 HAVING = [id for id, cls in catalogue().items() if NAME in cls.trained_banks]
 
 
@@ -48,9 +49,9 @@ def network(model, answer=0.0):
     return LearnedPolicy(model, arrays, "tanh")
 
 
-def episodes(id, count, steps, **keywords):
+def episodes(id, count, steps, name="kalman-net", **keywords):
     """Initial, and the measurements of episodes of the training distribution."""
-    model = make_model(id, NAME, **keywords)
+    model = make_model(id, name, **keywords)
     rng = np.random.default_rng(2)
     draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
     truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
@@ -297,21 +298,21 @@ def test_covariance_of_the_augmented_filter_under_any_gain_is_josephs():
     np.testing.assert_allclose(found, joseph[np.triu_indices(3)], rtol=1e-12)
 
 
-@pytest.mark.parametrize("id", HAVING)
+@pytest.mark.parametrize(("id", "name"), TRAINED)
 @pytest.mark.parametrize("answer", [-0.999, 0.999, "random"])
-def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, answer):
+def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, name, answer):
     """An evaluation refuses what is not finite, symmetric and positive definite."""
-    maker = EstimatorMaker(NAME, lambda model: network(model, answer))
+    maker = EstimatorMaker(name, lambda model: network(model, answer))
     cost = filtergym.evaluate(id, {"net": maker}, episodes=16, **SHORT.get(id, {}))["cost"]
     assert float(cost.max()) < 1e6
 
 
-@pytest.mark.parametrize("id", HAVING)
-def test_the_estimator_is_the_policy_in_its_bank(id):
+@pytest.mark.parametrize(("id", "name"), TRAINED)
+def test_the_estimator_is_the_policy_in_its_bank(id, name):
     """What is trained in the environment is what is evaluated outside of it."""
-    model, initial, measurements = episodes(id, 8, 40)
+    model, initial, measurements = episodes(id, 8, 40, name)
     estimator, policy = (
-        Asked(EstimatorMaker(NAME, lambda model: network(model, "random"))(model.task)),
+        Asked(EstimatorMaker(name, lambda model: network(model, "random"))(model.task)),
         network(model, "random"),
     )
     memory, state, hidden = estimator.start(initial, 8), model.filter.start(initial), None

@@ -192,7 +192,7 @@ def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
 def test_shipped_hyperparameters_pass_the_check_of_settings():
     for algorithm in training_run.FILES:
         # A learned estimator steers a filter of its own, and no control.
-        control = {"dqn": "mode", "kalman-net": "kalman-net"}.get(algorithm, "gain")
+        control = {"dqn": "mode", "kalman-net": "kalman-net", "student": "student"}.get(algorithm, "gain")
         new_run(problem_of(ID), RunOptions(algorithm, control, overrides={"learning_rate": 1e-4}))
 
 

@@ -19,6 +19,7 @@ from filtergym.evaluation.storage.files import writable_file, write_text
 from filtergym.evaluation.storage.store import UNFINISHED, Store
 from front import draw_fronts, panels_of
 from notebooks import notebook_files, write_executed
+from playground import FILTERS, compile_filter, has_compiler, module_file
 from readme import with_numbers, with_printed
 from records import (
     BENCHMARK,
@@ -256,12 +257,26 @@ def ship(
         console.print(f"{file}: {best.name}, of the lowest validation cost")
 
 
+def playground() -> None:
+    """Compile the filters of the first page to WebAssembly, which needs zig's C compiler: pip install ziglang.
+
+    Example: python docs/make playground
+    """
+    if not has_compiler():
+        raise ValueError("zig's C compiler is not installed: pip install ziglang")
+    for name in FILTERS:
+        module = compile_filter(name)
+        module_file(name).write_bytes(module)
+        console.print(f"{module_file(name)}: {len(module):,} bytes", soft_wrap=True)
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "record": record,
     "table": table,
     "seeds": seeds,
     "ship": ship,
     "readme": readme,
+    "playground": playground,
     "notebooks": notebooks,
 }
 

@@ -8,6 +8,8 @@
   too.
 * ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must
   be both accurate and consistent.
+* ``cost-and-covariance``: the same with a fortieth of the log-likelihood, for an estimator that answers with its
+  covariance itself: accuracy rules what it estimates, and the covariance still follows the errors.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
@@ -25,6 +27,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ...filters.gaussian import log_density
+from ...filters.ordered_sums import ordered_sum
+from ...filters.small_matrices import solve_definite
 from ..contract.model import Model
 from ..contract.observation import Array
 
@@ -32,11 +36,20 @@ COMPRESSED_BEYOND = 30.0
 """Charge, in units of the paper's average one, from which on the reward falls slowly."""
 
 
+COVARIANCE_WEIGHT = 1 / 40
+"""Of the log-density of a component in ``cost-and-covariance``, ours: small beside what errors are charged."""
+
+
+def compress(model: Model, charged: Array) -> Array:
+    """Charge in units of the paper's average one, compressed, ``(N,)``."""
+    return COMPRESSED_BEYOND * model.task.xp.log1p(
+        charged * (1.0 / (COMPRESSED_BEYOND * model.task.reward_unit))
+    )
+
+
 def charge(model: Model, state: Any) -> Array:
     """What the estimate is charged in the reward, in units of the paper's average charge, compressed, ``(N,)``."""
-    return COMPRESSED_BEYOND * model.task.xp.log1p(
-        model.charge(state) * (1.0 / (COMPRESSED_BEYOND * model.task.reward_unit))
-    )
+    return compress(model, model.charge(state))
 
 
 def cost_reward(model: Model, state: Any) -> Array:
@@ -62,6 +75,41 @@ def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
     )
 
 
+def cost_and_covariance_reward(model: Model, state: Any) -> Array:
+    """Likewise, with the density weighted by ``COVARIANCE_WEIGHT``, ``(N,)``."""
+    weight = COVARIANCE_WEIGHT / len(model.task.components)
+    return cost_reward(model, state) + log_likelihood_reward(model, state) * weight
+
+
+LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0, "cost-and-covariance": COVARIANCE_WEIGHT}
+"""Of the log-density of a component, in the rewards that a teacher can give."""
+
+
+def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance: Array) -> Array:
+    """Expected reward, up to a constant, if the truth is distributed as a teacher says, ``(N,)``.
+
+    With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
+    expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A charge is a square of errors, and adds what the teacher's own
+    errors are charged, which the student cannot change: it is charged for d.
+
+    Args:
+        kind: of reward, one of ``LIKELIHOOD_WEIGHTS``.
+        model: of the student.
+        state: its episodes after the action.
+        mean: of the teacher, ``(C, N)``.
+        covariance: S, ``(C, C, N)``.
+    """
+    world, difference = model.task.world, model.mean(state) - mean
+    reward = -compress(model, world.charge(state.truth, world.state(state.truth) + difference))
+    weight = LIKELIHOOD_WEIGHTS[kind] / len(model.task.components)
+    if not weight:
+        return reward
+    P = model.covariance(state)
+    ratio = solve_definite(P, covariance)
+    trace = ordered_sum(ratio[i, i] for i in range(ratio.shape[0]))
+    return reward + weight * (log_density(difference, P)[0] - 0.5 * trace)
+
+
 def no_reward(model: Model, state: Any) -> Array:
     """Zero, ``(N,)``, where the truth is not known."""
     return 0.0 * model.mean(state)[0]
@@ -71,6 +119,7 @@ OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
+    "cost-and-covariance": cost_and_covariance_reward,
     "relative": cost_reward,
     "log-relative": log_cost_reward,
     "none": no_reward,

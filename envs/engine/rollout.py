@@ -6,7 +6,7 @@ comes out of it into that with respect to what went in.
 """
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -14,10 +14,17 @@ from ...compiler import namespace as traced
 from ...compiler.functions import Specialised, address_of, empty_lanes, leaves, map_arrays
 from ...compiler.gradients import pullback
 from ..contract.model import Episode
-from .programs import Programs, step_episodes
+from .programs import Programs
+from .reward import OWN_PAY, teacher_reward
 
-ADDRESS_SLOTS = slice(1, 7, 2)
-"""Where the table of a :class:`~..compiler.functions.Call` holds the addresses of episodes, action and noise."""
+
+class Reward(NamedTuple):
+    """What the gradient is of."""
+
+    kind: str
+    """Of reward."""
+    teacher_share: float = 0.0
+    """Share of what a teacher's estimates say in the place of the truth, see :func:`.reward.teacher_reward`."""
 
 
 def _unpack(like: Episode, state: Any) -> Episode:
@@ -39,29 +46,38 @@ def _pack(episode: Episode) -> Any:
     return traced.concat([traced.reshape(array, (-1, 1)) for array in arrays])
 
 
-def _forward(programs: Programs, kind: str, state: Any, action: Any, noise: Any) -> Any:
+def _forward(programs: Programs, reward: Reward, state: Any, action: Any, noise: Any, *teacher: Any) -> Any:
     """Episodes at the next measurement, reward, and observation."""
-    episode = _unpack(programs.later.episode, state)
-    episode, reward, shown = step_episodes(kind, programs.traced, episode, action, noise)
-    return _pack(episode), reward, shown
+    model = programs.traced
+    after = model.act(_unpack(programs.later.episode, state), action)
+    episode, own = model.measure(after, noise), OWN_PAY[reward.kind](model, after)
+    if teacher:
+        taught = teacher_reward(reward.kind, model, after, *teacher)
+        own = (1.0 - reward.teacher_share) * own + reward.teacher_share * taught
+    return _pack(episode), own, model.observe(episode)
 
 
-def _backward(programs: Programs, kind: str, state: Any, action: Any, noise: Any, *adjoints: Any) -> Any:
-    """Gradients with respect to episodes and action, from those with respect to what :func:`_forward` returns."""
-    outputs = _forward(programs, kind, state, action, noise)
-    return tuple(pullback(programs.graph, outputs, adjoints, (state, action)))
+def _backward(programs: Programs, reward: Reward, state: Any, action: Any, noise: Any, *others: Any) -> Any:
+    """Gradients with respect to episodes and action, from those with respect to what :func:`_forward` returns.
+
+    The last three arguments are the latter; what stands before them is the teacher's.
+    """
+    outputs = _forward(programs, reward, state, action, noise, *others[:-3])
+    return tuple(pullback(programs.graph, outputs, others[-3:], (state, action)))
 
 
 @functools.lru_cache(16)
-def _compile(programs: Programs, kind: str) -> tuple[Specialised, Specialised]:
+def _compile(programs: Programs, reward: Reward) -> tuple[Specialised, Specialised]:
     rows = sum(int(numpy.prod(leaf.shape[:-1])) for leaf in leaves(programs.later.episode))
     state = numpy.zeros((rows, 8))
     action = numpy.zeros((*(programs.traced.action_space.shape or ()), 8))
-    given = (state, action, programs.row)
+    C = len(programs.traced.task.components)
+    teacher = (numpy.zeros((C, 8)), numpy.zeros((C, C, 8))) if reward.teacher_share else ()
+    given = (state, action, programs.row, *teacher)
     answer = (state, numpy.zeros(8), numpy.zeros((len(programs.traced.fields), 8)))
     made = []
     for function, parts in ((_forward, given), (_backward, (*given, *answer))):
-        bound = functools.partial(function, programs, kind)
+        bound = functools.partial(function, programs, reward)
         made.append(Specialised(bound, programs.graph, parts, unchanged=0))
     return made[0], made[1]
 
@@ -71,13 +87,15 @@ class Rollout:
 
     Args:
         model: compiled.
-        kind: of reward.
+        reward: whose gradient it is.
         width: lanes, a multiple of eight.
         measurements: that are kept at once.
 
     Attributes:
         action: of every measurement, ``(measurements, A, width)``, to be written before it is flown.
         noise: likewise, ``(measurements, row width, width)``.
+        teacher: likewise, means ``(measurements, C, width)`` and covariances ``(measurements, C C, width)`` of a
+            teacher; nothing where there is none.
         reward: of the last action, ``(width,)``.
         shown: last observation, ``(fields, width)``.
         reward_adjoint: gradient with respect to the reward, ``(width,)``, to be written.
@@ -85,18 +103,19 @@ class Rollout:
         action_adjoint: gradient with respect to the action, ``(A, width)``.
     """
 
-    def __init__(self, model: Any, kind: str, width: int, measurements: int) -> None:
-        forward, backward = _compile(model.programs, kind)
-        rows, actions, noise = (leaf.rows for leaf in forward.inputs)
+    def __init__(self, model: Any, reward: Reward, width: int, measurements: int) -> None:
+        forward, backward = _compile(model.programs, reward)
+        rows, actions, noise, *teacher = (leaf.rows for leaf in forward.inputs)
         self._states = [empty_lanes((rows,), width) for _ in range(measurements + 1)]
         self._next = empty_lanes((rows,), width)
         self.action = numpy.zeros((measurements, actions, width))
         self.noise = numpy.zeros((measurements, noise, width))
+        self.teacher = [numpy.zeros((measurements, each, width)) for each in teacher]
         self.reward, self.shown = numpy.empty(width), empty_lanes((len(model.fields),), width)
         self.reward_adjoint = numpy.zeros(width)
         self.shown_adjoint = numpy.zeros((len(model.fields), width))
         self.action_adjoint = numpy.zeros((actions, width))
-        given = [self._states[0], self.action[0], self.noise[0]]
+        given = [self._states[0], self.action[0], self.noise[0], *(each[0] for each in self.teacher)]
         self._forward = forward.bound(given, [self._next, self.reward, self.shown])
         adjoint, other = empty_lanes((rows,), width), empty_lanes((rows,), width)
         # One reads what the other has written.
@@ -106,8 +125,12 @@ class Rollout:
             )
             for after, before in ((adjoint, other), (other, adjoint))
         ]
-        memories = zip(self._states[:-1], self.action, self.noise, strict=True)
+        memories = zip(self._states[:-1], self.action, self.noise, *self.teacher, strict=True)
         self._places = numpy.array([[address_of(array) for array in memory] for memory in memories])
+        self._adjoint = len(given)
+        """Place among the arrays of a call of the gradient with respect to the episodes after it."""
+        self._addresses = slice(1, 1 + 2 * len(given), 2)
+        """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of what is given."""
         self._width, self._flown = width, 0
 
     def load(self, episode: Episode) -> None:
@@ -124,7 +147,7 @@ class Rollout:
     def forward(self) -> None:
         """Fly one measurement."""
         here = self._flown
-        self._forward.table[ADDRESS_SLOTS] = self._places[here]
+        self._forward.table[self._addresses] = self._places[here]
         self._forward(0, self._width)
         # The code writes a row here and a row there, which is slow outside the cache.
         self._states[here + 1][...] = self._next
@@ -132,11 +155,11 @@ class Rollout:
 
     def backward_from_here(self) -> None:
         """Let the gradient with respect to the episodes as they are now be zero."""
-        self._backward[0].arrays[3][...] = 0.0
+        self._backward[0].arrays[self._adjoint][...] = 0.0
 
     def backward(self, measurement: int) -> None:
         """Go back over a measurement, the last one first."""
         backward = self._backward[0]
-        backward.table[ADDRESS_SLOTS] = self._places[measurement]
+        backward.table[self._addresses] = self._places[measurement]
         backward(0, self._width)
         self._backward.reverse()

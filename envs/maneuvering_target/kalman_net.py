@@ -24,8 +24,8 @@ of them that nobody knows.
 """
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -99,6 +99,80 @@ def frame_of(velocity: Array) -> Array:
     return xp.stack([direction, xp.stack([-direction[1], direction[0]])])
 
 
+def sensor_blocks(
+    bank: Any, variances: Callable[..., Array], coupling: Callable[..., Array]
+) -> Sequence[Block]:
+    """Blocks of the covariance of a measurement in the frame.
+
+    Args:
+        bank: that shows them.
+        variances: along and across, ``(2, N)``, m^2, of the bank's state and the measurement.
+        coupling: the correlation, ``(N,)``, likewise.
+    """
+    xp, p = bank.xp, bank.parameters
+    return (
+        Block(
+            "measurement_sigma",
+            lambda f, z: 0.5 * xp.log(variances(f, z) * (1.0 / p.range_sigma**2)),
+            "the measurement's sigma over range_sigma",
+            FRAME,
+            KEPT_AS_LOG,
+        ),
+        Block("measurement_correlation", coupling, "correlation of the measurement's errors"),
+    )
+
+
+def clock_blocks(bank: Any) -> Sequence[Block]:
+    """Blocks of the predicted speed, of the scan and of what it saw, for a bank with a ``mean``."""
+    xp, p = bank.xp, bank.parameters
+    return (
+        Block(
+            "speed",
+            lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
+            "the predicted speed over 100 m/s",
+            shown=KEPT_AS_LOG,
+        ),
+        Block(
+            "scan",
+            lambda _, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
+            f"scans since the start over {SCANS_SHOWN}, saturating at 1",
+        ),
+        Block("available", lambda _, measurement: measurement.available, "1 if the scan saw the target"),
+        Block(
+            "interval",
+            lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
+            "the time since the scan before over sampling_interval",
+            shown=KEPT_AS_LOG,
+        ),
+    )
+
+
+def sensor_covariance(measurement: Measurement, xp: Any) -> Array:
+    """Covariance of a measurement, ``(2, 2, N)``, m^2."""
+    none = 0.0 * measurement.variance[0]
+    return xp.stack([xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])])
+
+
+def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
+    """Predict by an acceleration that is held along and across: a turn, and a change of speed.
+
+    Args:
+        mean: x, y (m), vx, vy (m/s), ``(4, N)``.
+        acceleration: along and across, m/s^2, ``(2, N)``.
+        T: interval, s, ``(N,)``.
+
+    Returns:
+        The predicted mean, and the mean before with the turn rate as fifth state, ``(5, N)``.
+    """
+    xp = namespace(mean)
+    rate = 1.0 / speed_of(mean[2:], LEAST_SPEED)
+    turning = xp.concat([mean, (acceleration[1] * rate)[None]])
+    turned = coordinated_turn.propagate(turning, T)
+    faster = T * acceleration[0] * rate
+    position = mean[:2] + (1.0 + 0.5 * faster) * (turned[:2] - mean[:2])
+    return xp.concat([position, (1.0 + faster) * turned[2:4]]), turning
+
+
 class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
     """An extended Kalman filter whose noises, gain and motion the action sets."""
 
@@ -137,16 +211,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
                 FRAME,
                 KEPT_AS_LOG,
             ),
-            Block(
-                "measurement_sigma",
-                lambda f, _: 0.5 * xp.log(f.sensor * (1.0 / p.range_sigma**2)),
-                "the measurement's sigma over range_sigma",
-                FRAME,
-                KEPT_AS_LOG,
-            ),
-            Block(
-                "measurement_correlation", lambda f, _: f.coupling, "correlation of the measurement's errors"
-            ),
+            *sensor_blocks(self, lambda f, _: f.sensor, lambda f, _: f.coupling),
             Block(
                 "acceleration",
                 lambda f, _: f.acceleration * (1.0 / LARGEST_ACCELERATION),
@@ -160,24 +225,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
                 FRAME,
                 KEPT_AS_LOG,
             ),
-            Block(
-                "speed",
-                lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
-                "the predicted speed over 100 m/s",
-                shown=KEPT_AS_LOG,
-            ),
-            Block(
-                "scan",
-                lambda _, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
-                f"scans since the start over {SCANS_SHOWN}, saturating at 1",
-            ),
-            Block("available", lambda _, measurement: measurement.available, "1 if the scan saw the target"),
-            Block(
-                "interval",
-                lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
-                "the time since the scan before over sampling_interval",
-                shown=KEPT_AS_LOG,
-            ),
+            *clock_blocks(self),
         )
 
     def start(self, initial: Initial) -> Track:
@@ -190,21 +238,15 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
     def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict to the scan by the acceleration that was answered, and compare."""
         xp, T = self.xp, measurement.interval
-        along, across = state.acceleration[0], state.acceleration[1]
-        rate = 1.0 / speed_of(state.mean[2:], LEAST_SPEED)
-        turning = xp.concat([state.mean, (across * rate)[None]])
-        turned = coordinated_turn.propagate(turning, T)
-        faster = T * along * rate
-        position = state.mean[:2] + (1.0 + 0.5 * faster) * (turned[:2] - state.mean[:2])
-        mean = xp.concat([position, (1.0 + faster) * turned[2:4]])
+        mean, turning = advance(state.mean, state.acceleration, T)
         F = coordinated_turn.jacobian(turning, T)[:4, :4]
         carried = product(product(F, state.covariance), transpose(F))
         frame = frame_of(mean[2:])
         noise = self.noise(frame, state.deviation, T)
-        R = self.sensor(measurement)
+        R = sensor_covariance(measurement, xp)
         sensor = product(product(frame, R), transpose(frame))
         prior = product(product(frame, carried[:2, :2] + noise[:2, :2]), transpose(frame))
-        innovation = measurement.available * (measurement.position - position)
+        innovation = measurement.available * (measurement.position - mean[:2])
         variances = xp.stack([sensor[0, 0], sensor[1, 1]])
         return state._replace(
             mean=mean,
@@ -213,13 +255,6 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
             prior=xp.stack([prior[0, 0], prior[1, 1]]),
             sensor=variances,
             coupling=sensor[0, 1] / xp.sqrt(variances[0] * variances[1]),
-        )
-
-    def sensor(self, measurement: Measurement) -> Array:
-        """Covariance of a measurement, ``(2, 2, N)``, m^2."""
-        xp, none = self.xp, 0.0 * measurement.variance[0]
-        return xp.stack(
-            [xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])]
         )
 
     def noise(self, frame: Array, deviation: Array, T: Array) -> Array:
@@ -247,7 +282,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         P = state.covariance + self.noise(frame, deviation, measurement.interval)
         agile = deviation * xp.exp(math.log(AGILITY) * a[5:7])
         M = state.covariance[:, :2] + self.noise(frame, agile, measurement.interval)[:, :2]
-        R = self.sensor(measurement) * xp.exp(math.log(NOISE_RANGE) * a[2])
+        R = sensor_covariance(measurement, xp) * xp.exp(math.log(NOISE_RANGE) * a[2])
         caution = product(inverse, xp.exp(math.log(CAUTION) * a[3:5])[:, None] * frame)
         S = M[:2] + product(product(caution, R), caution)
         share = available / (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1])

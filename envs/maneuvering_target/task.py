@@ -27,6 +27,7 @@ from .live import PlotInput
 from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
 from .parameters import ManeuveringTargetParameters
 from .scenarios import SCENARIOS
+from .student import RadarStudentBank
 from .world import RadarWorld
 
 MOST_SCANS = 100_000
@@ -124,7 +125,7 @@ class ManeuveringTarget(Task):
         "mode": FilterBank,
         "weights": FilterBank,
     }
-    trained_banks = {"kalman-net": KalmanNetBank}
+    trained_banks = {"kalman-net": KalmanNetBank, "student": RadarStudentBank}
     reach = {"evidence": ("evidence_scale",)}
     scenarios = SCENARIOS
     components = (

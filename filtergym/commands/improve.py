@@ -109,7 +109,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
     algo: Annotated[
         str,
-        typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear or kalman-net."),
+        typer.Option(
+            help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear, kalman-net or student."
+        ),
     ] = "ppo",
     control: TrainedControl = None,
     scenario: TrainingScenario = None,
@@ -161,7 +163,7 @@ def train(
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one, with --resume or --seeds, also
-    takes --trust. One of bptt or kalman-net cannot.
+    takes --trust. One of bptt, kalman-net or student cannot.
 
     Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
     settings of the run, and refuses others.

@@ -1,0 +1,170 @@
+r"""The fully learned estimator ``student``: a network answers with corrections and covariance at every measurement.
+
+No Kalman filter stands behind it. An environment declares its frame, its units and its motion (:class:`StudentBank`);
+the rest is the same everywhere. With U the rotation into the frame, s the unit of each component there, m what was
+answered of the motion and nu the innovation over the sensor's sigma, zero where nothing was received,
+
+    predict   x' = f(x, m)
+    update    x = x' + U^T diag(s) (G nu + g),  G = G0 + G1 a_G,  g = offset_reach a_g
+    report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_i,  L_ij = coupling_reach L_ii a_ij  (j < i)
+
+where a in [-1, 1] are the network's answers. All zero is a filter with the fixed gain G0. Because everything that is
+shown and answered is relative to the frame, the estimator is as symmetric as the frame is.
+
+A network that is trained through its own recursive estimate is that of Haarnoja and others, "Backprop KF: Learning
+Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs answers with the measurement of a Kalman filter.
+"""
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters.small_matrices import apply, outer, product, transpose
+from .filter import Bank, Initial, Measurement, TaskT
+from .observation import SIGNED_LOG, Array, Block
+
+OFFSET_REACH = 2.0
+"""Largest correction that does not depend on the innovation, in units of the component."""
+DEVIATION_RANGE = 50.0
+"""Largest factor and divisor of a reported deviation, likewise; before what it shares with the components above."""
+COUPLING_REACH = 4.0
+"""Largest entry of a Cholesky factor beside the diagonal, over that on it: correlations of up to 0.97."""
+
+
+class View(NamedTuple):
+    """What an environment says of a measurement and of the estimate predicted to it."""
+
+    mean: Array
+    """Predicted, ``(C, N)``."""
+    frame: Array
+    """U, ``(C, C, N)``; None: the components are the frame."""
+    unit: Array
+    """s, ``(C, N)``."""
+    innovation: Array
+    """nu, ``(m, N)``."""
+
+
+class Track(NamedTuple):
+    """The estimate at one moment."""
+
+    mean: Array
+    """``(C, N)``; predicted between :meth:`StudentBank.predict` and the action."""
+    covariance: Array
+    """As it was reported last, ``(C, C, N)``."""
+    motion: Array
+    """Answered last of the motion, in [-1, 1], ``(k, N)``; one row of zeros where nothing is."""
+    view: View
+    """Of the measurement at hand."""
+
+
+class StudentBank(Bank[TaskT, Measurement, Track]):
+    """An estimate that the action corrects; what an environment declares stands below.
+
+    A subclass says how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and what
+    else is shown (:attr:`features`).
+    """
+
+    gain: ClassVar[Sequence[Sequence[float]]]
+    """G0, ``(C, m)``: what a network without training corrects by."""
+    gain_reach: ClassVar[Sequence[Sequence[float]] | None] = None
+    """G1, likewise: how far its answers go from there; None: ``1 - |G0|``."""
+    axes: ClassVar[Sequence[str]]
+    """Names of the numbers of an innovation, ``(m,)``."""
+    motions: ClassVar[Sequence[str]] = ()
+    """Names of the numbers that are answered of the motion."""
+
+    def __init__(self, task: TaskT, control: str) -> None:
+        super().__init__(task, control)
+        gain = numpy.array(self.gain, dtype=float)
+        reach = 1.0 - abs(gain) if self.gain_reach is None else numpy.array(self.gain_reach, dtype=float)
+        self.size, self.measured = gain.shape
+        constant = task.constant  # type: ignore[attr-defined]
+        self.fixed_gain, self.reach = (constant(each[..., None]) for each in (gain, reach))
+
+    def rotate(self, mean: Array) -> Array:
+        """Return U at an estimate, ``(C, C, N)``; None, as by default, where the components are the frame."""
+        return None
+
+    @abstractmethod
+    def look(self, mean: Array, motion: Array, measurement: Any) -> View:
+        """Predict to a measurement and compare.
+
+        Args:
+            mean: estimate before, ``(C, N)``.
+            motion: what was answered of the motion then, ``(k, N)``.
+            measurement: that arrives, whose missing values are zero.
+        """
+
+    @property
+    @abstractmethod
+    def features(self) -> Sequence[Block]:
+        """What is shown of the measurement beside the innovation, relative to the frame."""
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """Gains, offsets, the Cholesky factor and the motion."""
+        count = self.size * (self.measured + 1) + self.size * (self.size + 1) // 2 + len(self.motions)
+        return gymnasium.spaces.Box(-1.0, 1.0, (count,), numpy.float32)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """The innovation, and what the environment shows; what was answered before, only the network's memory knows.
+
+        Shown again, answers that vary little before anything is learned would be normalised by that little, and
+        gradients would grow with every scan that they flow back.
+        """
+        return (
+            Block(
+                "innovation",
+                lambda f, _: f.view.innovation,
+                "the innovation over the sensor's sigma, in the frame",
+                self.axes,
+                SIGNED_LOG,
+            ),
+            *self.features,
+        )
+
+    def start(self, initial: Initial) -> Track:
+        """Start where everyone starts."""
+        frame, none = self.rotate(initial.mean), 0.0 * initial.mean
+        motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
+        innovation = self.xp.stack([none[0]] * self.measured)
+        view = View(initial.mean, frame, none + 1.0, innovation)
+        return Track(initial.mean, initial.covariance, motion, view)
+
+    def predict(self, state: Track, measurement: Measurement) -> Track:
+        """Predict by the motion that was answered, and compare."""
+        view = self.look(state.mean, state.motion, measurement)
+        return state._replace(mean=view.mean, view=view)
+
+    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+        """Correct the estimate and report the covariance as the network answers."""
+        xp, C, m = self.xp, self.size, self.measured
+        a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
+        ends = numpy.cumsum([0, C * m, C, C, C * (C - 1) // 2, len(self.motions)])
+        by_gain, offset, diagonal, coupling, motion = (
+            a[first:last] for first, last in itertools.pairwise(ends)
+        )
+        frame, unit = state.view.frame, state.view.unit
+        inverse = None if frame is None else transpose(frame)
+        gain = self.fixed_gain + self.reach * xp.reshape(by_gain, (C, m, -1))
+        correction = apply(gain, state.view.innovation) + OFFSET_REACH * offset
+        deviation = unit * xp.exp(math.log(DEVIATION_RANGE) * diagonal)
+        factor, entry = [], iter(range(C * (C - 1) // 2))
+        for i in range(C):
+            beside = [COUPLING_REACH * deviation[i] * coupling[next(entry)] for _ in range(i)]
+            factor.append(xp.stack([*beside, deviation[i], *([0.0 * deviation[i]] * (C - 1 - i))]))
+        rotated = xp.stack(factor) if inverse is None else product(inverse, xp.stack(factor))
+        covariance = outer(rotated[:, 0], rotated[:, 0])
+        for column in range(1, C):
+            covariance = covariance + outer(rotated[:, column], rotated[:, column])
+        return state._replace(
+            mean=state.mean + (unit * correction if inverse is None else apply(inverse, unit * correction)),
+            covariance=covariance,
+            motion=motion if self.motions else state.motion,
+        )

@@ -1,0 +1,73 @@
+"""The fully learned estimator of ManeuveringTarget: what :mod:`..contract.student` wants to know of it.
+
+The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
+unit of a position is the measurement's sigma there, that of a velocity what such an error makes of it in a scan period.
+Of the motion the network answers with the acceleration until the next scan, along and across, as in ``kalman-net``.
+Turning or moving the whole problem turns and moves the estimates.
+"""
+
+from collections.abc import Sequence
+
+from ...filters.small_matrices import apply, product, transpose
+from ..contract.observation import Array, Block
+from ..contract.student import StudentBank, Track, View
+from .kalman_net import (
+    FRAME,
+    LARGEST_ACCELERATION,
+    advance,
+    clock_blocks,
+    frame_of,
+    sensor_blocks,
+    sensor_covariance,
+)
+from .parameters import ManeuveringTargetParameters
+from .world import Measurement
+
+
+class RadarStudentBank(StudentBank[object, Measurement]):
+    """Position and velocity of an aircraft, corrected in the frame of its velocity."""
+
+    parameters: ManeuveringTargetParameters
+    # An alpha-beta filter without training: a half, and a quarter of the innovation over the scan period.
+    gain = ((0.5, 0.0), (0.0, 0.5), (0.25, 0.0), (0.0, 0.25))
+    axes = motions = FRAME
+
+    def rotate(self, mean: Array) -> Array:
+        """Turn positions and velocities alike, ``(4, 4, N)``."""
+        turn = frame_of(mean[2:])
+        none = 0.0 * turn
+        sides = [[turn, none], [none, turn]]
+        return self.xp.concat([self.xp.concat(row, axis=1) for row in sides])
+
+    def look(self, mean: Array, motion: Array, measurement: Measurement) -> View:
+        """Predict by the acceleration that was answered."""
+        xp = self.xp
+        mean, _ = advance(mean, LARGEST_ACCELERATION * motion, measurement.interval)
+        frame = self.rotate(mean)
+        turn = frame[:2, :2]
+        R = self.turned_covariance(turn, measurement)
+        sigma = xp.sqrt(xp.stack([R[0, 0], R[1, 1]]))
+        innovation = measurement.available * (measurement.position - mean[:2])
+        unit = xp.concat([sigma, sigma * (1.0 / self.parameters.sampling_interval)])
+        return View(mean, frame, unit, apply(turn, innovation) / sigma)
+
+    @property
+    def features(self) -> Sequence[Block]:
+        """The sensor's covariance in the frame, the speed, and the clock."""
+
+        def covariance(track: Track, measurement: Measurement) -> Array:
+            return self.turned_covariance(track.view.frame[:2, :2], measurement)
+
+        def variances(track: Track, measurement: Measurement) -> Array:
+            R = covariance(track, measurement)
+            return self.xp.stack([R[0, 0], R[1, 1]])
+
+        def coupling(track: Track, measurement: Measurement) -> Array:
+            R = covariance(track, measurement)
+            return R[0, 1] / self.xp.sqrt(R[0, 0] * R[1, 1])
+
+        return (*sensor_blocks(self, variances, coupling), *clock_blocks(self))
+
+    def turned_covariance(self, turn: Array, measurement: Measurement) -> Array:
+        """Covariance of a measurement in the frame, ``(2, 2, N)``, m^2."""
+        return product(product(turn, sensor_covariance(measurement, self.xp)), transpose(turn))
