@@ -21,6 +21,7 @@ from ..evaluation.storage.blind import write_blind
 from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..names import assumed_parameters, find_competitor, is_learned, isolate_names
 from ..offline import plan_datasets
+from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
@@ -95,7 +96,7 @@ def evaluate_policies(
         typer.Option(
             help="In place of an environment: a frozen protocol over several of them, filtergym-1, whose row can be "
             "quoted; --policy NAME, or ENVIRONMENT=NAME for one of them.",
-            autocompletion=one_of("filtergym-1"),
+            autocompletion=one_of(*protocol_names()),
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -198,10 +199,10 @@ def evaluate_policies(
         raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
     if protocol is not None:
         check_options(ctx)
-        rename = isolate_names if isolated else None
+        isolating = isolate_names if isolated else None
         with limit_programs(time_limit, memory_limit), Workers(jobs, cluster) as workers:
             evaluate_protocol(
-                protocol, policy or [], workers, json, trust, rename, backend=backend, threads=threads
+                protocol, policy or [], workers, json, trust, isolating, backend=backend, threads=threads
             )
         return
     keywords = parse_settings(settings or [])
