@@ -154,7 +154,7 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
     teacher = Teacher(env, "kalman-imm")
     found = {}
     for share in (0.0, 0.7, 1.0):
-        reward_of_it = Reward("cost-and-covariance", share)
+        reward_of_it = Reward("cost-and-likelihood", share)
         unrolled = Unrolled(env, policy, 12, reward_of_it, teacher if share else None)
 
         def cost(unrolled=unrolled):
