@@ -199,6 +199,7 @@ def test_who_cannot_teach_is_refused(id, overrides, message):
     from filtergym.agents.bptt import Descent
     from filtergym.agents.training_run import RunOptions, new_run
 
-    run = new_run(problem_of(id), RunOptions(NAME, envs=2, overrides=overrides))
+    algorithm = NAME if id == RADAR else "bptt"
+    run = new_run(problem_of(id), RunOptions(algorithm, envs=2, overrides=overrides))
     with pytest.raises(ValueError, match=message):
         Descent(run).flight()
