@@ -141,4 +141,4 @@ $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made
-	rm -rf $(VENV) build site *.egg-info
+	rm -rf $(VENV) build site jupyter_execute *.egg-info

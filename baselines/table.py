@@ -36,6 +36,9 @@ class Tunable:
     """How far beyond its limits a value of a file may lie: where a recording sets the limits, those of another one."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Of the values, without their logarithm; what is not named is a pure number."""
+    likelihood: bool = False
+    """Whether a search weighs the density of the truth beside the cost: a filter with few hypotheses costs least where
+    it claims more than it knows."""
     anchored: bool = False
     """Whether a second sensor tells it the motion, so that it can tell errors that last from motion. It is fitted to
     measurements some time apart, and compared with others on these (:mod:`.advice`)."""

@@ -29,7 +29,8 @@ class Tuned:
     scenario: str
     values: dict[str, float]
     cost: float
-    """Geometric mean of the costs of episodes of the validation split."""
+    """Geometric mean of the costs of episodes of the validation split; where likelihood counts, see
+    :mod:`.tuning`, divided by that of the densities."""
     untuned_cost: float
     environment_steps: int
     seed: int

@@ -2,8 +2,13 @@
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
 values; every candidate meets the same episodes of the training split, so differences are not noise. Costs are geometric
-means over the episodes, so that no lost track decides. The best candidate is kept only if it beats the untuned values
-significantly on episodes of the validation split.
+means over the episodes, so that no lost track decides. Where the declaration says so (:attr:`.Tunable.likelihood`), the
+cost of an episode is divided by the density of the truth: with mean cost c and mean log-density l of n components
+
+    log c - l / n                                                                                                  (1)
+
+is least, averaged over episodes, for what is accurate and says how accurate. The best candidate is kept only if it
+beats the untuned values significantly on episodes of the validation split.
 """
 
 import json
@@ -18,6 +23,7 @@ from ..envs.contract.model import Episode, Model
 from ..envs.contract.task import Scenario
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest, short_name
+from ..envs.engine.reward import log_likelihood_reward
 from ..envs.engine.scenario_choice import find_scenario, make_task
 from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.running.parallel import Workers, check_workers
@@ -37,6 +43,10 @@ def _report_cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
     return {"cost": model.cost(episode)}
 
 
+def _report_cost_and_likelihood(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+    return {**_report_cost(model, episode), "density": log_likelihood_reward(model, episode)}
+
+
 class Candidate(NamedTuple):
     """Values of a policy or an estimator over some episodes."""
 
@@ -49,24 +59,27 @@ class Candidate(NamedTuple):
 
 
 def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
-    """Cost of every measurement of every episode, ``(time, episodes)``."""
+    """What the search weighs of every episode, ``(episodes,)``: its mean cost, or where likelihood counts (1), as a
+    factor.
+    """
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
     # Made already, so that no filter is compiled for a candidate that is tried once.
     competitor = make(model if control else model.task)
-    found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, _report_cost)
-    return numpy.ascontiguousarray(found["cost"].T)
+    report = _report_cost_and_likelihood if candidate.tunable.likelihood else _report_cost
+    found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, report)
+    means = {name: numpy.ascontiguousarray(values.T).mean(axis=0) for name, values in found.items()}
+    density = means.get("density", 0.0)
+    return means["cost"] * numpy.exp(-density / len(model.task.components))
 
 
 def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy.ndarray:
-    """Mean cost of a candidate in each of its episodes, ``(episodes,)``; the workers share them."""
+    """What the search weighs of a candidate in each of its episodes, ``(episodes,)``; the workers share them."""
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
-    costs = numpy.concatenate(workers.results(_costs, pieces), axis=1)
-    found: numpy.ndarray = costs.mean(axis=0)
-    return found
+    return numpy.concatenate(workers.results(_costs, pieces))
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
@@ -231,5 +244,5 @@ def tune(
 def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
     """All that the cost of a candidate depends on beside its values and the code."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
-    how = [search.seed, search.episodes, search.backend]
+    how = [search.seed, search.episodes, search.backend, tunable.likelihood]
     return [problem.id, scenario.name, limited, dict(tunable.start), *how]

@@ -94,10 +94,10 @@ def main() -> None:
             everything += findings
             rows.append(row(name, findings))
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-            if options.record:
-                write_record(problem, rows, options)
             if options.json is not None:
                 options.json.write_text(json.dumps([one._asdict() for one in everything]), encoding="utf-8")
+        if options.record:
+            write_record(problem, rows, options)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,9 @@ is our filter with the factors on Q and R that have the least error on these ten
 
 import argparse
 import importlib
+import os
+import resource
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -28,9 +31,10 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 
 from filtergym import read_recording
 
-ROOT = Path(__file__).parent.parent
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples" / "own_logs"
 LATE = 0.15
 """Of the camera, s."""
+COLUMNS = ("machine", "filter", "RMSE", "of filterpy's", "factors", "processor time, s")
 CANDIDATES = 40
 """Factors that are tried for the limit, three times, each time closer to the best."""
 
@@ -99,14 +103,14 @@ def battery(log: dict[str, np.ndarray]) -> np.ndarray:
     kf, last = ExtendedKalmanFilter(2, 1), 0.0
     kf.x, kf.P, found = np.array([0.8, 0]), np.diag([0.01, 1e-4]), []
     slope = lambda s: np.array([[0.9 - 1.2 * s[0] + 1.65 * s[0] ** 2, -1.0]])  # noqa: E731
-    curve = lambda s: np.array([3.3 + 0.9 * s[0] - 0.6 * s[0] ** 2 + 0.55 * s[0] ** 3 - s[1]])  # noqa: E731
+    curve = lambda s, u: np.array([3.3 + 0.9 * s[0] - 0.6 * s[0] ** 2 + 0.55 * s[0] ** 3 - s[1] - 0.02 * u])  # noqa: E731
     for t, current, voltage in zip(log["time"], log["current"], log["voltage"], strict=True):
         dt, last = t - last, t
         kept = np.exp(-dt / 40)
         kf.F, G = np.diag([1, kept]), np.array([-dt / 9000, 0.025 * (1 - kept)])
         kf.x = kf.F @ kf.x + G * current
         kf.P = kf.F @ kf.P @ kf.F.T + 0.05**2 * np.outer(G, G) + np.diag([1e-6, 1e-6]) * dt / 60
-        kf.update(np.array([voltage]), slope, curve, R=np.array([[1e-4]]))
+        kf.update(np.array([voltage]), slope, curve, R=np.array([[1e-4]]), hx_args=(current,))
         found.append(kf.x[:1].copy())
     return np.array(found)
 
@@ -174,6 +178,42 @@ def follow_late(module: Any, logs: list[dict[str, np.ndarray]], factors: dict[st
     return np.array(found)
 
 
+def processor_time(name: str, folder: Path) -> float:
+    """Of the three commands of the page, which fit, judge and export, s."""
+    machine, filter, before = f"{name}:{problem_id(name)}", folder / "fitted.filter.json", used()
+    for words in (
+        ["advise", folder / f"{name}.csv", "--environment", machine, "--out", filter],
+        [
+            "evaluate",
+            machine,
+            "--recording",
+            folder / f"{name}_judged.csv",
+            "--policy",
+            filter,
+            "--policy",
+            "kalman",
+        ],
+        ["export", machine, filter, "--to", "c", "--out", folder / f"{name}_c"],
+    ):
+        command = [sys.executable, "-m", "filtergym", *map(str, words)]
+        subprocess.run(
+            command, cwd=EXAMPLES, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, capture_output=True
+        )
+    return used() - before
+
+
+def used() -> float:
+    """Processor time of the processes that this one has waited for, s."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def problem_id(name: str) -> str:
+    """Id of the environment of a machine."""
+    module = importlib.import_module(name)
+    return next(cls.id for cls in vars(module).values() if hasattr(cls, "definition"))
+
+
 def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
     """Columns of each recording of a table."""
     table = np.genfromtxt(file, delimiter=",", names=True)
@@ -186,7 +226,7 @@ def read_logs(file: Path) -> list[dict[str, np.ndarray]]:
 def compare(name: str, folder: Path) -> list[list[str]]:
     """Rows of the table of one machine."""
     module = importlib.import_module(name)
-    problem = problem_of(next(cls.id for cls in vars(module).values() if hasattr(cls, "definition")))
+    problem = problem_of(problem_id(name))
     log, judged = (read_recording(folder / f"{name}{part}.csv", problem.id) for part in ("", "_judged"))
     tunable = families_of(problem, log)["extended"]
     own = make_model(problem.task, backend="numpy", **log.parameters).task
@@ -217,7 +257,8 @@ def compare(name: str, folder: Path) -> list[list[str]]:
         less = "" if who.startswith("filterpy") else f"{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"
         shown = several.get(who, {})
         noises = ", ".join(f"{key.removesuffix('_noise')} {value:.3g}" for key, value in shown.items())
-        rows.append([name.replace("_", " "), who, f"{np.sqrt(np.mean(each**2)):.4g}", less, noises])
+        time = f"{processor_time(name, folder):.0f}" if who == "fitted" else ""
+        rows.append([name.replace("_", " "), who, f"{np.sqrt(np.mean(each**2)):.4g}", less, noises, time])
         print(" ".join(rows[-1]), file=sys.stderr, flush=True)
     return rows
 
@@ -226,13 +267,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=sorted(BY_HAND))
     options = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "docs" / "examples" / "own_logs"))
+    sys.path.insert(0, str(EXAMPLES))
     make_logs = importlib.import_module("make_logs")
     with tempfile.TemporaryDirectory() as folder:
         names = [options.only] if options.only else list(BY_HAND)
         make_logs.write_logs(Path(folder), names)
         rows = [row for name in names for row in compare(name, Path(folder))]
-    print("\n".join(markdown_table(("machine", "filter", "RMSE", "of filterpy's", "factors"), rows)))
+    print("\n".join(markdown_table(COLUMNS, rows)))
 
 
 if __name__ == "__main__":

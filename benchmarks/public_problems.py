@@ -35,6 +35,7 @@ from filtergym.envs.engine.catalogue import short_name
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 
 import filtergym
+from filtergym import Sensor
 
 MODULE = Path(__file__).stem
 ALGORITHMS = {"kalman-net": (), "bptt": ("--control", "noise"), "ppo": ("--control", "noise")}
@@ -159,10 +160,8 @@ LorenzDecimated = filtergym.state_space(
 
 # --- NCLT
 
-WHEELS = ("x", "y", "speed", "heading", "rate", "compass")
+STATES = ("x", "y", "speed", "heading", "rate", "error")
 """North and east (m), speed (m/s), heading (rad), its rate (rad/s), and what the compass reads beyond it (rad)."""
-RATE_SIGMA, SPEED_SIGMA = 0.05, 0.1
-"""Deviations of gyroscope (rad/s) and wheels (m/s), ours."""
 WHEEL_SCALE = 1.075
 """Speed by the wheels over that of the truth, in both validation drives."""
 
@@ -180,63 +179,61 @@ def drive(x: Any) -> list[Any]:
     ]
 
 
-def sensors(x: Any) -> list[Any]:
-    """Position by the receiver, speed by the wheels, cosine and sine of the compass, rate by the gyroscope."""
-    return [x[0], x[1], WHEEL_SCALE * x[2], numpy.cos(x[3] + x[5]), numpy.sin(x[3] + x[5]), x[4]]
-
-
-def process_noise(position: float, compass: float) -> numpy.ndarray:
-    """Q of the drives: deviations of position and compass a second; speed and rate may change as they like."""
-    return numpy.diag([position, position, 0.5, 0.01, 0.3, compass]) ** 2
-
-
-def sensor_noise(receiver: float, reading: float) -> numpy.ndarray:
-    """R of the drives, with the deviations of a position by the receiver (m) and of the compass's cosine and sine."""
-    return numpy.diag([receiver, receiver, SPEED_SIGMA, reading, reading, RATE_SIGMA]) ** 2
-
-
 Drives = filtergym.state_space(
     "public/Drives-v0",
     f=drive,
-    h=sensors,
-    Q=process_noise(0.1, 0.001),
-    R=sensor_noise(1.0, 0.05),
+    # Deviations in a second: beyond the model 0.1 m; speed and rate may change as they like; of the compass 1 mrad.
+    Q={
+        "slip": numpy.diag([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]) ** 2,
+        "motion": numpy.diag([0.0, 0.0, 0.5, 0.01, 0.3, 0.0]) ** 2,
+        "magnetism": numpy.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.001]) ** 2,
+    },
+    sensors={
+        "receiver": Sensor(numpy.eye(2, 6), numpy.eye(2), names=("x", "y")),
+        "wheels": Sensor([[0.0, 0.0, WHEEL_SCALE, 0.0, 0.0, 0.0]], 0.1**2, units=("m/s",)),
+        "compass": Sensor([[0.0, 0.0, 0.0, 1.0, 0.0, 1.0]], 0.05**2, wraps="rad"),
+        "gyroscope": Sensor([[0.0, 0.0, 0.0, 0.0, 1.0, 0.0]], 0.05**2, units=("rad/s",)),
+    },
     mean=[76.5, 108.3, 0.0, 0.0, 0.0, 0.0],
     covariance=numpy.diag([1.0, 1.0, 0.01, 0.01, 0.01, 0.01]),
-    names=WHEELS,
+    names=STATES,
     units=["m", "m", "m/s", "rad", "rad/s", "rad"],
     weights=[0.5, 0.5, 0.0, 0.0, 0.0, 0.0],
     horizon=4000,
 )
 """Wheels, compass, gyroscope and receiver of a segway, once a second."""
+TUNED = ("receiver_noise", "slip_noise", "magnetism_noise", "compass_noise")
+"""Factors on R and Q that are tuned."""
+STARTS = ([2.0, 0.0, 0.0, 0.6], [3.0, 0.0, 2.0, 2.0])
+"""Of the search, their decimal logarithms."""
 
 
-DEVIATIONS = ("receiver", "position", "compass", "reading")
-"""What is tuned."""
-
-
-class WheelAndReceiver(Extended):
-    """The extended Kalman filter of the drives with deviations of its own.
+class WithNoises(Extended):
+    """The Kalman filter as written with noises of its own.
 
     Args:
         task: the problem.
-        receiver: of a position, m.
-        position: of the motion beyond the model, m each second.
-        compass: of the change of the compass's error, rad each second.
-        reading: of its cosine and sine.
+        Q: covariance of the process noise, ``(n, n)``.
+        R: of the measurement noise, ``(m, m)``.
     """
 
-    def __init__(
-        self,
-        task: Any,
-        receiver: float = 1.0,
-        position: float = 0.1,
-        compass: float = 0.001,
-        reading: float = 0.05,
-    ) -> None:
+    def __init__(self, task: Any, Q: numpy.ndarray, R: numpy.ndarray) -> None:
         super().__init__(task)
-        self.Q = task.constant(process_noise(position, compass))[:, :, None]
-        self.R = task.constant(sensor_noise(receiver, reading))[:, :, None]
+        self.Q, self.R = (task.constant(noise)[:, :, None] for noise in (Q, R))
+
+    def process_noise(self, mean: Any, measurement: Any) -> Any:
+        """Its own, whatever the state."""
+        return self.Q
+
+
+def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:
+    """Return what makes a Kalman filter with these noises."""
+
+    def make(task: Any) -> WithNoises:
+        return WithNoises(task, Q, R)
+
+    make.kind, make.traceable = "estimator", True  # type: ignore[attr-defined]
+    return make
 
 
 # --- stored sets
@@ -278,8 +275,8 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
         for one in read_tensors(folder / f"data/nclt_fusion/{name}.pt")
     ]
     times = max(len(one["gps"]) for one in drives)
-    values, there = (numpy.zeros((len(drives), times, 6)) for _ in range(2))
-    truth = numpy.full((len(drives), times, len(WHEELS)), math.nan)
+    values, there = (numpy.zeros((len(drives), times, 5)) for _ in range(2))
+    truth = numpy.full((len(drives), times, len(STATES)), math.nan)
     seconds = numpy.full((len(drives), times), math.nan)
     means = numpy.zeros((len(drives), 6))
     held = {}
@@ -288,8 +285,7 @@ def stored_drives(folder: Path, name: str) -> tuple[Recording, dict[str, float]]
         # A row holds what wheels, compass and gyroscope said at the row before.
         now = numpy.minimum(numpy.arange(rows) + 1, rows - 1)
         left, right, compass, rate = one["wheel"][now].T
-        columns = [0.5 * (left + right), numpy.cos(compass), numpy.sin(compass), rate]
-        table = numpy.column_stack([one["filtered_gps"], *columns])
+        table = numpy.column_stack([one["filtered_gps"], 0.5 * (left + right), compass, rate])
         there[i, :rows] = numpy.isfinite(table)
         values[i, :rows] = numpy.nan_to_num(table)
         truth[i, :rows, :2] = one["ground_truth"]
@@ -433,45 +429,33 @@ def competitors_of(problem: Problem, agents: Mapping[str, Sequence[str]], runs: 
 
 
 def tune_drives(recording: Recording) -> dict[str, float]:
-    """Deviations with the least squared error over the validation drives, by the simplex method from some starts."""
+    """Factors with the least squared error over the validation drives, by the simplex method from some starts."""
     from scipy.optimize import minimize
 
     def cost(logarithms: numpy.ndarray) -> float:
-        values = (10.0**value for value in logarithms.tolist())
-        deviations = dict(zip(DEVIATIONS, values, strict=True))
-
-        def made(task: Any) -> WheelAndReceiver:
-            return WheelAndReceiver(task, **deviations)
-
-        made.kind, made.traceable = "estimator", True  # type: ignore[attr-defined]
-        found = filtergym.evaluate(Drives.id, {"candidate": made}, recording)
+        factors = dict(zip(TUNED, (10.0**logarithms).tolist(), strict=True))
+        found = filtergym.evaluate(Drives.id, {"candidate": Variant(Extended, **factors)}, recording)
         return math.log(float(found.cost.mean("time").mean()))
 
     best = min(
         (
             minimize(cost, start, method="Nelder-Mead", options={"maxfev": 120, "xatol": 0.02, "fatol": 1e-3})
-            for start in ([1.0, -1.0, -3.0, -1.0], [1.5, -1.0, -2.0, -0.3])
+            for start in STARTS
         ),
         key=lambda found: found.fun,
     )
-    return dict(zip(DEVIATIONS, (10.0**best.x).round(5).tolist(), strict=True))
+    return {name: float(f"{10.0**value:.4g}") for name, value in zip(TUNED, best.x, strict=True)}
 
 
 def judge_drives(folder: Path, runs: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned deviations."""
+    """RMSE a coordinate of every test drive by the receiver alone and by filters, and the tuned factors."""
     recording, held = stored_drives(folder, "test")
     file = runs / "drives.tuned.json"
     if not file.exists():
         file.write_text(json.dumps(tune_drives(stored_drives(folder, "val")[0])), encoding="utf-8")
     values = json.loads(file.read_text(encoding="utf-8"))
-
-    def with_tuned(task: Any) -> WheelAndReceiver:
-        return WheelAndReceiver(task, **values)
-
-    with_tuned.kind, with_tuned.traceable = "estimator", True  # type: ignore[attr-defined]
-    dataset = filtergym.evaluate(
-        Drives.id, {"extended": "extended", "extended, tuned": with_tuned}, recording, timed=True
-    )
+    competitors = {"extended": "extended", "extended, tuned": Variant(Extended, **values)}
+    dataset = filtergym.evaluate(Drives.id, competitors, recording, timed=True)
     drives = [str(name) for name in dataset.flight.values]
     rows: list[dict[str, Any]] = [{"name": "receiver alone", "rmse": held}]
     for name in dataset.policy.values.tolist():
@@ -535,7 +519,7 @@ def drive_table(figures: Mapping[str, Any]) -> dict[str, Any]:
         anees = ", ".join(_text(one["anees"][date], 1) for date in DATES) if "anees" in one else ""
         time = _text(one["nanoseconds"], 0) if "nanoseconds" in one else ""
         rows.append(["ours", one["name"], *(_text(one["rmse"][date], 3) for date in DATES), anees, time])
-    return {"columns": ["", "filter", *DATES, "ANEES", "ns"], "rows": rows}
+    return {"columns": ["by", "filter", *DATES, "ANEES", "ns"], "rows": rows}
 
 
 def write_records(figures: Mapping[str, Any], command: str, folder: Path = RECORDS) -> None:
@@ -563,11 +547,21 @@ def main() -> None:
     parser.add_argument("--filternet", type=Path, help="folder of filternet")
     parser.add_argument("--runs", type=Path, default=Path("runs/public"), help="tuned values and agents")
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side")
+    parser.add_argument("--only", choices=(PROBLEMS, DRIVES), help="make one record")
     parser.add_argument("--steps", type=int, default=200_000, help="measurements of a training")
     options = parser.parse_args()
+    if options.only == DRIVES and not options.filternet:
+        parser.error(f"{DRIVES} needs --filternet")
     # Agents name the module in which their training has found the environment.
     sys.modules[MODULE] = sys.modules["__main__"]
     options.runs.mkdir(parents=True, exist_ok=True)
+    command = "python benchmarks/public_problems.py"
+    if options.only == DRIVES:
+        drives, values = judge_drives(options.filternet, options.runs)
+        write_records(
+            {"drives": drives, "drives_tuned": values}, f"{command} --only {DRIVES} --filternet filternet"
+        )
+        return
     rows: list[Row] = []
     figures: dict[str, Any] = {}
     problems = [Problem("Lorenz, J = 2", LorenzOrderTwo.id), Problem("Lorenz, decimated", LorenzDecimated.id)]
@@ -599,10 +593,11 @@ def main() -> None:
                 problem.name, problem.id, competitors_of(problem, agents, options.runs), problem.recording
             )
     figures |= {"steps": options.steps, "episodes": TEST_EPISODES, "rows": [row._asdict() for row in rows]}
-    if options.filternet:
+    if options.filternet and options.only is None:
         figures["drives"], figures["drives_tuned"] = judge_drives(options.filternet, options.runs)
-    command = "python benchmarks/public_problems.py --kalmannet KalmanNet_TSP --filternet filternet"
-    write_records(figures, f"{command} --steps {options.steps}")
+    write_records(
+        figures, f"{command} --kalmannet KalmanNet_TSP --filternet filternet --steps {options.steps}"
+    )
 
 
 if __name__ == "__main__":

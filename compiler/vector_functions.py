@@ -38,6 +38,7 @@ class VectorFunction:
 
     Attributes:
         size: m.
+        given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
 
@@ -48,7 +49,7 @@ class VectorFunction:
 
     def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
         graph = Graph()
-        self._inputs = size
+        self._inputs, self.given = size, given
         with namespace.tracing(graph):
             rows = [graph.input(0, row) for row in range(size + given)]
             x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)

@@ -22,7 +22,7 @@ version = release = filtergym.__version__
 sys.path.insert(0, str(Path(__file__).parent / "make"))
 
 extensions = [
-    *("myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_design"),
+    *("myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_design"),
     "record_directives",
 ]
 # Examples and recipes are shown inside pages; the page of the package index stands alone.
@@ -31,6 +31,9 @@ exclude_patterns = ["examples", "recipes", "package_index.md"]
 # Links to headings are written as on a repository's page, so that both find them; a broken one ends the build.
 myst_heading_anchors = 4
 myst_enable_extensions = ["attrs_inline", "colon_fence"]
+
+# `python docs/make notebooks` executes them, and commits what they print: a check of the pages must not take minutes.
+nb_execution_mode = "off"
 
 highlight_language = "none"  # of what names no language: output, formulas
 

@@ -410,8 +410,9 @@ def _model_of(env: Any) -> Any:
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:
-    """Every metric of every policy with its interval, the environment's own among them.
+    """Return every metric of every policy with its interval, the environment's own among them.
 
-    See :func:`.evaluation.running.metrics.tidy_records`.
+    Args:
+        dataset: from :func:`evaluate`; see :func:`.evaluation.running.metrics.tidy_records`.
     """
     return metrics.tidy_records(dataset, problem_of(dataset.attrs["environment"]).baselines.metrics)

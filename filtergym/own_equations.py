@@ -12,7 +12,7 @@ from .compiler.vector_functions import VectorFunction
 from .envs.contract.parameters import read_numbers
 from .envs.linear.equations import StateSpaceModel, process_noise
 from .envs.linear.inputs import Input
-from .own_drifts import discretise_drift
+from .own_drifts import Discretised, discretise_drift
 
 Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
 """A function of the state ``(n,)`` that returns a list of numbers, or a matrix; with more arguments see
@@ -51,12 +51,12 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
         ValueError: for what does not, or cannot be traced.
     """
     n = len(around.mean)
-    h = trace("h", given["h"], n, None)
-    motion, of_inputs, noise = (
-        _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
-    )
+    h = trace_measurement("h", given["h"], n, len(around.inputs))
+    motion = _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
     R = check_covariance("R", given["R"], h.size, definite=True)
-    model = StateSpaceModel(motion, h, noise, R, of_inputs)
+    model = StateSpaceModel(
+        motion.f, h, motion.Q, R, motion.G, _of_inputs(given["h"], h, around), motion.sources
+    )
     check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
     return model
 
@@ -67,16 +67,18 @@ class _Motion(NamedTuple):
     f: VectorFunction
     G: VectorFunction | None
     Q: numpy.ndarray | VectorFunction
+    sources: Mapping[str, numpy.ndarray | VectorFunction]
 
 
 def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
     """The motion of f and Q."""
-    n, f, Q = len(around.mean), given["f"], given["Q"]
+    n, f, parts = len(around.mean), given["f"], _sources("Q", given["Q"])
     takes = further_arguments(f)
-    if ("dt" in takes) != callable(Q):
+    wrong = next((Q for Q in parts.values() if ("dt" in takes) != callable(Q)), None)
+    if wrong is not None:
         raise ValueError(
             "a timed model has f(x, dt) and Q(dt), any other takes the interval in neither: got "
-            f"{'f(x, dt)' if 'dt' in takes else 'f without dt'} and {'Q(dt)' if callable(Q) else 'Q as a matrix'}"
+            f"{'f(x, dt)' if 'dt' in takes else 'f without dt'} and {'Q(dt)' if callable(wrong) else 'Q as a matrix'}"
         )
     if not callable(f):
         f = check_array("f", f, (n, n))
@@ -87,14 +89,38 @@ def _discrete(given: Mapping[str, Any], around: Surroundings) -> _Motion:
         further = {"dt": dt, "u": u}
         return f(x, **{name: further[name] for name in takes}) if callable(f) else f @ x
 
-    noise: numpy.ndarray | VectorFunction
-    if callable(Q):
-        noise = trace("Q", lambda v: _entries(Q(v[n])), 0, n * n, n + 1 + len(around.inputs))
-    else:
-        noise = check_covariance("Q", Q, n)
-    if not takes and not around.inputs:
-        return _Motion(trace("f", f, n, n), None, noise)
-    return _Motion(*_with_inputs("f", call, "dt" in takes, around), noise)
+    def noise(parts: Sequence[Any]) -> numpy.ndarray | VectorFunction:
+        if "dt" not in takes:
+            return sum(check_covariance("Q", Q, n) for Q in parts)
+        entries = lambda v: _sum([_entries(Q(v[n])) for Q in parts])  # noqa: E731
+        return trace("Q", entries, 0, n * n, n + 1 + len(around.inputs))
+
+    moved = (
+        _with_inputs("f", call, "dt" in takes, around)
+        if takes or around.inputs
+        else (trace("f", f, n, n), None)
+    )
+    return _Motion(*moved, noise([*parts.values()]), {name: noise([Q]) for name, Q in parts.items() if name})
+
+
+def _sources(what: str, given: Any) -> Mapping[str, Any]:
+    """Covariances of the sources of noise by their names; a single one has none.
+
+    Raises:
+        ValueError: for no source, or a name that is none.
+    """
+    if not isinstance(given, Mapping):
+        return {"": given}
+    if not given or not all(isinstance(name, str) and name for name in given):
+        raise ValueError(
+            f"{what} by its sources names at least one, such as {{'wind': ...}}, got {[*given]!r}"
+        )
+    return given
+
+
+def _sum(parts: Sequence[Sequence[Any]]) -> list[Any]:
+    """Sum of lists, number by number."""
+    return [sum(numbers[1:], numbers[0]) for numbers in zip(*parts, strict=True)]
 
 
 def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
@@ -108,12 +134,23 @@ def _continuous(given: Mapping[str, Any], around: Surroundings) -> _Motion:
         drift = lambda v: own(v[:n], v[n:]) if takes else own(v[:n])  # noqa: E731
     else:
         drift = numpy.concatenate([check_array("drift", drift, (n, n)), numpy.zeros((n, p))], axis=1)
-    diffusion = check_covariance("diffusion", given["diffusion"], n)
-    found = discretise_drift(
-        trace("drift", drift, n + p, n), diffusion, around.interval, around.integration_steps
-    )
-    noise = trace("drift", lambda v: _entries(found.noise(v[:n], v[n], v[n + 1 :])), 0, n * n, n + 1 + p)
-    return _Motion(*_with_inputs("drift", found.motion, True, around), noise)
+    parts = {
+        name: check_covariance("diffusion", one, n)
+        for name, one in _sources("diffusion", given["diffusion"]).items()
+    }
+    traced = trace("drift", drift, n + p, n)
+
+    def discretised(diffusion: numpy.ndarray) -> Discretised:
+        return discretise_drift(traced, diffusion, around.interval, around.integration_steps)
+
+    def noise(diffusion: numpy.ndarray) -> VectorFunction:
+        found = discretised(diffusion)
+        return trace("drift", lambda v: _entries(found.noise(v[:n], v[n], v[n + 1 :])), 0, n * n, n + 1 + p)
+
+    total = sum(parts.values())
+    motion = discretised(total).motion
+    sources = {name: noise(one) for name, one in parts.items() if name}
+    return _Motion(*_with_inputs("drift", motion, True, around), noise(total), sources)
 
 
 def _with_inputs(
@@ -128,6 +165,28 @@ def _with_inputs(
         return motion, None
     of_inputs = lambda v: call(v[p : p + n], v[p + n] if timed else None, v[:p])  # noqa: E731
     return motion, trace(what, of_inputs, p, n, n + further)
+
+
+def trace_measurement(what: str, h: Function, n: int, p: int) -> VectorFunction:
+    """Trace what is measured of a state of n numbers and, where it takes them, p inputs.
+
+    Raises:
+        ValueError: if it cannot be traced, or takes what is not there.
+    """
+    takes = further_arguments(h)
+    if "dt" in takes or ("u" in takes and not p):
+        raise ValueError(f"{what} takes the state, and u where there are inputs: h(x) or h(x, u)")
+    if not callable(h) or not takes:
+        return trace(what, h, n, None)
+    return trace(what, lambda v: h(v[:n], v[n:]), n, None, p)
+
+
+def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> VectorFunction | None:
+    """Return h as a function of the inputs and then of the state; None where none with noise acts on it."""
+    p = len(around.inputs)
+    if not callable(h) or not traced.given or not any(one.noise > 0.0 for one in around.inputs.values()):
+        return None
+    return trace("h", lambda v: h(v[p:], v[:p]), p, traced.size, len(around.mean))
 
 
 def further_arguments(function: Any) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy
@@ -12,7 +12,7 @@ from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
 from .envs.contract.parameters import Limits, check, check_integer, quote_shortened
 from .envs.engine.catalogue import nearest
-from .envs.linear.equations import StateSpaceDefinition
+from .envs.linear.equations import StateSpaceDefinition, StateSpaceModel
 from .envs.linear.inputs import Input
 from .envs.linear.sensors import Sensor
 from .envs.linear.state_space import (
@@ -29,9 +29,9 @@ from .own_equations import (
     check_covariance,
     further_arguments,
     make_model,
-    trace,
+    trace_measurement,
 )
-from .own_sensors import check_columns, find_channels, replace_sensors, sensor_columns, stack_sensors
+from .own_sensors import NOISES, check_columns, find_channels, replace_sensors, sensor_columns, stack_sensors
 
 EQUATIONS = ("f", "Q", "drift", "diffusion", "h", "R", "sensors")
 TRIED = 32, 64
@@ -79,12 +79,13 @@ def state_space(
             it is the state that interval later, s: the model is timed, and measurements may come at any time. With an
             argument called ``u`` it is given the inputs ``(p,)`` that act until then.
         Q: covariance of the process noise, ``(n, n)``; of a timed model a function that returns that of an interval,
-            ``Q(dt)``.
+            ``Q(dt)``. Or several of them by the names of their sources, of which it is the sum: each then has a factor
+            of its own that ``tune`` and ``advise`` search.
         drift: in place of f and Q the derivative of the state, ``drift(x)`` or ``drift(x, u)``, or a matrix: the model
             is timed, see :mod:`filtergym.filters.discretisation`.
-        diffusion: spectral density of the noise of that derivative, ``(n, n)``.
+        diffusion: spectral density of the noise of that derivative, ``(n, n)``; or several by their sources.
         integration_steps: of the Runge-Kutta method between two measurements, of a drift that is not linear.
-        h: as f what is measured, m numbers; or a matrix ``(m, n)``.
+        h: as f what is measured, m numbers, ``h(x)`` or ``h(x, u)``; or a matrix ``(m, n)``.
         R: covariance of the measurement noise, ``(m, m)``, positive definite.
         sensors: by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
@@ -139,21 +140,26 @@ def state_space(
     steps = check_integer("integration_steps", integration_steps, 1)
     around = Surroundings(mean, interval, inputs, steps)
     motion = "drift" if f is None else "f"
-    if inputs and not any("u" in further_arguments(one[motion]) for one in given):
+    acted = [
+        call for one in given for call in (one[motion], one["h"], *(s.h for s in one["sensors"].values()))
+    ]
+    if inputs and not any("u" in further_arguments(call) for call in acted):
         raise ValueError(
-            f"there are inputs, {', '.join(inputs)}, and {motion} does not take u: write "
+            f"there are inputs, {', '.join(inputs)}, and neither {motion} nor h takes u: write "
             f"{'drift(x, u)' if f is None else 'f(x, u) or f(x, dt, u)'}"
         )
-    world = tuple(make_model(_stack(one, n), around) for one in given)
+    world = tuple(make_model(_stack(one, n, len(inputs)), around) for one in given)
     filters = world
     if filter_model is not None:
         filters = tuple(
-            make_model(_stack(_replace("filter_model", one, filter_model), n), around) for one in given
+            make_model(_stack(_replace("filter_model", one, filter_model), n, len(inputs)), around)
+            for one in given
         )
     if len({model.h.size for model in (*world, *filters)}) > 1:
         raise ValueError("all models must measure as many numbers")
     if len({model.timed for model in (*world, *filters)}) > 1:
         raise ValueError("all models must take the interval, or none: write f(x, dt) and Q(dt) in each")
+    _check_sources(filters, sensors)
     count = len(world)
     names = names or tuple(f"x{i + 1}" for i in range(n))
     units = units or ("1",) * n
@@ -162,7 +168,7 @@ def state_space(
             f"names and units must be {n} each, got {quote_shortened(names)} and {quote_shortened(units)}"
         )
     m = world[0].h.size
-    counts = [trace("h", one.h, n, None).size for one in sensors.values()] or [m]
+    counts = [trace_measurement("h", one.h, n, len(inputs)).size for one in sensors.values()] or [m]
     channels = find_channels(sensors, counts, interval)
     columns = dict.fromkeys(measured or [f"z{j + 1}" for j in range(m)], "")
     columns = sensor_columns(sensors, channels) if sensors else columns
@@ -251,11 +257,23 @@ def _replace(what: str, first: Mapping[str, Any], part: Mapping[str, Any]) -> di
     return {**first, **part}
 
 
-def _stack(given: dict[str, Any], size: int) -> dict[str, Any]:
+def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -> None:
+    """Raise ValueError for names of the noises in Q that differ between models, or are those of others."""
+    first, *others = ([*model.sources] for model in filters)
+    if any(one != first for one in others):
+        raise ValueError(f"all models must name the same sources of noise, got {first} and {others}")
+    taken = {*first} & {*NOISES, *sensors}
+    if taken:
+        raise ValueError(
+            f"the source of noise {min(taken)!r} must have another name than {', '.join(NOISES)} and sensors"
+        )
+
+
+def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
     """Put h and R of all sensors in the place of these."""
     if not given["sensors"]:
         return given
-    h, R = stack_sensors(given["sensors"], size)
+    h, R = stack_sensors(given["sensors"], size, inputs)
     return {**given, "h": h, "R": R}
 
 

@@ -8,7 +8,7 @@ import numpy
 from .envs.contract.parameters import quote_shortened
 from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.linear.sensors import PERIODS, Channel, Sensor
-from .own_equations import Function, check_array, check_covariance, trace
+from .own_equations import Function, check_array, check_covariance, further_arguments, trace_measurement
 
 RESERVED = (RECORDING, "values", "available")
 """Names that mean something else in a table or a measurement."""
@@ -32,15 +32,15 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
     return {**(sensors or {}), **given}
 
 
-def stack_sensors(sensors: Mapping[str, Sensor], size: int) -> tuple[Function, numpy.ndarray]:
-    """Return h and R of all sensors together, of a state of n numbers.
+def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, numpy.ndarray]:
+    """Return h and R of all sensors together, of a state of n numbers and p inputs.
 
     Raises:
         ValueError: for what does not fit.
     """
     noises, traced = [], []
     for name, one in sensors.items():
-        traced.append(trace(f"h of the sensor {name!r}", one.h, size, None))
+        traced.append(trace_measurement(f"h of the sensor {name!r}", one.h, size, inputs))
         R = numpy.asarray(one.R, dtype=float)
         given = R[None, None] if R.ndim == 0 else R
         noises.append(check_covariance(f"R of the sensor {name!r}", given, traced[-1].size, definite=True))
@@ -51,11 +51,15 @@ def stack_sensors(sensors: Mapping[str, Sensor], size: int) -> tuple[Function, n
     matrices = [one.matrix for one in traced if one.matrix is not None and not numpy.any(one.offset)]
     if len(matrices) == len(traced):
         return numpy.concatenate(matrices), R
-    return lambda x: [number for one in sensors.values() for number in _numbers(one.h, x)], R
+    if any(one.given for one in traced):
+        return lambda x, u: [number for one in sensors.values() for number in _numbers(one.h, x, u)], R
+    return lambda x: [number for one in sensors.values() for number in _numbers(one.h, x, None)], R
 
 
-def _numbers(h: Function, x: Any) -> Any:
-    return h(x) if callable(h) else check_array("h", h, (None, len(x))) @ x
+def _numbers(h: Function, x: Any, u: Any) -> Any:
+    if not callable(h):
+        return check_array("h", h, (None, len(x))) @ x
+    return h(x, u) if further_arguments(h) else h(x)
 
 
 def find_channels(

@@ -179,6 +179,10 @@ def read_submission(path: Path) -> tuple[Submission, str]:
 def write_submission(path: Path, submission: Submission) -> str:
     """Write a submission, and return the SHA-256 digest of the file.
 
+    Args:
+        path: of the file.
+        submission: that it holds.
+
     Raises:
         ValueError: if it cannot be written, or is larger than a reader takes.
     """

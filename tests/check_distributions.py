@@ -15,6 +15,8 @@ from filtergym.envs.engine.catalogue import catalogue
 
 import filtergym
 
+MOST_BYTES = 3_000_000
+"""Of the wheel."""
 ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents", "filtergym")
 
 
@@ -25,6 +27,7 @@ def check_wheel(wheel: Path, source: Path) -> None:
     wanted = {name if name.startswith("filtergym/") else f"filtergym/{name}" for name in names}
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert held == wanted, sorted(held ^ wanted)
+    assert wheel.stat().st_size < MOST_BYTES
 
 
 def check_source_distribution(archive: Path, source: Path) -> None:

@@ -366,19 +366,10 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
         assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
 
-class Sluggish:
+class Sluggish(ConstantVelocity):
     """Constant velocity with less acceleration than there is."""
 
-    kind, parameters = "estimator", {"acceleration": (0.15, 0.2, 0.25)}
-
-    def __init__(self, task, acceleration):
-        self.own = Asked(ConstantVelocity(task, acceleration))
-
-    def start(self, initial, N):
-        return self.own.start(initial, N)
-
-    def update(self, measurement, memory):
-        return self.own.update(measurement, memory)
+    parameters = {"acceleration": (0.15, 0.2, 0.25)}  # noqa: RUF012
 
 
 def test_a_cheaper_family_that_predicts_worse_beyond_chance_is_not_chosen(monkeypatch, tmp_path):

@@ -85,7 +85,8 @@ def weights(algorithm, folder):
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "bptt-linear", "bptt-small", "kalman-net", "student"]
+    "algorithm",
+    ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "bptt-linear", "bptt-small", "kalman-net", "student"],
 )
 def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
     # Interrupted at about a third, in the middle of an episode; bptt and kalman-net learn from whole ones.

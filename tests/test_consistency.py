@@ -154,7 +154,7 @@ def test_who_is_best(dataset, found):
     expected = float(cost.sel(policy="ppo") / cost.sel(policy="bptt")) - 1.0
     assert behind.value == pytest.approx(expected, rel=1e-12)
     sentence = ranking_sentence(records, "imm")
-    assert sentence.startswith("On `random` `bptt` (learned) costs least: -")
+    assert sentence.startswith("On `random` `bptt` (learned) has the lowest error cost: -")
     classical = next(name for name in names if name not in ("bptt", "ppo"))
     assert f"The strongest classical competitor, `{classical}` (" in sentence
     assert ("known-turn", "behind_best") not in found

@@ -13,8 +13,11 @@ from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.compiler import c_source as compiler_source
 from filtergym.envs.contract.filter import Initial
+from filtergym.envs.tightly_coupled_navigation.banks import HypothesisBank
+from filtergym.evaluation.competitors.programs import Program
 from filtergym.filters import kalman
 
+from filtergym import evaluate
 from filtergym.exports import c_source
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
 from filtergym.exports.replay import mean_rows, replay, run_filter
@@ -227,6 +230,53 @@ def converse(program, given):
     )
     assert "exported from another" in json.loads(refused.stdout)["error"]
     return np.moveaxis(np.frombuffer(content, dtype="<f8").reshape(T, E, -1)[..., :C], 1, -1)
+
+
+@pytest.mark.parametrize(
+    ("environment", "name", "scenario", "horizon"),
+    [
+        ("UavAutopilot", "bptt-small", None, 200),  # is shown readings that sensors hold in dropouts
+        (
+            "RadarEsmTracking",
+            "forgetting-joint-type",
+            None,
+            60,
+        ),  # bearings are told where an emitter is heard
+        ("ManeuveringTarget", "adaptive", "glint", 60),
+    ],
+)
+def test_an_exported_policy_competes_as_what_it_was(environment, name, scenario, horizon, tmp_path):
+    own, program = costs_of(environment, name, tmp_path, scenario, horizon=horizon)
+    np.testing.assert_allclose(program, own, rtol=1e-9)
+
+
+def costs_of(environment, name, folder, scenario=None, **keywords):
+    """Costs of the episodes of a policy, and of the program that it is exported as, ``(2, episodes)``."""
+    problem = problem_of(f"filtergym/{environment}-v0")
+    export_c(ExportRequest(problem, name, find_competitor(problem, name), scenario, keywords), folder)
+    words = [compiler(), "-std=c99", "-O1", "main.c", f"{c_source.file_stem(name)}.c", "-lm", "-o", "run"]
+    subprocess.run(words, cwd=folder, check=True)
+    both = {"own": name, "program": Program(str(folder / "run"))}
+    found = evaluate(problem.id, both, scenario, 16, backend="numpy", **keywords)
+    assert not np.nan_to_num(found["lost"]).any()
+    return found["cost"].mean("time").values
+
+
+def test_an_exported_bank_steers_the_tracking_loops(tmp_path, monkeypatch):
+    """From its first answer on; before it they follow the initial estimate, here of both."""
+    feedback = HypothesisBank.feedback
+
+    def after_the_start(self, state, measurement):
+        return None if isinstance(measurement, Initial) else feedback(self, state, measurement)
+
+    monkeypatch.setattr(HypothesisBank, "feedback", after_the_start)
+    keywords = {"aperture_probability": 1.0, "rate_aperture": 2.0, "horizon": 60}
+    own, program = costs_of("TightlyCoupledNavigation", "multi-hypothesis", tmp_path, **keywords)
+    np.testing.assert_allclose(program, own, rtol=1e-9)
+    # The loops lose rates here: with what the estimate says alone others, and the costs are others.
+    monkeypatch.setattr(HypothesisBank, "feedback", lambda *given: None)
+    (other, _) = costs_of("TightlyCoupledNavigation", "multi-hypothesis", tmp_path, **keywords)
+    assert np.abs(other / own - 1.0).max() > 1e-3
 
 
 class OwnNetwork:

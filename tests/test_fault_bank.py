@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.table import Variant
 from filtergym.envs.contract.filter import Initial, Input
-from filtergym.envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE, FaultBank
+from filtergym.envs.loosely_coupled_navigation.fault_bank import FEW, TRAINING, VAGUE, FaultBank
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.running.rollout import rollout
@@ -148,6 +148,16 @@ def test_merging_costs_little(seed):
     assert found[0] == pytest.approx(exact[0], abs=0.15)
     assert found[1] == pytest.approx(exact[1], abs=0.2 * math.sqrt(exact[2]))
     assert found[2] == pytest.approx(exact[2], rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_four_filters_are_the_enumeration_while_nothing_is_merged(seed):
+    four = {name: getattr(FEW, name) for name in ("points", "onsets")}
+    bank, task = small(**four)
+    seen = list(measurements(seed, 3))
+    assert of_bank(bank, seen) == pytest.approx(enumerated(bank, task, seen), rel=1e-10, abs=1e-10)
+    memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1)))).memory
+    assert memory.free.weights[..., 0].size + memory.pulled.weights[..., 0].size == 4
 
 
 def test_the_first_fix_gives_the_exact_mixture():

@@ -227,7 +227,7 @@ def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
         ({"x": TIME, "y": TIME}, "it has x and latitude: leave one of them out"),
         (
             {"x": TIME, "y": TIME, "lat": None, "lon": None, "truth_lat": TIME / 100.0, "truth_lon": TIME / 100.0},
-            "it has truth_latitude and no latitude: nobody knows where x and y begin",
+            "it has truth_latitude and no latitude, without which the origin of x and y is not known",
         ),
     ],
 )  # fmt: skip

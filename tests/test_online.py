@@ -12,6 +12,7 @@ from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import read_recording
 from filtergym.evaluation.competitors.kinds import kind_of
+from filtergym.evaluation.competitors.online_state import History
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
 
@@ -276,6 +277,8 @@ def test_the_example_of_the_page_prints_what_the_page_says(capsys):
         (lambda f: f.update(x=1.0, y=2.0), "has not been started: call start first"),
         (lambda f: f.start(STATE), "needs covariance at the start, finite, got mean="),
         (lambda f: f.start(STATE[:3], COVARIANCE), r"mean must have shape \(4,\), got \(3,\)"),
+        (lambda f: f.start(5.0, COVARIANCE), r"mean must have shape \(4,\), got \(\)"),
+        (lambda f: f.start(STATE, COVARIANCE[0, 0]), r"covariance must have shape \(4, 4\), got \(\)"),
         (lambda f: f.start(STATE, COVARIANCE, position=3), "unknown value 'position'"),
         (lambda f: f.start(STATE, COVARIANCE, time=np.nan), "time must be finite seconds"),
         (lambda f: f.update(1.0, X=1.0), r"unknown value 'X': .* takes x \(m, east"),
@@ -545,6 +548,47 @@ def test_a_state_goes_back_to_the_filter_that_it_is_of():
     with pytest.raises(TypeError, match="a running filter cannot be copied or pickled: make another"):
         pickle.dumps(filter)
     filter.restore(pickle.loads(pickle.dumps(filter.save())))
+
+
+def test_a_number_is_no_vector_of_equal_ones_and_one_of_each_track_no_vector():
+    filter, axes = filtergym.online(LOOSE, "plain-reduced", tracks=2, axes=3), 3
+    filter.start(np.zeros(axes), np.eye(axes))
+    for wrong in (5.0, [1.0, 2.0], np.zeros((axes, 3))):
+        with pytest.raises(ValueError, match=r"ins must have shape \(3,\), or \(..., 2\) for 2 tracks, got"):
+            filter.update(ins=wrong)
+    filter.update(ins=np.zeros(axes))
+    filter.update(ins=np.zeros((axes, 2)))
+
+
+FORGED = {
+    "filter": [None, 5, (), np.zeros(3)],
+    "input": [None, 5, {}, {"time": np.zeros(1)}, {"time": np.full(1, np.nan), "count": np.zeros(1)}],
+    "fresh": [None, "x", np.ones(7, dtype=bool)],
+    "measurements": [None, -1, "x", 1.5],
+    "too_late": [None, "x"],
+    "history": [None, (), 5],
+}
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt"])
+def test_a_forged_state_is_refused_in_a_sentence_and_the_filter_goes_on(name):
+    filter, other = (filtergym.online(RADAR, name, lag=3) for _ in range(2))
+    for each in (filter, other):
+        each.start(STATE, COVARIANCE)
+        each.update(10.0, x=20310.0, y=30640.0)
+    saved = filter.save()
+    taken = saved.history.taken[0]
+    histories = [History((one,)) for one in (None, 5, taken._replace(before=None), taken._replace(time="x"))]
+    parts = {**FORGED, "history": [*FORGED["history"], *histories]}
+    if name == "bptt":
+        parts |= {"policy": [5, "x"]}
+    for part, values in parts.items():
+        for value in values:
+            with pytest.raises(ValueError, match="cannot go on from this state, which is not what save has"):
+                filter.restore(saved._replace(**{part: value}))
+    one, two = (each.update(20.0, x=20200.0, y=30700.0) for each in (filter, other))
+    np.testing.assert_array_equal(one.mean, two.mean)
+    np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
 @pytest.mark.parametrize("name", ["imm", "kalman-imm-turn", "bptt-small"])

@@ -89,7 +89,7 @@ for k, line in enumerate(sys.stdin):
 def task_of(components=2):
     """A task as far as a program is told of it."""
     named = [Component(f"c{i}", "m") for i in range(components)]
-    return SimpleNamespace(id="mine/Task-v0", components=named, parameters=None)
+    return SimpleNamespace(id="mine/Task-v0", components=named, parameters=None, closes_loop=False)
 
 
 def given(N, components=2):
@@ -116,6 +116,39 @@ def run(command, steps=4, N=8, **limits):
         assert covariance.shape == (2, 2, N)
         means.append(mean)
     return np.stack(means), estimator
+
+
+# --- what steers the world
+
+STEER = """
+import json, sys
+hello, what = json.loads(sys.stdin.readline()), sys.argv[1]
+print(json.dumps({"filtergym": 1, "format": "json", "feedback": what != "none"}), flush=True)
+own = json.loads(sys.stdin.readline())["initial"]
+if what != "none":
+    size = hello["numbers"]["feedback"]
+    value = {"far": 1e6, "nothing": None}[what]
+    own["feedback"] = [[value] * size for _ in range(hello["tracks"])]
+for line in sys.stdin:
+    print(json.dumps(own), flush=True)
+"""
+
+
+def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
+    """What is no number is not taken, and the loops follow the estimate, as without."""
+    (tmp_path / "steer.py").write_text(STEER)
+    navigation = make_model("filtergym/TightlyCoupledNavigation-v0", scenario="kinematic", horizon=4)
+
+    def received(what):
+        program = Program(f"{sys.executable} {tmp_path / 'steer.py'} {what}")
+        return np.stack([e.measurement.available[:8, 0] for e, _ in rollout(navigation, program, [3])])
+
+    usual = received("none")
+    assert usual.any()
+    np.testing.assert_array_equal(received("nothing"), usual)
+    far = received("far")
+    np.testing.assert_array_equal(far[0], usual[0])  # the first measurement comes before its first answer
+    assert not far[1:].any()
 
 
 # --- mistakes

@@ -110,7 +110,19 @@ def test_stored_drives_are_read(problems, tmp_path):
     np.testing.assert_array_equal(
         values[:, 2], [4.5, 8.5, 12.5, 12.5]
     )  # of the next row; the last one's is its own
-    np.testing.assert_allclose(values[:, 3], np.cos([6.0, 10.0, 14.0, 14.0]))
-    np.testing.assert_array_equal(values[:, 5], [7.0, 11.0, 15.0, 15.0])
+    np.testing.assert_allclose(values[:, 3], [6.0, 10.0, 14.0, 14.0])
+    np.testing.assert_array_equal(values[:, 4], [7.0, 11.0, 15.0, 15.0])
     np.testing.assert_array_equal(recording.initial["mean"][0], [7.0, 8.0, 0.0, 0.5, 0.0, 0.0])
     recording.scenario(problems.Drives, {})
+
+
+def test_a_filter_with_noises_of_its_own_uses_both(problems):
+    """As factors on the model's covariances say; alike would also hold if both were left out."""
+    own = {
+        "own": problems.with_noises(9.0 * problems.LINEAR["Q"], 2.0 * problems.LINEAR["R"]),
+        "factors": problems.Variant(problems.Extended, process_noise=9.0, measurement_noise=2.0),
+        "written": "extended",
+    }
+    cost = problems.filtergym.evaluate(problems.Linear.id, own, episodes=5).cost
+    np.testing.assert_allclose(cost.sel(policy="own"), cost.sel(policy="factors"), rtol=1e-12)
+    assert np.abs(cost.sel(policy="own") / cost.sel(policy="written") - 1.0).max() > 0.1

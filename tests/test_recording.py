@@ -613,7 +613,7 @@ def test_files_with_and_without_truth_are_not_judged(recordings, tmp_path):
     read = read_recording(tmp_path)
     assert read.names[2:4] == ("known: 2", "untold: 0")
     assert read.truth is None
-    assert read.notes == ("untold: has no truth, so nobody is judged",)
+    assert read.notes == ("untold: has no truth, so no competitor is judged",)
 
 
 def test_a_horizon_makes_episodes_shorter(recordings, tmp_path):

@@ -289,6 +289,7 @@ def test_verdicts_of_few_episodes(results: SimpleNamespace) -> None:
     assert verdicts["C3"] == "reproduced"
 
 
+@pytest.mark.slow
 def test_verdicts_follow_the_data(results: SimpleNamespace) -> None:
     main = results.of.main
     imm, adaptive = main["imm"], main["adaptive"]
@@ -308,6 +309,7 @@ def test_verdicts_follow_the_data(results: SimpleNamespace) -> None:
     assert verdicts["C3"] == "not reproduced"
 
 
+@pytest.mark.slow
 def test_figures_can_be_drawn_with_axes_named(results: SimpleNamespace) -> None:
     drawn = figures.figures(results.of)
     assert len(drawn) == 5

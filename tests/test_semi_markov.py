@@ -4,7 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.maneuvering_target.semi_markov import SLOWEST, VAGUE, SemiMarkov
+from filtergym.envs.maneuvering_target.semi_markov import (
+    SLOWEST,
+    VAGUE,
+    SemiMarkov,
+    training_prior,
+)
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
@@ -90,7 +95,7 @@ def begun(filter, kind, x, P):
     if kind == "thrust":
         return np.append(x, [0.0, 0.0]), padded(P, [filter.prior.thrust**2] * 2)
     pace = math.sqrt(squared_pace(x))
-    return np.append(x, kind / pace), padded(P, [(filter.prior.turn_spread / pace) ** 2])
+    return np.append(x, kind.acceleration / pace), padded(P, [(kind.spread / pace) ** 2])
 
 
 def predicted(filter, kind, x, P, dt):
@@ -110,8 +115,9 @@ def predicted(filter, kind, x, P, dt):
 def enumerated(filter, initial, measurements, b):
     """Posterior moments and log-likelihoods of all sequences of kinds and durations, none merged."""
     hazard = filter.hazard[:, 0]
-    kinds = {"thrust": (1.0 - filter.prior.turning) * filter.prior.begin}
-    kinds |= {turn: filter.prior.turning * filter.prior.begin / len(filter.turns) for turn in filter.turns}
+    turning = filter.prior.turning if filter.turns else 0.0
+    kinds = {"thrust": (1.0 - turning) * filter.prior.begin}
+    kinds |= {turn: turning * filter.prior.begin * turn.share for turn in filter.turns}
     found = [(0.0, "rest", 0, initial.mean[:, b], initial.covariance[..., b])]
     answers = []
     for m in measurements:
@@ -181,9 +187,14 @@ def prior(**changed):
     return {"begin": 0.2, "noise": 0.05, "change": 0.1, "outliers": 0.0, **changed}
 
 
-def test_equals_the_enumeration_while_nothing_is_merged(model):
+@pytest.mark.parametrize(
+    "size",
+    [{}, {"turns": (), "straight_ages": 4}, {"turns": (3.25,), "straight_ages": 2}, {"hard_turns": 0.2}],
+    ids=["whole", "no-turns", "one-turn", "hard-turns"],
+)
+def test_equals_the_enumeration_while_nothing_is_merged(model, size):
     # Until a manoeuvre may have ended there is one straight flight that others may begin from.
-    filter = SemiMarkov(model.task, **prior(hazards=(0.0, 0.0, 0.0, 0.0, 0.3)))
+    filter = SemiMarkov(model.task, **prior(hazards=(0.0, 0.0, 0.0, 0.0, 0.3), **size))
     initial, measurements, answers = answers_of(model, filter, 4)
     for b in range(LANES):
         for (x, P, total), (mean, covariance, log_likelihood) in zip(
@@ -196,10 +207,15 @@ def test_equals_the_enumeration_while_nothing_is_merged(model):
                 assert log_likelihood[b] == pytest.approx(total, rel=1e-8, abs=1e-9)
 
 
-def test_stays_near_the_enumeration_where_it_merges(model):
+@pytest.mark.parametrize("hypotheses", [3, 5, 9, 15, 32])
+def test_stays_near_the_enumeration_where_it_merges(model, hypotheses):
     # Manoeuvres end and begin again: what is merged differs only in when.
-    filter = SemiMarkov(model.task, **prior(begin=0.05, hazards=(0.0, 0.3, 0.4)))
-    initial, measurements, answers = answers_of(model, filter, 6)
+    # The fewer ages, the sooner manoeuvres may end, and the more sequences there are.
+    scans, size = (
+        (6, {"hazards": (0.0, 0.3, 0.4)}) if hypotheses == 32 else (4, training_prior(hypotheses)._asdict())
+    )
+    filter = SemiMarkov(model.task, **{**size, **prior(begin=0.05)})
+    initial, measurements, answers = answers_of(model, filter, scans)
     distances, differences = [], []
     for b in range(0, LANES, 3):  # seconds each
         for (x, P, total), (mean, _, log_likelihood) in zip(
@@ -211,6 +227,17 @@ def test_stays_near_the_enumeration_where_it_merges(model):
     # What is added to the normalised squared error, of which the mean is four.
     assert np.mean(distances) < 0.02
     assert abs(np.mean(differences)) < 0.02
+
+
+@pytest.mark.parametrize("hypotheses", [3, 5, 9, 15])
+def test_few_hypotheses_are_as_many_as_asked_for(model, hypotheses):
+    filter = SemiMarkov(model.task, training_prior(hypotheses))
+    assert (
+        sum(table.probability.shape[0] for table in filter.start(answers_of(model, filter, 1)[0]).track)
+        == hypotheses
+    )
+    # Durations are those of training: 3 to 12 scans, all alike.
+    assert filter.prior.hazards == pytest.approx((1.0 / 7.5,))
 
 
 def test_survives_what_its_prior_rules_out():
@@ -268,7 +295,7 @@ def probabilities_after(bank, state, measurement, action):
 @pytest.mark.parametrize(("index", "factor"), [(0, 3.0), (1, 9.0), (2, 1.5)])
 def test_hypotheses_multiplies_odds(steered, index, factor):
     bank, scans, _ = steered
-    ages, straight = bank.own.ages, bank.own.straight_ages
+    ages, straight = bank.own.ages, bank.own.prior.straight_ages
     end = straight + ages * (1 + len(bank.own.turns))
     raised = [range(straight, end, ages), [0], range(straight + ages, end)][index]
     for state, measurement in scans[:6]:

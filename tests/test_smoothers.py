@@ -112,7 +112,9 @@ def test_smoothers_are_marked_and_never_ranked():
     assert not {"score", "behind_best", "log_likelihood", "anis"} & of_smoother
     assert {r.component or r.policy for r in records if r.metric == "behind_best"} <= {"kalman-imm", "imm"}
     assert [place.name for place in ranking(records)] == ["kalman-imm", "imm"]
-    assert ranking_sentence(records, "imm").startswith("On `paper` `kalman-imm` (estimator) costs least")
+    assert ranking_sentence(records, "imm").startswith(
+        "On `paper` `kalman-imm` (estimator) has the lowest error cost"
+    )
     tables = results_tables(records, problem_of(TARGET).knows, 200)
     assert "Not causal, with later measurements: imm-smoother, imm-lag-5." in tables[-1].caption
     assert [name for name, *_ in rank_competitors(records)] == [

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.linear.state_space import Measurement
 from own_models import make_models, simulate
 
 import filtergym
@@ -131,6 +132,68 @@ def test_filters_agree(make):
     np.testing.assert_allclose(*dataset.error.values, rtol=1e-6, atol=1e-6)
 
 
+LOADED = {
+    "f": lambda x, dt, u: [x[0] - 0.1 * dt * u[0], x[1] * np.exp(-dt)],
+    "h": lambda x, u: [x[0] + 0.1 * x[0] ** 2 - x[1] - 0.3 * u[0] * (1.0 + x[1]) + u[1]],
+}
+"""What is measured is under load."""
+SENSORS = {"voltage": filtergym.Sensor(LOADED["h"], R), "gauge": filtergym.Sensor([[1.0, 0.0]], R)}
+
+
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+@pytest.mark.parametrize("kind", [{}, {"inputs": ["current", "load"]}], ids=["noisy", "exact"])
+def test_sensors_may_measure_the_inputs(make, kind, backend):
+    """Against a naive extended Kalman filter of the same equations, rounding alone between them."""
+    cls = make(**LOADED, **kind)
+    start, kept = simulate(cls, 10, 4, backend=backend, jitter=0.9)
+    for lane in range(4):
+        mean, P = start.measurement.mean[:, lane], start.measurement.covariance[:, :, lane]
+        known = np.zeros((2, 2)) if kind else N
+        for _, m, *_ in kept:
+            dt, u = m.interval[lane], m.inputs[:, lane]
+            F, G = np.diag([1.0, np.exp(-dt)]), np.array([[-0.1 * dt, 0.0], [0.0, 0.0]])
+            mean = F @ mean + G @ u
+            P = F @ P @ F.T + G @ known @ G.T + np.array(noise_of(dt))
+            H = np.array([[1.0 + 0.2 * mean[0], -1.0 - 0.3 * u[0]]])
+            D = np.array([[-0.3 * (1.0 + mean[1]), 1.0]])
+            S = H @ P @ H.T + D @ known @ D.T + R
+            K = P @ H.T @ np.linalg.inv(S)
+            nu = m.values[0, lane] - LOADED["h"](mean, u)[0]
+            mean, P = mean + K[:, 0] * nu, P - K @ S @ K.T
+        np.testing.assert_allclose(kept[-1][2][:, lane], mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
+
+
+def test_the_world_measures_what_truly_acts(make):
+    """Without noise of the sensor, and with the input told exactly, nothing is left of the difference."""
+    cls = make(**LOADED, inputs=["current", "load"], R=[[1e-20]])
+    _, kept = simulate(cls, 5, 8)
+    for truth, measurement, *_ in kept:
+        told = LOADED["h"](truth.state, truth.inputs)[0]
+        np.testing.assert_allclose(measurement.values[0], told, atol=1e-8)
+
+
+def test_filters_agree_on_sensors_of_inputs(make):
+    cls = make(f=LOADED["f"], sensors=SENSORS, h=None, R=None, measured=())
+    names = ["kalman", "extended", "known-model"]
+    dataset = filtergym.evaluate(cls.id, names, scenario="jitter", episodes=8, horizon=20)
+    first, *others = dataset.error.values
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=1e-9, atol=1e-9)
+    linear = make(f=LOADED["f"], h=lambda x, u: [x[0] - x[1] - 0.3 * u[0]])
+    dataset = filtergym.evaluate(linear.id, ["extended", "unscented"], episodes=8, horizon=20)
+    np.testing.assert_allclose(*dataset.error.values, rtol=1e-6, atol=1e-6)
+
+
+def test_a_table_is_predicted_with_the_inputs_that_are_measured(make):
+    cls = make(**LOADED)
+    mean, dt, u = np.array([[0.7], [0.1]]), np.array([0.4]), np.array([[1.1], [0.2]])
+    given = Measurement(np.array([[0.3]]), np.ones((1, 1)), dt, u)
+    predicted, _ = cls.log_format.predict(mean, given, None)
+    moved = LOADED["f"](mean[:, 0], 0.4, u[:, 0])
+    np.testing.assert_allclose(predicted[:, 0], LOADED["h"](moved, u[:, 0]), rtol=1e-14)
+
+
 def test_a_loop_of_ones_own_gives_inputs_by_name_and_the_last_holds_on(make):
     filter, late = (filtergym.online(make().id, "extended", lag=lag) for lag in (0, 3))
     for each in (filter, late):
@@ -198,7 +261,7 @@ def test_a_filter_with_inputs_is_exported(make, tmp_path):
     ("wrong", "sentence"),
     [
         ({"inputs": ()}, "f takes u, and there are no inputs"),
-        ({"f": lambda x, dt: [x[0], x[1]]}, "f does not take u: write"),
+        ({"f": lambda x, dt: [x[0], x[1]]}, "neither f nor h takes u: write"),
         ({"inputs": ["current", "voltage"]}, "none of them a time or an input"),
         ({"inputs": ["current", "values"]}, "names may not be recording, values, available"),
         ({"inputs": "current"}, "inputs must be names, or a mapping"),

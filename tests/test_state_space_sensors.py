@@ -9,6 +9,7 @@ from filtergym.baselines.advice import fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
+from filtergym.baselines.table import Variant
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.envs.linear.state_space import Measurement
@@ -293,3 +294,81 @@ def test_a_noise_that_the_log_does_not_tell_is_not_identifiable(make, tmp_path):
     for name, factor in (("process_noise", 0.25), ("gps_noise", 4.0), ("odometry_noise", 4.0)):
         interval = intervals[f"log10_{name}"]
         assert interval.low - 0.1 < np.log10(factor) < interval.high + 0.1
+
+
+WANDERS = {"speed": np.diag([0.0, 0.04]), "drift": np.diag([0.25, 0.0])}
+TURNS = np.array([[0.0, 1.0], [-0.1, -0.2]])
+TWO = {
+    "f": None, "Q": None, "drift": TURNS, "diffusion": WANDERS, "sensors": {"gps": Sensor([[1, 0]], 1.0)},
+    "mean": [0, 0], "covariance": np.eye(2), "names": ["x", "v"], "units": (), "weights": None,
+    "sampling_interval": 0.5,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["extended", "unscented", "kalman-imm"])
+@pytest.mark.parametrize("kind", ["drift", "timed", "fixed"])
+def test_a_source_of_noise_has_a_factor_of_its_own(make, kind, name):
+    """The filter with factors is the one of the model whose noises are so much larger."""
+    factors, curved = {"speed": 4.0, "drift": 0.25}, lambda x: [x[0] + 0.01 * x[1] ** 2]
+    if kind == "drift":
+        given = {"drift": lambda x: [x[1], -0.1 * np.sin(x[0])], "diffusion": WANDERS}
+    elif kind == "timed":
+        given = {"f": lambda x, dt: [x[0] + dt * x[1], x[1]], "drift": None, "diffusion": None}
+        given["Q"] = {name: lambda dt, D=D: dt * D for name, D in WANDERS.items()}
+    else:
+        given = {"f": [[1, 0.5], [0, 1]], "Q": WANDERS, "drift": None, "diffusion": None}
+    noise = "diffusion" if kind == "drift" else "Q"
+    scale = lambda one, k: (lambda dt: k * one(dt)) if callable(one) else k * one  # noqa: E731
+    scaled = {**given, noise: {each: scale(own, factors[each]) for each, own in given[noise].items()}}
+    found = []
+    for model, further in ((given, {f"{each}_noise": k for each, k in factors.items()}), (scaled, {})):
+        common = {**TWO, **model, "sensors": {"gps": Sensor(curved, 1.0)}}
+        world = {key: value for key, value in given.items() if value is not None}
+        cls = make(**{**common, **world}, filter_model={noise: model[noise]}, hypotheses=[{}])
+        known = problem_of(cls.id).baselines
+        limits = {"log10_speed_noise", "log10_drift_noise", "log10_measurement_noise"}
+        assert {*known.tunable[name].limits} == limits
+        dataset = filtergym.evaluate(
+            cls.id, {"one": Variant(known.estimators[name], **further)}, episodes=4, horizon=20
+        )
+        found.append(dataset.error.values)
+    # Sigma points start with 1e-9 of the Q of the model more, which the two do not share.
+    np.testing.assert_allclose(*found, rtol=1e-6 if name == "unscented" else 1e-9, atol=1e-12)
+
+
+def test_a_log_tells_the_noise_of_each_source(make, tmp_path):
+    """Of 600 measurements: within the intervals that are said, which are of 95 %, half a decade at most each way."""
+    larger = {"speed": 4.0 * WANDERS["speed"], "drift": 0.25 * WANDERS["drift"]}
+    sensors = {"gps": Sensor([[1, 0]], 0.01), "log": Sensor([[0, 1]], 0.01)}
+    world = make(**{**TWO, "diffusion": larger, "sensors": sensors})
+    made = filtergym.record(world.id, episodes=1, horizon=600)
+    table = np.column_stack([made.seconds[0], made.measurements["values"][0]])
+    np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header="time,gps,log", comments="")
+    problem = problem_of(make(**{**TWO, "sensors": sensors}).id)
+    log = read_recording(tmp_path / "log.csv", problem.id)
+    _, _, intervals = fit_all(problem, log, families_of(problem, log)["extended"])
+    for name, factor in (("speed_noise", 4.0), ("drift_noise", 0.25)):
+        interval = intervals[f"log10_{name}"]
+        assert interval.high - interval.low < 1.0
+        assert interval.low - 0.05 < np.log10(factor) < interval.high + 0.05
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"diffusion": {}}, "diffusion by its sources names at least one"),
+        ({"diffusion": {"gps": np.eye(2)}}, "the source of noise 'gps' must have another name"),
+        ({"diffusion": {"process": np.eye(2)}}, "the source of noise 'process' must have another name"),
+        ({"hypotheses": [{"diffusion": np.eye(2)}]}, "all models must name the same sources of noise"),
+        ({"diffusion": {"wind": -np.eye(2)}}, "diffusion must be symmetric"),
+    ],
+)
+def test_what_are_no_sources_is_refused(make, wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make(**{**TWO, **wrong})
+
+
+def test_a_noise_of_nobody_is_refused(make):
+    task = make_model(make(), backend="numpy").task
+    with pytest.raises(ValueError, match="noises are of gps, odometry, compass, got 'wind'"):
+        Extended(task, wind_noise=2.0)

@@ -90,6 +90,7 @@ def test_an_honest_submission_holds(name, honest, command):
     assert f"SHA-256 {digest}" in shown
 
 
+@pytest.mark.slow
 def test_what_runs_is_the_text_wherever_it_runs(honest):
     """The module that was packed is not there any more; two processes find what one has found."""
     assert "own_filter" not in sys.modules

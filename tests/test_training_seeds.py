@@ -162,6 +162,7 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     assert scored[8:] == ["agent", "agent", "imm"]
 
 
+@pytest.mark.slow
 def test_command_makes_the_record_and_the_record_the_tables(folders, tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ("--episodes", 20, "--split", "validation", "--out", "seeds.json", "--curves", "curves.png")

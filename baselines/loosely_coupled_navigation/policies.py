@@ -11,7 +11,7 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
-from ...envs.loosely_coupled_navigation.fault_bank import TRAINING, VAGUE, FaultBank
+from ...envs.loosely_coupled_navigation.fault_bank import FEW, TRAINING, VAGUE, FaultBank
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import select_nested
@@ -240,6 +240,7 @@ ESTIMATORS |= {
         "distribution.",
         prior=TRAINING,
     ),
+    "fault-bank-4": Variant(FaultBank, "`fault-bank` with 4 filters in place of 43.", prior=FEW),
     "fault-bank-vague": Variant(
         FaultBank,
         "`fault-bank` by a prior that is wider than every scenario and expects outliers.",
@@ -309,6 +310,7 @@ BASELINES = Baselines(
         "augmented",
         "augmented-sage-husa",
         "fault-bank",
+        "fault-bank-4",
         "fault-bank-vague",
         "ins-only",
         "gnss-only",

@@ -3,13 +3,21 @@
 Deviations and small probabilities are searched by their logarithm: their sizes are not known beforehand.
 """
 
+import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from math import log10
 from typing import Any
 
-from ...envs.maneuvering_target.semi_markov import TRAINING, VAGUE, SemiMarkov, SemiMarkovPrior
-from ..table import Variant, tunable, without_logarithms
+from ...envs.maneuvering_target.semi_markov import (
+    TRAINING,
+    VAGUE,
+    WIDE,
+    SemiMarkov,
+    SemiMarkovPrior,
+    training_prior,
+)
+from ..table import Tunable, Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .data_association import (
     InteractingMultipleModelDataAssociation,
@@ -31,11 +39,23 @@ SEMI_MARKOV_VAGUE_DATA_ASSOCIATION = Variant(
     "`semi-markov-vague`, each of whose hypotheses weighs all plots of a scan; without clutter it is that filter.",
     prior=VAGUE,
 )
+FEW = {
+    f"semi-markov-{H}": Variant(
+        SemiMarkov, f"`semi-markov` with {H} hypotheses in place of 32.", prior=training_prior(H)
+    )
+    for H in (3, 5, 9, 15)
+}
 
 ESTIMATORS = {
     "kalman-imm": KalmanInteractingMultipleModel,
     "kalman-imm-turn": KalmanTurnInteractingMultipleModel,
     "semi-markov": SemiMarkov,
+    **FEW,
+    "semi-markov-wide": Variant(
+        SemiMarkov,
+        "`semi-markov` with a prior that holds harder manoeuvres than those of training, too: 40 hypotheses.",
+        prior=WIDE,
+    ),
     "semi-markov-vague": SEMI_MARKOV_VAGUE,
     "kalman-pda": ProbabilisticDataAssociation,
     "kalman-imm-pda": InteractingMultipleModelDataAssociation,
@@ -69,30 +89,41 @@ def _imm_turn(values: Mapping[str, float]) -> Settings:
     )
 
 
-def _semi_markov(
-    make: Callable[..., Any], hazards: Sequence[float]
-) -> Callable[[Mapping[str, float]], Settings]:
+TURNS = {
+    0: {},
+    1: {"turn": (0.5, 7.0)},
+    2: {"turn_gentle": (0.5, 3.0), "turn_steep": (3.0, 7.0)},
+}
+"""Limits of the mean acceleration of as many kinds of turns."""
+
+
+def _semi_markov(make: Callable[..., Any], prior: SemiMarkovPrior, likelihood: bool = False) -> Tunable:
+    names = TURNS[len(prior.turns)]
+
     def apply(values: Mapping[str, float]) -> Settings:
         v = without_logarithms(values)
-        gentle, steep, leave = (v.pop(name) for name in ("turn_gentle", "turn_steep", "leave"))
-        prior = {"turns": (gentle, steep), "hazards": (*hazards[:-1], leave), **v}
-        return {}, functools.partial(make, **prior)
+        turns, leave = tuple(v.pop(name) for name in names), v.pop("leave")
+        return {}, functools.partial(make, turns=turns, hazards=(*prior.hazards[:-1], leave), **v)
 
-    return apply
-
-
-def _semi_markov_limits(prior: SemiMarkovPrior) -> dict[str, tuple[float, float, float]]:
-    return {
-        "log10_begin": (-3.0, log10(prior.begin), -1.0),
+    of_turns = {
         "turning": (0.1, prior.turning, 0.9),
-        "log10_leave": (-1.5, log10(prior.hazards[-1]), -0.3),
-        "log10_thrust": (0.0, log10(prior.thrust), 1.0),
-        "turn_gentle": (0.5, prior.turns[0], 3.0),
-        "turn_steep": (3.0, prior.turns[1], 7.0),
+        **{
+            name: (low, mean, high)
+            for (name, (low, high)), mean in zip(names.items(), prior.turns, strict=True)
+        },
         "turn_spread": (0.3, prior.turn_spread, 2.0),
-        "log10_noise": (-3.0, log10(prior.noise), 0.0),
-        "log10_change": (-3.0, log10(prior.change), 0.0),
     }
+    found = tunable(
+        make,
+        apply,
+        log10_begin=(-3.0, log10(prior.begin), -1.0),
+        log10_leave=(-1.5, log10(prior.hazards[-1]), -0.3),
+        log10_thrust=(0.0, log10(prior.thrust), 1.0),
+        **(of_turns if names else {}),
+        log10_noise=(-3.0, log10(prior.noise), 0.0),
+        log10_change=(-3.0, log10(prior.change), 0.0),
+    )
+    return dataclasses.replace(found, likelihood=likelihood)
 
 
 _IMM = {
@@ -123,26 +154,11 @@ TUNABLE = {
         log10_leave_noisy=(-3.0, log10(0.2), -0.5),
         log10_leave_turn=(-3.0, log10(0.2), -0.5),
     ),
-    "semi-markov": tunable(
-        SemiMarkov,
-        _semi_markov(SemiMarkov, TRAINING.hazards),
-        **_semi_markov_limits(TRAINING),
-    ),
-    "semi-markov-pda": tunable(
-        SemiMarkovDataAssociation,
-        _semi_markov(SemiMarkovDataAssociation, TRAINING.hazards),
-        **_semi_markov_limits(TRAINING),
-    ),
-    "semi-markov-vague": tunable(
-        SEMI_MARKOV_VAGUE,
-        _semi_markov(SEMI_MARKOV_VAGUE, VAGUE.hazards),
-        **_semi_markov_limits(VAGUE),
-    ),
-    "semi-markov-vague-pda": tunable(
-        SEMI_MARKOV_VAGUE_DATA_ASSOCIATION,
-        _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE.hazards),
-        **_semi_markov_limits(VAGUE),
-    ),
+    "semi-markov": _semi_markov(SemiMarkov, TRAINING),
+    **{name: _semi_markov(few, few.keywords["prior"], likelihood=True) for name, few in FEW.items()},
+    "semi-markov-pda": _semi_markov(SemiMarkovDataAssociation, TRAINING),
+    "semi-markov-vague": _semi_markov(SEMI_MARKOV_VAGUE, VAGUE),
+    "semi-markov-vague-pda": _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
     "sage-husa": tunable(
         SageHusa,

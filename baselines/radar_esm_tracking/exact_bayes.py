@@ -82,6 +82,8 @@ TRAINING = ClassPrior()
 uniform from 0 to 0.6, of which these are the two points of Gauss and Legendre; rates of silence at their means. Four
 points of the share, four of the rates, eight onsets and a fourth point of the bearing change the cost by less than
 0.03 %."""
+FEW = TRAINING._replace(onsets=1, second_emitter=(0.3,), sides=1)
+"""For whoever has little time: one onset, and of the second emitter the mean share and one distance on either side."""
 VAGUE = ClassPrior(
     change_rate=0.004,
     change=(0.0, math.inf),

@@ -17,7 +17,7 @@ from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import ClassAlarm
-from .exact_bayes import TRAINING, VAGUE, ClassPrior, ExactBayes
+from .exact_bayes import FEW, TRAINING, VAGUE, ClassPrior, ExactBayes
 from .metrics import METRICS
 from .references import Ideal, KnownDrawBound
 
@@ -213,6 +213,12 @@ ESTIMATORS = {
         "class and time of its change, by the prior of the training distribution.",
         prior=TRAINING,
     ),
+    "exact-bayes-9": Variant(
+        ExactBayes,
+        "`exact-bayes` with 9 filters in place of 12: one time of a change of class, one share and one distance of the "
+        "second emitter.",
+        prior=FEW,
+    ),
     "exact-bayes-vague": Variant(
         ExactBayes,
         "`exact-bayes` by one prior for all targets: the class may change again, types may be drawn anew for every "
@@ -288,7 +294,9 @@ BASELINES = Baselines(
         "radar-only",
         "esm-only",
         "non-adaptive",
-        *ESTIMATORS,
+        "exact-bayes",
+        "exact-bayes-9",
+        "exact-bayes-vague",
         "random",
         "ideal",
         "known-class-bound",

@@ -102,6 +102,15 @@ _MEMORY = (20.0, 100.0, 400.0)
 _WEIGHT = (-3.0, 1.0 / 3.0, 3.0)
 BANKS: dict[str, Any] = {
     "level-bank": LevelBank,
+    **{
+        f"level-bank-{1 + points}": Variant(
+            LevelBank,
+            f"`level-bank` with {1 + points} hypotheses in place of 8, and 5 levels of each sensor in place of 9.",
+            gust_points=points,
+            sensor_points=5,
+        )
+        for points in (2, 3)
+    },
     "level-bank-vague": Variant(
         LevelBank,
         "The level bank with one vague prior for all flights: wider levels, outliers, a biased rate sensor, a slow "
@@ -197,6 +206,7 @@ BASELINES = Baselines(
         "innovation-adaptive",
         "gust-imm",
         "level-bank",
+        "level-bank-4",
         "random",
         "true-state",
         "matched",

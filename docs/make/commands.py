@@ -18,6 +18,8 @@ from filtergym.evaluation.running.parallel import Workers
 from filtergym.evaluation.storage.files import writable_file, write_text
 from filtergym.evaluation.storage.store import UNFINISHED, Store
 from front import draw_fronts, panels_of
+from notebooks import notebook_files, write_executed
+from playground import FILTERS, compile_filter, has_compiler, module_file
 from readme import with_numbers, with_printed
 from records import (
     BENCHMARK,
@@ -126,7 +128,7 @@ def readme(
         bool, typer.Option("--printed", help="Run the page's commands, and put in what they print.")
     ] = False,
 ) -> None:
-    """Put the numbers into README, which nobody renders, and draw its picture, both from the records.
+    """Put the numbers into README, which is not rendered, and draw its picture, both from the records.
 
     Example: python docs/make readme --printed
     """
@@ -140,6 +142,20 @@ def readme(
     write_text(page, text)
     if printed:
         write_text(page, with_printed(page))
+
+
+def notebooks(
+    file: Annotated[
+        list[Path] | None, typer.Argument(help="Notebooks. Default: all of the documentation.")
+    ] = None,
+) -> None:
+    """Execute notebooks and write them with what their cells print and draw; a minute or two each.
+
+    Example: python docs/make notebooks
+    """
+    for one in file or notebook_files():
+        write_executed(one)
+        console.print(f"executed {one}", soft_wrap=True)
 
 
 def seeds(
@@ -241,12 +257,27 @@ def ship(
         console.print(f"{file}: {best.name}, of the lowest validation cost")
 
 
+def playground() -> None:
+    """Compile the filters of the first page to WebAssembly, which needs zig's C compiler: pip install ziglang.
+
+    Example: python docs/make playground
+    """
+    if not has_compiler():
+        raise ValueError("zig's C compiler is not installed: pip install ziglang")
+    for name in FILTERS:
+        module = compile_filter(name)
+        module_file(name).write_bytes(module)
+        console.print(f"{module_file(name)}: {len(module):,} bytes", soft_wrap=True)
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "record": record,
     "table": table,
     "seeds": seeds,
     "ship": ship,
     "readme": readme,
+    "playground": playground,
+    "notebooks": notebooks,
 }
 
 

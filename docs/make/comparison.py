@@ -229,7 +229,7 @@ def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Compariso
         ),
         grid(
             f"Nanoseconds a measurement on one core, with the simulated world; {PYTHON_MARK}: asked in Python; "
-            f"{FRONT_MARK}: on the front, where nobody else costs less in as much time",
+            f"{FRONT_MARK}: on the front, where no other competitor has a lower error cost in as much time",
             columns,
             lambda scenario, name: times[scenario].get(name, "-"),
         ),

@@ -53,7 +53,7 @@ def draw_fronts(panels: Sequence[Panel], *, columns: int = 2) -> Any:
 
 
 def budgets_markdown(found: Sequence[BenchmarkRecords]) -> str:
-    """Return who costs least in so much time, of classical and of learned competitors, in Markdown.
+    """Return who has the lowest error cost in so much time, of classical and of learned competitors, in Markdown.
 
     A learned one is bold where its whole interval lies below that of the classical one, a classical one likewise.
     """

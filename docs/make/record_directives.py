@@ -16,8 +16,10 @@ from docutils.statemachine import StringList
 from environment_page import environment_table
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.figures.print_layout import save
+from filtergym.evaluation.storage.files import write_text
 from filtergym.papers.grid import markdown_table
 from front import budgets_markdown, draw_fronts, panels_of
+from playground import page_script, read_modules
 from records import (
     BENCHMARK,
     SEEDS,
@@ -96,7 +98,7 @@ class _Rendered(SphinxDirective):
 
 
 class ResultsTable(_Rendered):
-    """``{results-table} ENVIRONMENT``: everybody in its training distribution; several, or some, by options."""
+    """``{results-table} ENVIRONMENT``: all competitors in its training distribution; several, or some, by options."""
 
     option_spec: ClassVar[Any] = {
         "scenario": directives.unchanged,
@@ -154,7 +156,7 @@ class FrontFigure(_Rendered):
 
 
 class BudgetsTable(_Rendered):
-    """``{budgets-table}``: who costs least in so much time, classical and learned, in all environments."""
+    """``{budgets-table}``: who has the lowest error cost in so much time, classical and learned, everywhere."""
 
     def markdown(self) -> str:
         """Return one table."""
@@ -281,6 +283,30 @@ class RecordRole(SphinxRole):
         return [nodes.Text("record "), link, nodes.Text(" of "), nodes.literal("", record.command)]
 
 
+class Playground(SphinxDirective):
+    """``{playground} IMAGE``: filters that follow the pointer, and a picture where scripts are off."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Return the place for it, its scripts and its colours."""
+        page = Path(self.env.doc2path(self.env.docname)).parent
+        static = os.path.relpath(Path(self.env.srcdir) / "_static", page)
+        picture = nodes.image(uri=self.arguments[0], alt="Tracks of four filters, their errors and weights")
+        return [
+            nodes.raw("", PLAYGROUND.format(static=static), format="html"),
+            picture,
+            nodes.raw("", "</noscript></div>", format="html"),
+        ]
+
+
+PLAYGROUND = """\
+<link rel="stylesheet" href="{static}/playground.css">
+<script defer src="{static}/playground_filters.js"></script>
+<script defer src="{static}/playground.js"></script>
+<div id="playground"><noscript>"""
+
+
 def _in_sentence(
     role: SphinxRole, make: Callable[[], Sequence[nodes.Node]], record: str
 ) -> tuple[list[nodes.Node], list[nodes.system_message]]:
@@ -303,7 +329,13 @@ DIRECTIVES = {
     "record-table": RecordTable,
     "environment-table": EnvironmentTable,
     "command-line": CommandLine,
+    "playground": Playground,
 }
+
+
+def _write_playground(app: Any) -> None:
+    """Write the filters of the playground beside its script."""
+    write_text(Path(app.outdir) / "_static" / "playground_filters.js", page_script(read_modules()))
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -313,4 +345,5 @@ def setup(app: Any) -> dict[str, bool]:
     app.add_role("number", NumberRole(interval=True))
     app.add_role("value", NumberRole(interval=False))
     app.add_role("record", RecordRole())
+    app.connect("builder-inited", _write_playground)
     return {"parallel_read_safe": True}

@@ -1,6 +1,9 @@
 """PPO in a loop of one's own, as in CleanRL: torch on the native vector environment.
 
 python docs/recipes/with_a_loop_of_ones_own.py
+
+With "NextStep", Gymnasium's default, the step after the last one of an episode only resets: leave it out of the loss.
+With "SameStep" the last observation is in ``info["final_obs"]``.
 """
 
 import gymnasium as gym

@@ -1,6 +1,8 @@
 """Episodes of a tuned policy as a Minari data set, loaded again; behaviour cloning from it, judged on unseen episodes.
 
 python docs/recipes/with_minari.py
+
+d3rlpy's ``MDPDataset`` takes the same arrays: use d3rlpy 2.8.0, as 2.8.1 needs Gymnasium 1.0.0.
 """
 
 import os

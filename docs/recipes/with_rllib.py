@@ -1,6 +1,8 @@
 """PPO of RLlib (new API stack) on single environments, then on the native vector environment.
 
 python docs/recipes/with_rllib.py
+
+RLlib 2.60.0 needs Gymnasium 1.2.2, which works here too.
 """
 
 import ray

@@ -1,6 +1,8 @@
 """PPO of Tianshou on single environments.
 
 python docs/recipes/with_tianshou.py
+
+Tianshou needs pandas below 3, and its high-level interface ``tianshou[eval]``.
 """
 
 import gymnasium as gym

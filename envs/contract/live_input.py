@@ -1,5 +1,6 @@
 """Measurements that come one by one from outside: values by their names, made into the task's ``Measurement``."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -70,15 +71,14 @@ class LiveInput:
             raise ValueError(
                 f"{name} must be at most {LARGEST:g}, or NaN where it did not come, got {quote_shortened(value)}"
             )
-        if array.shape == shape:
-            array = array[..., None]
-        elif value is None:
+        if value is None:
             array = numpy.full((*shape, 1), numpy.nan)
-        try:
-            return numpy.broadcast_to(array, (*shape, self.tracks))
-        except ValueError:
+        elif array.shape == shape or (array.ndim == 0 and math.prod(shape) == 1):
+            array = array.reshape(*shape, 1)
+        elif array.shape not in ((*shape, 1), (*shape, self.tracks)):  # a number is no vector of equal ones
             tracks = f", or (..., {self.tracks}) for {self.tracks} tracks" if self.tracks > 1 else ""
-            raise ValueError(f"{name} must have shape {shape}{tracks}, got {numpy.shape(value)}") from None
+            raise ValueError(f"{name} must have shape {shape}{tracks}, got {numpy.shape(value)}")
+        return numpy.broadcast_to(array, (*shape, self.tracks))
 
     def read_all(self, values: Mapping[str, Any], names: Iterable[str], what: str) -> numpy.ndarray:
         """Return some numbers as ``(len(names), N)``.

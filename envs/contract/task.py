@@ -142,6 +142,9 @@ class Task(ABC):
     recorded_decision_interval: ClassVar[int | None] = None
     """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
     measurement is lost."""
+    feedback_words: ClassVar[str] = ""
+    """What a filter may report to steer the world beside its estimate, in words for a program that competes; empty where
+    all that steers follows from the estimate."""
     measurement_words: ClassVar[str] = ""
     """What the numbers of a measurement are, in a sentence for those who fill in arrays; empty where names say it."""
     log_format: ClassVar[LogFormat | None] = None

@@ -157,7 +157,9 @@ class Columns:
             there = numpy.isfinite(self[latitude]) & numpy.isfinite(self[longitude])
             if self.origin is None:
                 if true:
-                    raise ValueError(f"it has {latitude} and no latitude: nobody knows where x and y begin")
+                    raise ValueError(
+                        f"it has {latitude} and no latitude, without which the origin of x and y is not known"
+                    )
                 if not there.any():
                     raise ValueError(f"no row has {latitude} and {longitude}")
                 first = int(there.argmax())

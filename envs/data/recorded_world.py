@@ -281,7 +281,7 @@ class LiveWorld(_ForeignWorld):
     def state(self, truth: Unknown) -> Array:
         """Raise ValueError: nobody knows it."""
         raise ValueError(
-            "nobody knows the truth of what comes from outside, so there is no error and no cost"
+            "the truth of what comes from outside is not known, so there is no error and no cost"
         )
 
 

@@ -373,7 +373,7 @@ def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[
             lines += [f"{one.name}: {note}" for note in one.notes]
     untrue = [one.name for one in kept if one.truth is None]
     if untrue and len(untrue) < len(kept):
-        lines.append(f"{untrue[0]}: has no truth, so nobody is judged")
+        lines.append(f"{untrue[0]}: has no truth, so no competitor is judged")
     for key in sorted({key for one in kept for key in one.measurements}):
         lacking = [one.name for one in kept if key not in one.measurements]
         if lacking:

@@ -1,17 +1,19 @@
 r"""Equations of a state-space model, and what they give on the arrays of a task.
 
-    x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k)) + v,  v ~ N(0, R)
+    x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R)
 
 dt is the interval between the measurements k - 1 and k, and u the input that acted in it, constant. A model may do
 without either. Where u is known with white noise of covariance N only, what is known of the state after it is
 
     P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
 
-(Simon, Optimal State Estimation (2006), section 13.2, with the input among the noises).
+(Simon, Optimal State Estimation (2006), section 13.2, with the input among the noises). Where the sensors measure the
+input, too, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: that this error and the one of the motion are the
+same one, G N D^T, is left out.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy
@@ -42,6 +44,10 @@ class StateSpaceModel:
     """``(m, m)``."""
     G: VectorFunction | None = None
     """f as a function of the inputs, and then of all else; None where no input has noise."""
+    D: VectorFunction | None = None
+    """h likewise; None also where it knows no inputs."""
+    sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
+    """What Q is the sum of, by the names of the noises; empty where they have none."""
 
     @property
     def timed(self) -> bool:
@@ -170,7 +176,8 @@ class Equations:
     def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
         self.R = task.constant(model.R)
-        self._Q = None if model.timed else task.constant(model.Q)
+        self._Q = self._constant(task, model.Q)
+        self._sources = {name: self._constant(task, own) for name, own in model.sources.items()}
         self._F, self._H = (
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
@@ -178,6 +185,10 @@ class Equations:
         self.wraps = any(channel.period for channel in self.channels)
         self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
+
+    @staticmethod
+    def _constant(task: "StateSpace", Q: numpy.ndarray | VectorFunction) -> Array | None:
+        return None if isinstance(Q, VectorFunction) else task.constant(Q)
 
     def move(self, x: Array, passed: Passed) -> Array:
         """State without noise at the next measurement, ``(n, ...)``.
@@ -195,18 +206,30 @@ class Equations:
             rows += [passed.inputs[j] for j in range(passed.inputs.shape[0])]
         return self.xp.concat([x, *((0.0 * x[0] + row)[None] for row in rows)]) if rows else x
 
-    def process_noise(self, x: Array, passed: Passed) -> Array:
+    def process_noise(self, x: Array, passed: Passed, of_sources: Mapping[str, Any] | None = None) -> Array:
         """Q, ``(n, n, N)``, without time ``(n, n, 1)``.
 
         Args:
             x: predicted state, ``(n, N)``.
             passed: what went on until then.
+            of_sources: factors on some of its sources, by their names, a number or ``(N,)`` each.
         """
-        if self._Q is not None:
-            return self._Q[:, :, None]
-        assert isinstance(self.model.Q, VectorFunction)
+        if not of_sources:
+            return self._noise(self.model.Q, self._Q, x, passed)
+        parts = [
+            of_sources.get(name, 1.0) * self._noise(own, self._sources[name], x, passed)
+            for name, own in self.model.sources.items()
+        ]
+        return sum(parts[1:], parts[0])
+
+    def _noise(
+        self, Q: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
+    ) -> Array:
+        if constant is not None:
+            return constant[:, :, None]
+        assert isinstance(Q, VectorFunction)
         n = self.model.f.size
-        entries = self.model.Q.value(self._with_passed(x, passed), self.xp)
+        entries = Q.value(self._with_passed(x, passed), self.xp)
         return self.xp.reshape(entries, (n, n, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
@@ -216,16 +239,23 @@ class Equations:
             x: state before, ``(n, N)``.
             passed: what went on since.
         """
-        if self.model.G is None:
+        return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
+
+    def measured_input_noise(self, x: Array, passed: Passed) -> Array | float:
+        """What it adds to R, ``(m, m, N)``; arguments as of :meth:`input_noise`, the state at the measurement."""
+        return self._through(self.model.D, x, passed)
+
+    def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
+        """Covariance that noise of the inputs has behind a function of them, and of what else is given to it."""
+        if function is None:
             return 0.0
         assert passed.inputs is not None
-        inputs = passed.inputs + 0.0 * x[0]
-        given = self._with_passed(x, Passage(passed.interval, None))
-        G = self.model.G.jacobian(self.xp.concat([inputs, given]), self.xp)
+        inputs = passed.inputs + 0.0 * given[0]
+        J = function.jacobian(self.xp.concat([inputs, given]), self.xp)
         scaled = self.xp.stack(
-            [G[:, j] * variance for j, variance in enumerate(self._input_variances)], axis=1
+            [J[:, j] * variance for j, variance in enumerate(self._input_variances)], axis=1
         )
-        return product(scaled, transpose(G))
+        return product(scaled, transpose(J))
 
     def sensor_noise(self, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None) -> Array:
         """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
@@ -243,9 +273,18 @@ class Equations:
             rows += [own * R[place] for place in channel.numbers]
         return self.xp.stack(rows)
 
-    def measure(self, x: Array) -> Array:
-        """Measurement without noise, ``(m, ...)``."""
-        return self._value(self.model.h, x)
+    def measure(self, x: Array, passed: Passed) -> Array:
+        """Measurement without noise, ``(m, ...)``.
+
+        Args:
+            x: ``(n, ...)``.
+            passed: what went on until then.
+        """
+        return self._value(self.model.h, self._with_inputs(x, passed))
+
+    def _with_inputs(self, x: Array, passed: Passed) -> Array:
+        """What h takes: the state, with the inputs as its last rows where it knows them."""
+        return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
     def subtract(self, z: Array, predicted: Array) -> Array:
         """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
@@ -271,8 +310,10 @@ class Equations:
             mean: predicted, ``(n, N)``.
             R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
         """
-        nu = self.subtract(measurement.values, self.measure(mean))
-        return keep_received(nu, self.measurement_matrix(mean), R, measurement.available)
+        nu = self.subtract(measurement.values, self.measure(mean, measurement))
+        if self.model.D is not None:
+            R = R + self.measured_input_noise(mean, measurement)
+        return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:
         """Kalman gain for a predicted covariance ``(n, n, N)``, zero for sensors beyond their gates, ``(n, m, N)``."""
@@ -308,9 +349,11 @@ class Equations:
             return self._F[:, :, None]
         return self.model.f.jacobian(self._with_passed(x, passed), self.xp)
 
-    def measurement_matrix(self, x: Array) -> Array:
+    def measurement_matrix(self, x: Array, passed: Passed) -> Array:
         """Jacobian of h, likewise."""
-        return self.model.h.jacobian(x, self.xp) if self._H is None else self._H[:, :, None]
+        if self._H is not None:
+            return self._H[:, :, None]
+        return self.model.h.jacobian(self._with_inputs(x, passed), self.xp)
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
         """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""

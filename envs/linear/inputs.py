@@ -33,6 +33,7 @@ class Input:
     noise: float = 0.0
     """Standard deviation of what is told from what acts, independent at every measurement."""
     unit: str = "1"
+    """Of its mean, in tables and pages."""
 
     def __post_init__(self) -> None:
         for field in fields(self)[:-1]:

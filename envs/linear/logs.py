@@ -18,7 +18,15 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""
-OF_EPISODES = ("horizon", "decision_interval", "jitter", "process_noise", "measurement_noise", "availability")
+OF_EPISODES = (
+    "horizon",
+    "decision_interval",
+    "jitter",
+    "process_noise",
+    "measurement_noise",
+    "availability",
+    "late",
+)
 """Parameters of a simulation, which a log has not."""
 
 
@@ -141,7 +149,9 @@ def _predict(
     rows += [measurement.interval[None]] if model.timed else []
     rows += [measurement.inputs] if definition.inputs else []
     given = numpy.concatenate([numpy.reshape(row, (len(row), -1)) for row in rows])
-    predicted = model.h.value(model.f.value(given, numpy), numpy).reshape(-1, *mean.shape[1:])
+    moved = model.f.value(given, numpy)
+    known = numpy.concatenate([moved, given[len(given) - model.h.given :]])
+    predicted = model.h.value(known, numpy).reshape(-1, *mean.shape[1:])
     measured = numpy.where(measurement.available > 0.0, measurement.values, numpy.nan)
     for channel in definition.channels:
         if channel.period is not None:

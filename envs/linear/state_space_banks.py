@@ -352,7 +352,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         control: its name.
         process_noise: factor on Q of all hypotheses, a number or ``(N,)``.
         measurement_noise: likewise on R.
-        **sensor_noises: factors on R of some sensors, by their names.
+        of_sources: factors on some sources of Q, by their names.
+        of_sensors: factors on R of some sensors, by their names.
     """
 
     parameters: StateSpaceParameters
@@ -363,11 +364,12 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         control: str,
         process_noise: Any = 1.0,
         measurement_noise: Any = 1.0,
-        **sensor_noises: Any,
+        of_sources: Mapping[str, Any] | None = None,
+        of_sensors: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(task, control)
-        self.count, self.factor = len(task.believed), process_noise
-        self.R = [one.sensor_noise(measurement_noise, sensor_noises) for one in task.believed]
+        self.count, self.factor, self.of_sources = len(task.believed), process_noise, of_sources
+        self.R = [one.sensor_noise(measurement_noise, of_sensors) for one in task.believed]
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -436,7 +438,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         updates = []
         for j, equations in enumerate(self.task.believed):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
-            P = carried + self.factor * equations.process_noise(mean, measurement)
+            P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
             received = equations.receive(measurement, mean, self.R[j])
             updates.append(update_with_gain(mean, P, received, equations.gain(P, received)))
         return state._replace(

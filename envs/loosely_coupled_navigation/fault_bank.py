@@ -104,6 +104,8 @@ VAGUE = FaultPrior(
     rate=3.0,
     outlier=0.01,
 )
+FEW = TRAINING._replace(points=1, onsets=2, levels=(0.2, 1.0, 10.0, 100.0))
+"""Four filters: the modelled noises, others, and two onsets of a pull in these."""
 
 
 def spread_points(points: int, dimensions: int) -> numpy.ndarray:

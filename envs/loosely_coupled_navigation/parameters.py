@@ -157,11 +157,13 @@ class LooselyCoupledNavigationParameters(TaskParameters):
             )
         T = self.sampling_interval
         growth = (self.white_intensity + 2.0 * self.coloured**2 * min(self.correlation_time, T)) * T
-        if growth > MOST_RATIO * self.receiver_variance:
+        growth += (self.drift * T) ** 2
+        best = min(1.0, self.receiver_factor[0]) * self.receiver_variance
+        if growth > MOST_RATIO * best:
             raise ValueError(
-                "sampling_interval, coloured or white_intensity must be smaller, or receiver_intensity larger: from "
-                f"one measurement to the next the error gains {growth / self.receiver_variance:.1e} times the variance "
-                f"of the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
+                "sampling_interval, drift, coloured or white_intensity must be smaller, or receiver_intensity or "
+                f"receiver_factor larger: from one measurement to the next the error gains {growth / best:.1e} times "
+                f"the variance of the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
             )
 
     @property

@@ -52,10 +52,10 @@ class HypothesesBank(SteeredBank, RadarBank):
         super().__init__(task, control)
         thrust, *turns = self.own.kinds
         sided = list(zip(self.own.turns, turns, strict=True))
-        sides = ([kind for turn, kind in sided if side * turn > 0.0] for side in (1.0, -1.0))
+        sides = ([kind for turn, kind in sided if side * turn.acceleration > 0.0] for side in (1.0, -1.0))
         together = ([thrust], *sides)
         members = (
-            list(range(1, self.own.straight_ages)),
+            list(range(1, self.own.prior.straight_ages)),
             [0],
             [kind[0] for kind in self.own.kinds],
             *([h for kind in kinds for h in kind[1:-1]] for kinds in together),

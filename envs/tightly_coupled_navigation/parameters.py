@@ -261,6 +261,12 @@ class TightlyCoupledNavigationParameters(TaskParameters):
                         f"{name} must be at most {LARGEST_RATIO:g} times {sensor}, got {unknown!r} and {known!r}: "
                         "the covariance would have no digits left"
                     )
+        tilt = self.gravity * min(math.radians(self.initial_attitude_sigma), 1.0)
+        if tilt > LARGEST_RATIO * self.accelerometer_sigma:
+            raise ValueError(
+                f"gravity or initial_attitude_sigma must be smaller: an attitude off by that makes accelerometers read "
+                f"{tilt:.1e} m/s^2, more than {LARGEST_RATIO:g} times accelerometer_sigma"
+            )
 
     @property
     def site(self) -> tuple[float, float, float]:

@@ -106,6 +106,10 @@ class TightlyCoupledNavigation(Task):
     Parameters = TightlyCoupledNavigationParameters
     World = NavigationWorld
     live_input = ReceiverInput
+    feedback_words = (
+        "state that the tracking loops expect at the next measurement, in the order of the components; by default the "
+        "estimate, extrapolated as in a manoeuvre"
+    )
     actions = {
         "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
         "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "

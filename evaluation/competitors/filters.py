@@ -218,6 +218,11 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         )
         return Adapted(mean, covariance, None, Likelihood(*known).fill_unknown(mean[0]))
 
+    def feedback(self, state: Adapted, measurement: Any) -> Array | None:
+        """What a program has reported to steer the world."""
+        own = self.own.own if isinstance(self.own, Adapter) else None
+        return own.feedback if isinstance(own, ProgramEstimator) else None
+
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
         """Return what was answered as float64, or raise ValueError if it has another shape."""
         where = f"{self.name}: the {word} at measurement {self.step_number}"
@@ -308,6 +313,14 @@ class CheckedFilter(Filter[Task, Any, Checked]):
             answer[..., lost] = last[..., lost]
             return answer
         return self.xp.where(lost, last, answer)
+
+    def feedback(self, state: Checked, measurement: Any) -> Array | None:
+        """What a program reports, where that is a number and the episode not lost; else what the estimate says."""
+        own = self.own.feedback(None, measurement) if isinstance(self.own, HeldInPython) else None
+        if own is None:
+            return None
+        usable = numpy.isfinite(own).all(axis=0) & (state.fault == 0.0)
+        return numpy.where(usable, own, self.task.feedback(state.mean, state.covariance, measurement))
 
     def records(self, state: Checked, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was, and why the episode is lost."""

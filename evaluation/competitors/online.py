@@ -6,12 +6,13 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 import copy
 import importlib.metadata
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import timedelta
 from typing import Any
 
 import numpy
 
-from ...compiler.functions import map_arrays, round_up_lanes
+from ...compiler.functions import leaves, map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
@@ -330,7 +331,8 @@ class OnlineFilter:
         """Go on from what :meth:`save` has returned.
 
         Raises:
-            ValueError: for anything else, and for what another filter has returned.
+            ValueError: for anything else, also where a part of it was changed so that the filter cannot go on, and for
+                what another filter has returned; the filter is then as it was.
         """
         if not isinstance(state, OnlineState):
             raise ValueError(f"restore takes what save has returned, got {quote_shortened(state)}")
@@ -338,7 +340,52 @@ class OnlineFilter:
             raise ValueError(
                 f"this state is of {', '.join(state.owner) or 'no filter'}, and the filter is {', '.join(self._owner)}"
             )
-        self._resume(state if self._lag else state._replace(history=History()))
+        state = state if self._lag else state._replace(history=History())
+        kept = None if self._state is None else self._snapshot()
+        try:
+            self._try(state)
+            self._resume(state)
+        except Exception as error:  # whatever a part of another form leads to
+            self._state = None
+            if kept is not None:
+                self._resume(kept)
+            said = f"{type(error).__name__}: {error}"
+            raise ValueError(
+                f"{self.name!r} cannot go on from this state, which is not what save has returned: "
+                f"{quote_shortened(said)}"
+            ) from None
+
+    def _try(self, state: OnlineState) -> None:
+        """Go on from a state by a measurement, to see whether that can be done; raises whatever goes wrong. A filter in
+        Python, which may keep something to itself, is not asked.
+        """
+        taken = state.history.taken
+        first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
+        begun = self.model.start_filter(self._padded(map_arrays(first_track, self.input.initial)))
+        for one in (state, *(own.before for own in taken)):
+            if not self.model.filter.in_python and _shapes(one.filter) != _shapes(begun):
+                raise ValueError("filter must be arrays of the shapes that this filter has")
+            self._resume(one)
+            check_integer("measurements", one.measurements, 0)
+            check_integer("too_late", one.too_late, 0)
+            if numpy.shape(one.fresh) != (self.tracks,):
+                raise ValueError(f"fresh must say which of {self.tracks} tracks have just begun")
+            self._check_input(one.input)
+            if not self.model.filter.in_python:
+                example = map_arrays(first_track, self.input.measurement)
+                self._estimate(numpy.zeros(self.tracks), self._advance(example, one.input))
+        for own in taken:
+            self._times(own.time)
+            self.input.check_names(own.values, self.input.values)
+
+    def _check_input(self, memory: Any) -> None:
+        """Raise an error where the memory of the input is none."""
+        self._times(memory["time"])
+        for name, values in memory.items():
+            if numpy.ndim(values) and numpy.shape(values)[-1] != self.tracks:
+                raise ValueError(f"{name} of the measurements before must be of {self.tracks} tracks")
+        with suppress(ValueError):  # nothing came, which some environments refuse
+            self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
         """Go on from a snapshot, which stays as it is."""
@@ -484,6 +531,11 @@ class OnlineFilter:
             fresh=chosen | old.fresh,
             history=History(),
         )
+
+
+def _shapes(part: Any) -> list[tuple[int, ...]]:
+    """Shapes of nested tuples of arrays."""
+    return [numpy.shape(array) for array in leaves(part)]
 
 
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:

@@ -12,6 +12,9 @@ The protocol is version 1; docs/programs.md says the same to whoever writes a pr
 
 As ``json`` a message is a line, as ``float64`` a frame of little-endian numbers without a head: for every track its
 fields, or mean and covariance, row by row. So thousands of tracks are one message.
+
+Where the task has ``feedback_words``, the hello offers it, and a program that answers ``"feedback": true`` gives after
+mean and covariance what else steers the world.
 """
 
 import json
@@ -177,6 +180,7 @@ class ProgramEstimator:
     Attributes:
         tracks: how many of the N lanes are tracks; the others repeat the last one.
         fault: number of the reason among ``FAULTS`` for which there is no answer; 0 while there is.
+        feedback: what it has reported to steer the world, ``(..., N)``; None where it does not.
     """
 
     kind: ClassVar[Kind] = "estimator"
@@ -185,6 +189,10 @@ class ProgramEstimator:
         self.task, self.program = task, program
         self.tracks: int | None = None
         self.fault, self.step_number = 0, 0
+        self.feedback: numpy.ndarray | None = None
+        self._steers: tuple[int, ...] | None = None
+        """Shape of the feedback of a track; None where none is offered."""
+        self._reports_feedback = False
         self._process: ProgramProcess | None = None
         self._format = ""
         self._initial: numpy.ndarray | None = None
@@ -200,6 +208,9 @@ class ProgramEstimator:
         self.fault, self.step_number = 0, 0
         self.count = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
+        self.feedback, self._reports_feedback, self._steers = None, False, None
+        if self.task.closes_loop and self.task.feedback_words:
+            self._steers = self.task.feedback(initial.mean, initial.covariance, initial).shape[:-1]
         try:
             own = self.program.environment
             self._process = ProgramProcess(
@@ -219,7 +230,7 @@ class ProgramEstimator:
             raise ValueError("a program cannot go back to an earlier measurement")
         self.step_number += 1
         C, width = len(self.task.components), numpy.shape(measurement[0])[-1]
-        answer = numpy.full((self.count, C + C * C), numpy.nan)
+        answer: numpy.ndarray | None = None
         if not self.fault:
             assert self._process is not None
             try:
@@ -234,9 +245,14 @@ class ProgramEstimator:
                     stacklevel=2,
                 )
                 self.end()
+        if answer is None:
+            answer = numpy.full((self.count, C + C * C + self._feedback_size), numpy.nan)
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         answer = answer[lanes].T
-        return answer[:C], answer[C:].reshape(C, C, width), self.step_number
+        if self._reports_feedback:
+            assert self._steers is not None
+            self.feedback = answer[C + C * C :].reshape(*self._steers, width)
+        return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
         """Processor time that the program has taken, s; NaN where that is not known."""
@@ -252,6 +268,10 @@ class ProgramEstimator:
         """Return what a program is told first; what programs in plain C look for comes first in it."""
         C, measured = len(self.task.components), list(fields_of(measurement))
         numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
+        offered = {}
+        if self._steers is not None:
+            own = Field("feedback", self._steers, "float64", self.task.feedback_words)
+            numbers["feedback"], offered = _count([own]), {"feedback": [own._asdict()]}
         return {
             "filtergym": VERSION,
             "tracks": self.count,
@@ -261,8 +281,18 @@ class ProgramEstimator:
             "components": [component._asdict() for component in self.task.components],
             "initial": [own._asdict() for own in self._fields],
             "measurement": [own._asdict() for own in measured],
+            **offered,
             "parameters": parameters_of(self.task),
         }
+
+    @property
+    def _feedback_size(self) -> int:
+        """Numbers of the feedback of a track that it reports."""
+        return (
+            int(numpy.prod(self._steers, dtype=int))
+            if self._reports_feedback and self._steers is not None
+            else 0
+        )
 
     def _greet(self, measurement: Any) -> None:
         """Say hello, and hand over the initial estimate."""
@@ -281,6 +311,7 @@ class ProgramEstimator:
         if isinstance(answer.get("warning"), str):
             warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
         self._format = answer["format"]
+        self._reports_feedback = answer.get("feedback") is True and self._steers is not None
         self._process.tell(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
 
@@ -301,15 +332,18 @@ class ProgramEstimator:
         """Answer to a measurement, ``(tracks, C + C * C)``."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
-        size = self.count * (C + C * C)
+        size = self.count * (C + C * C + self._feedback_size)
         if self._format == "float64":
             answer = self._process.exchange(question, 8 * size)
-            return numpy.frombuffer(answer, dtype="<f8").reshape(self.count, C + C * C)
+            return numpy.frombuffer(answer, dtype="<f8").reshape(self.count, -1)
         answered = _read_object(
             self._process.exchange(question, None, LONGEST_HELLO + BYTES_OF_NUMBER * size)
         )
         found = []
-        for name, shape in (("mean", (self.count, C)), ("covariance", (self.count, C, C))):
+        asked = [("mean", (self.count, C)), ("covariance", (self.count, C, C))]
+        if self._reports_feedback:
+            asked.append(("feedback", (self.count, *(self._steers or ()))))
+        for name, shape in asked:
             try:
                 values = numpy.array(answered.get(name), dtype=float)  # None is NaN
             except (TypeError, ValueError):

@@ -27,7 +27,7 @@ TIME_TITLE = "ns"
 """Of the column of times."""
 TIME_NOTE = (
     f"{TIME_TITLE} is the processor time of a measurement on one core, of simulated world and competitor together. "
-    "An asterisk marks the front, where no other ranked competitor costs less in as much time or less. "
+    "An asterisk marks the front, where no other ranked competitor has a lower error cost in as much time or less. "
     f"{PYTHON_MARK} marks competitors that are asked in Python, which takes most of their time."
 )
 OWN_NOTE = (

@@ -191,7 +191,7 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
     return _cut(replace(later, initial=begun).renumbered(), stream.task.start_measurements, 1)
 
 
-def _single(stream: Stream, generator: numpy.random.Generator) -> Stream:
+def _rounded(stream: Stream, generator: numpy.random.Generator) -> Stream:
     def rounded(values: Any) -> Any:
         return values.astype(numpy.float32).astype(float) if values.dtype.kind == "f" else values
 
@@ -244,6 +244,6 @@ ALTERATIONS: tuple[Alteration, ...] = (
         "vague-start", "the initial covariance is 1e6 times what it should be", _initial_covariance(1e6)
     ),
     Alteration("restart", "the track begins anew in the middle", _restart),
-    Alteration("single-precision", "readings and start are in single precision", _single),
+    Alteration("rounded-readings", "readings and start are rounded to single precision", _rounded),
 )
 """The catalogue, in the order of the table."""

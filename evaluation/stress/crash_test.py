@@ -112,6 +112,9 @@ class StreamFilter(OnlineFilter):
         policy = None if self._policy is None else self._policy.begin(range(self.tracks))
         self._go_on(OnlineState(state, {}, policy, numpy.ones(self.tracks, dtype=bool)))
 
+    def _check_input(self, memory: Any) -> None:
+        """Measurements are given as they are: there is no memory of an input."""
+
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
         """Take a measurement in; return mean, covariance and what else is reported, arrays ``(..., N)``."""
         found = self._advance(self._padded(measurement), {})

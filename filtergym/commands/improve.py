@@ -109,7 +109,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
     algo: Annotated[
         str,
-        typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear, kalman-net or student."),
+        typer.Option(
+            help="ppo, recurrent-ppo, sac, dqn, bptt, bptt-small, bptt-linear, kalman-net or student."
+        ),
     ] = "ppo",
     control: TrainedControl = None,
     scenario: TrainingScenario = None,

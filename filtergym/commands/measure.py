@@ -38,6 +38,7 @@ from .evaluation import (
     say_departures,
     write,
 )
+from .protocol import check_options, evaluate_protocol
 from .shown import REPORT, make_report, print_headline, print_outcome, print_results
 from .terminal import (
     Backend,
@@ -71,6 +72,7 @@ from .terminal import (
 
 @one_thread()
 def evaluate_policies(
+    ctx: typer.Context,
     environment: Annotated[
         str | None,
         typer.Argument(
@@ -86,6 +88,14 @@ def evaluate_policies(
             help="Policy, estimator, reference or bound; repeat for several. Also a file, the folder of a "
             "training run, module:Class, or exec:COMMAND of any program.",
             autocompletion=complete_policy,
+        ),
+    ] = None,
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            help="In place of an environment: a frozen protocol over several of them, filtergym-1, whose row can be "
+            "quoted; --policy NAME, or ENVIRONMENT=NAME for one of them.",
+            autocompletion=one_of("filtergym-1"),
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -184,6 +194,16 @@ def evaluate_policies(
 
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
+    if isolated and trust:
+        raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
+    if protocol is not None:
+        check_options(ctx)
+        rename = isolate_names if isolated else None
+        with limit_programs(time_limit, memory_limit), Workers(jobs, cluster) as workers:
+            evaluate_protocol(
+                protocol, policy or [], workers, json, trust, rename, backend=backend, threads=threads
+            )
+        return
     keywords = parse_settings(settings or [])
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
     options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename)
@@ -191,8 +211,6 @@ def evaluate_policies(
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
     if isolated:
-        if trust:
-            raise ValueError("--trust lets code run here, and --isolated does not: leave one of them out")
         policy, why = isolate_names(problem, policy or []), isolate_names(problem, why or [])
     names = find_names(problem, data, policy)
     check_explained(why or [], names)

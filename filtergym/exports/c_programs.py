@@ -13,6 +13,7 @@ MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and w
 
 #define COLUMNS {count}
 #define ANSWER ({C} + {C} * {C})
+#define FEEDBACK {feedback} /* numbers beside the estimate that steer the simulated world */
 static const char columns[] =
     {columns};
 
@@ -39,20 +40,26 @@ static long number_of(const char *name) {{
     return place == NULL ? 0 : strtol(place + strlen(name), NULL, 10);
 }}
 
-/* What was not received comes as NaN; the filter weighs it by its availability, and any number will do. */
-static void clear_missing(double *row) {{
+/* What was not received comes as NaN. In its place stands what the sensor said last, zero before: an agent may be
+   shown the reading that a sensor holds, and a filter weighs the number by its availability. */
+static void hold_missing(double *row, double *last) {{
     static const int available[] = {{{available}-1}};
     int i, missing = 0;
     for (i = 0; available[i] >= 0; ++i) missing |= !(row[available[i]] > 0.0);
-    for (i = 0; missing && i < COLUMNS - {initial}; ++i)
-        if (row[i] != row[i]) row[i] = 0.0;
+    for (i = 0; i < COLUMNS - {initial}; ++i)
+        if (row[i] == row[i])
+            last[i] = row[i];
+        else if (missing)
+            row[i] = last[i];
 }}
 
 /* Answers every measurement of some tracks until there are no more. */
 static int serve(void) {{
     const long tracks = number_of("\\"tracks\\": ");
+    const int steers = FEEDBACK > 0 && number_of("\\"feedback\\": ") == FEEDBACK;
+    const int width = ANSWER + (steers ? FEEDBACK : 0);
     {own}_state *states;
-    double *rows;
+    double *rows, *last;
     long t;
     int i, j;
     if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
@@ -64,9 +71,10 @@ static int serve(void) {{
     while (strchr(line, '\\n') == NULL && fgets(line, (int)sizeof line, stdin) != NULL) {{
     }}
     states = malloc((size_t)tracks * sizeof *states);
-    rows = malloc((size_t)tracks * (COLUMNS + ANSWER) * sizeof *rows);
-    if (states == NULL || rows == NULL) return 2;
-    puts("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"}}");
+    rows = malloc((size_t)tracks * (COLUMNS + ANSWER + FEEDBACK) * sizeof *rows);
+    last = calloc((size_t)tracks * (COLUMNS - {initial}), sizeof *last);
+    if (states == NULL || rows == NULL || last == NULL) return 2;
+    printf("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"%s}}\\n", steers ? ", \\"feedback\\": true" : "");
     fflush(stdout);
     if (fread(rows, {initial} * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
     for (t = 0; t < tracks; ++t) {{
@@ -79,21 +87,23 @@ static int serve(void) {{
         for (t = 0; t < tracks; ++t) {{
             {own}_measurement measurement;
             {own}_estimate estimate;
-            clear_missing(rows + t * (COLUMNS - {initial}));
+            hold_missing(rows + t * (COLUMNS - {initial}), last + t * (COLUMNS - {initial}));
             set_measurement(&measurement, rows + t * (COLUMNS - {initial}));
             if ({own}_update(&states[t], &measurement, &estimate) >= {upper}_REJECTED) {{
-                for (i = 0; i < ANSWER; ++i) *answer++ = (double)NAN;
+                for (i = 0; i < width; ++i) *answer++ = (double)NAN;
                 continue;
             }}
             for (i = 0; i < {C}; ++i) *answer++ = (double)estimate.mean{mean};
             for (i = 0; i < {C}; ++i)
-                for (j = 0; j < {C}; ++j) *answer++ = (double)estimate.covariance{entry};
+                for (j = 0; j < {C}; ++j) *answer++ = (double)estimate.covariance{entry};{steer}
         }}
-        if (fwrite(answer - tracks * ANSWER, ANSWER * sizeof *rows, (size_t)tracks, stdout) != (size_t)tracks) return 2;
+        if (fwrite(answer - tracks * width, (size_t)width * sizeof *rows, (size_t)tracks, stdout) != (size_t)tracks)
+            return 2;
         fflush(stdout);
     }}
     free(states);
     free(rows);
+    free(last);
     return 0;
 }}
 

@@ -37,6 +37,7 @@ from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
     ESTIMATE,
+    FEEDBACK,
     INITIAL,
     LIKELIHOODS,
     MEASUREMENT,
@@ -57,6 +58,9 @@ TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "
 """Names that a filter's files must not have: those of the others."""
 EPISODES, MEASUREMENTS = 8, 200
 """That are compared before anything is written, at most."""
+STEER = """
+            for (i = 0; steers && i < FEEDBACK; ++i) *answer++ = (double)estimate.feedback[i];"""
+"""In the program around a filter that reports what steers the world."""
 VECTORS = 2, 50
 """Episodes and measurements among the test's vectors, at most."""
 
@@ -364,6 +368,8 @@ class Writer:
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
             entry="" if C == 1 else "[i][j]",
+            feedback=sum(member.name == FEEDBACK for member in self.traced.estimate),
+            steer=STEER if any(member.name == FEEDBACK for member in self.traced.estimate) else "",
             told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
         )
 

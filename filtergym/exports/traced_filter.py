@@ -32,6 +32,8 @@ STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
 """What is told beside an estimate, where the filter tells it."""
+FEEDBACK = "feedback"
+"""What of an estimate steers the world, where it does not follow from the mean."""
 
 
 class Member(NamedTuple):
@@ -73,12 +75,18 @@ class FilterSteps:
         filter: on traced arrays.
         masked: puts something in place of what was not received, of what never sees it.
         decider: asks a network inside; None without one.
+        steers: whether it is asked what steers the world, as a bank is.
     """
 
     def __init__(
-        self, filter: Filter, masked: Callable[[Any], Any] | None = None, decider: Decider | None = None
+        self,
+        filter: Filter,
+        masked: Callable[[Any], Any] | None = None,
+        decider: Decider | None = None,
+        steers: bool = False,
     ) -> None:
         self.filter, self.masked, self.decider = filter, masked, decider
+        self.steers = steers and bool(filter.task.feedback_words) and filter.task.closes_loop
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
         """Its state after a measurement, and its answer."""
@@ -86,6 +94,9 @@ class FilterSteps:
         after = own.step(state, Input(received))
         told = own.records(after, received)
         known = {name: told[name] for name in LIKELIHOODS if told.get(name) is not None}
+        feedback = own.feedback(after, received) if self.steers else None
+        if feedback is not None:
+            known[FEEDBACK] = feedback
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
@@ -194,7 +205,9 @@ def steps_of(
             "run as arrays"
         )
     steered = steer(Model(traced, control), policy)
-    return FilterSteps(steered, None, steered.decider), network
+    # Where a field says by its name what is received, the program around the filter puts a number there.
+    masked = None if traced.world.received_field else functools.partial(clear_missing, traced)
+    return FilterSteps(steered, masked, steered.decider, steers=True), network
 
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:

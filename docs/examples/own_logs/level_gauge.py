@@ -10,7 +10,10 @@ Level = filtergym.state_space(
     "mine/LevelGauge-v0",
     # Level, m; its rate, m/h, which forgets within 5 h; the gauge's offset, m, which wanders.
     drift=[[0, 1 / HOUR, 0], [0, -1 / (5 * HOUR), 0], [0, 0, 0]],
-    diffusion=np.diag([0, 0.02**2 / HOUR, 0.05**2 / (24 * HOUR)]),
+    diffusion={
+        "inflow": np.diag([0, 0.02**2 / HOUR, 0]),
+        "offset": np.diag([0, 0, 0.05**2 / (24 * HOUR)]),
+    },
     sensors={
         "gauge": Sensor([[1, 0, 1]], 0.01**2, interval=600.0),
         "stick": Sensor([[1, 0, 0]], 0.02**2, interval=12 * HOUR),

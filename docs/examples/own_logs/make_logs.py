@@ -21,7 +21,7 @@ def correlated(rng, steps, dt, deviation, time):
 
 
 def gps_odometry(rng, seconds=120, dt=0.1):
-    """A drone in wind: GPS of 2.5 m each second, velocity by camera of 0.15 m/s each 0.1 s, of which a tenth is lost."""
+    """A drone in wind: GPS of 2.5 m each second, velocity by camera of 0.15 m/s each 0.1 s, a tenth of it lost."""
     n = int(seconds / dt)
     v = np.array([correlated(rng, n, dt, 3.0, 10.0) + correlated(rng, n, dt, 0.3, 0.5) for _ in range(2)])
     p = rng.normal(0.0, 10.0, (2, 1)) + np.cumsum(v, axis=1) * dt
@@ -78,7 +78,7 @@ def pitch_roll(rng, seconds=30, dt=0.02, fine=10):
 
 
 def battery(rng, seconds=3600, dt=2.0):
-    """A cell of 2.5 Ah under a driving cycle: two RC pairs, a current sensor of 30 mA with an offset, voltage of 5 mV."""
+    """A cell of 2.5 Ah under a driving cycle: two RC pairs, current of 30 mA with an offset, voltage of 5 mV."""
     n = int(seconds / dt)
     current = np.maximum(-2.0, 1.8 + correlated(rng, n, dt, 1.5, 20.0))
     charge = rng.normal(0.8, 0.1) - np.cumsum(current) * dt / (2.5 * 3600)
@@ -89,10 +89,9 @@ def battery(rng, seconds=3600, dt=2.0):
             pairs[pair, k] = a * pairs[pair, k - 1] + R * (1.0 - a) * current[k]
     open_circuit = 3.3 + 0.9 * charge - 0.6 * charge**2 + 0.55 * charge**3
     voltage = open_circuit - pairs.sum(axis=0) - 0.02 * current + rng.normal(0.0, 0.005, n)
-    told = current + 0.02 + rng.normal(0.0, 0.03, n)
     return {
-        "time": np.arange(1, n + 1) * dt, "current": told, "voltage": voltage + 0.02 * told, "truth_charge": charge,
-        "truth_relaxation": pairs.sum(axis=0),
+        "time": np.arange(1, n + 1) * dt, "current": current + 0.02 + rng.normal(0.0, 0.03, n), "voltage": voltage,
+        "truth_charge": charge, "truth_relaxation": pairs.sum(axis=0),
     }  # fmt: skip
 
 

@@ -15,7 +15,7 @@ def drift(x, u):
 Attitude = filtergym.state_space(
     "mine/PitchRoll-v0",
     drift=drift,
-    diffusion=np.diag([1e-4, 1e-4, 1e-5, 1e-5]),
+    diffusion={"angles": np.diag([1e-4, 1e-4, 0, 0]), "biases": np.diag([0, 0, 1e-5, 1e-5])},
     inputs={
         "gyro_p": Input(mean=1.0, deviation=0.8, correlation_time=1.0, noise=0.02, unit="rad/s"),
         "gyro_q": Input(deviation=0.2, correlation_time=0.2, noise=0.02, unit="rad/s"),

@@ -275,8 +275,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "kind": "front",
                 "title": "Cost and time",
                 "text": "Cost against the processor time of a measurement, of simulated world and competitor "
-                "together. Nobody else costs less in as much time as those on the front, the line; open: asked in "
-                "Python.",
+                "together. No other competitor has a lower error cost in as much time as those on the front, the "
+                "line; open: asked in Python.",
                 "alternative": f"On the front, the quickest first: {', '.join(front(points))}.",
             }
         )

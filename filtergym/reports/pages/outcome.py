@@ -89,7 +89,7 @@ def _subject(result: Result) -> str:
 
 
 def _best_clause(result: Result, best: Place) -> str:
-    """Say who costs least, and how much less than the paper's algorithm."""
+    """Say who has the lowest error cost, and how much less than the paper's algorithm."""
     if best.name == result.paper:
         return f"the paper's `{best.name}` has the lowest error cost"
     kinds = {record.policy: record.kind for record in result.records}
@@ -123,7 +123,7 @@ class Lead(NamedTuple):
 
 
 def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -> Lead | None:
-    """Return where competitors of an origin lead in computing time, though another one costs least of all.
+    """Return where competitors of an origin lead in computing time, though another one has a lower cost.
 
     Someone leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of the
     other origin that takes no more time: a stricter test than that of their paired difference, which records hold only

@@ -83,7 +83,7 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
         return f"On `{first.scenario}` nothing is ranked."
     best, *others = places
     difference = found.get((best.name, HEADLINE))
-    sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) costs least"
+    sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) has the lowest error cost"
     if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
         sentence += f", but not significantly less than `{paper}`"
     elif best.name != paper and difference is not None and difference.value is not None:

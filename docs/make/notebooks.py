@@ -1,0 +1,64 @@
+"""Notebooks of the documentation: executed once, by ``python docs/make notebooks``, and shown as they then stand.
+
+The pages are built in every check, and the notebooks take minutes: so their outputs are committed, and `make test-slow`
+executes them again.
+"""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+KEPT = ("text/html", "text/plain", "image/png")
+"""Forms of an output that are committed."""
+SECONDS = 600
+"""That a cell may take."""
+
+
+def notebook_files() -> list[Path]:
+    """Return the notebooks."""
+    return sorted(FOLDER.glob("*.ipynb"))
+
+
+def execute(file: Path) -> Any:
+    """Return a notebook with what its cells print and draw, run in an empty folder by this Python.
+
+    Raises:
+        ValueError: if a cell fails.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError
+
+    notebook = nbformat.read(file, as_version=4)
+    # Commands of this Python, without the warning that no debugger can look into frozen modules.
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+    with tempfile.TemporaryDirectory() as folder:
+        client = NotebookClient(
+            notebook, timeout=SECONDS, resources={"metadata": {"path": folder}}, record_timing=False
+        )
+        try:
+            client.execute(env=environment)
+        except CellExecutionError as error:
+            raise ValueError(f"{file} fails: {error}") from error
+    for cell in notebook.cells:
+        for output in cell.get("outputs", ()):
+            if "data" in output:
+                output.data = {form: output.data[form] for form in KEPT if form in output.data}
+                output.metadata = {}
+    notebook.metadata = {"kernelspec": notebook.metadata.kernelspec, "language_info": {"name": "python"}}
+    return notebook
+
+
+def write_executed(file: Path) -> None:
+    """Execute a notebook and write it with its outputs.
+
+    Raises:
+        ValueError: as of :func:`execute`.
+    """
+    import nbformat
+
+    nbformat.write(execute(file), file)

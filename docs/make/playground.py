@@ -1,0 +1,118 @@
+"""The playground's filters: exported C, unchanged, compiled to WebAssembly.
+
+``pip install ziglang``, then ``python docs/make playground`` writes ``docs/playground/NAME.wasm``. The first page holds
+them as text, for a page that is opened from the disk may not read files. Where zig's C compiler is not installed, the
+committed files stand in.
+"""
+
+import base64
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from filtergym.baselines.problem import problem_of
+
+from filtergym.exports.c_source import export_c, file_stem
+from filtergym.exports.request import request_export
+
+FOLDER = Path(__file__).parent.parent / "playground"
+ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
+FILTERS = {
+    "imm": {"gain 0.3": ("bank_probabilities", 0, 1), "gain 0.7": ("bank_probabilities", 1, 1)},
+    "kalman-imm-turn": {
+        "quiet": ("probabilities", 0, 1),
+        "noisy": ("probabilities", 1, 1),
+        "turn": ("probabilities", 2, 1),
+    },
+    "semi-markov": {
+        "straight": ("track_straight_probability", 0, 12),
+        "thrust": ("track_thrust_probability", 0, 4),
+        "turn": ("track_turns_probability", 0, 16),
+    },
+    "bptt-small": {"gain": ("bank_alpha", 0, 1)},
+}
+"""Filter -> what weighs its hypotheses: the member of its state, the first number of it, and how many are summed.
+``bptt-small`` has no hypotheses, and shows the gain that its network sets."""
+
+EXPORTED = """\
+#include "{stem}.h"
+
+static {stem}_state state;
+static {stem}_initial initial;
+static {stem}_measurement measurement;
+static {stem}_estimate estimate;
+static double weights[{count}];
+
+static double sum(const double *first, int count) {{
+    double total = 0.0;
+    for (int i = 0; i < count; ++i) total += first[i];
+    return total;
+}}
+
+#define EXPORT(name) __attribute__((export_name(name)))
+EXPORT("initial") double *initial_place(void) {{ return (double *)&initial; }}
+EXPORT("measurement") double *measurement_place(void) {{ return (double *)&measurement; }}
+EXPORT("estimate") double *estimate_place(void) {{ return (double *)&estimate; }}
+EXPORT("weights") double *weights_place(void) {{ return weights; }}
+EXPORT("start") void start(void) {{ {stem}_start(&state, &initial); }}
+EXPORT("update") int update(void) {{
+    int became = {stem}_update(&state, &measurement, &estimate);
+{sums}
+    return became;
+}}
+"""
+"""What a page calls: one track, whose structures it writes and reads as rows of doubles."""
+FLAGS = (
+    *("-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c99", "-Oz", "-s"),
+    *("-Wl,--no-entry", "-Wl,-z,stack-size=65536"),
+)
+
+
+def has_compiler() -> bool:
+    """Whether zig's C compiler is installed."""
+    return importlib.util.find_spec("ziglang") is not None
+
+
+def compile_filter(name: str) -> bytes:
+    """Export a filter as C, and compile it.
+
+    Raises:
+        subprocess.CalledProcessError: if the compiler refuses it.
+    """
+    stem = file_stem(name)
+    sums = [
+        f"    weights[{i}] = sum((const double *)&state.{member} + {first}, {count});"
+        for i, (member, first, count) in enumerate(FILTERS[name].values())
+    ]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        export_c(request_export(problem_of(ENVIRONMENT), name), folder)
+        source = EXPORTED.format(stem=stem, count=len(sums), sums="\n".join(sums))
+        (folder / "page.c").write_text(source, encoding="ascii")
+        words = ["cc", *FLAGS, "page.c", f"{stem}.c", "-lm", "-o", "page.wasm"]
+        subprocess.run([sys.executable, "-m", "ziglang", *words], cwd=folder, check=True)
+        return (folder / "page.wasm").read_bytes()
+
+
+def page_script(modules: dict[str, bytes]) -> str:
+    """Return the script that holds the filters: names, what their weights are of, and WebAssembly in base 64."""
+    filters = {
+        name: {"weights": list(FILTERS[name]), "module": base64.b64encode(module).decode("ascii")}
+        for name, module in modules.items()
+    }
+    return f"const PLAYGROUND_FILTERS = {json.dumps(filters)};\n"
+
+
+def module_file(name: str) -> Path:
+    """Return where the committed module of a filter is."""
+    return FOLDER / f"{name}.wasm"
+
+
+def read_modules() -> dict[str, bytes]:
+    """Return the filters compiled anew, or the committed ones where no compiler is installed."""
+    if has_compiler():
+        return {name: compile_filter(name) for name in FILTERS}
+    return {name: module_file(name).read_bytes() for name in FILTERS}
