@@ -154,7 +154,7 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
     teacher = Teacher(env, "kalman-imm")
     found = {}
     for share in (0.0, 0.7, 1.0):
-        reward_of_it = Reward("cost-and-covariance", share)
+        reward_of_it = Reward("cost-and-likelihood", share)
         unrolled = Unrolled(env, policy, 12, reward_of_it, teacher if share else None)
 
         def cost(unrolled=unrolled):
@@ -199,6 +199,7 @@ def test_who_cannot_teach_is_refused(id, overrides, message):
     from filtergym.agents.bptt import Descent
     from filtergym.agents.training_run import RunOptions, new_run
 
-    run = new_run(problem_of(id), RunOptions(NAME, envs=2, overrides=overrides))
+    algorithm = NAME if id == RADAR else "bptt"
+    run = new_run(problem_of(id), RunOptions(algorithm, envs=2, overrides=overrides))
     with pytest.raises(ValueError, match=message):
         Descent(run).flight()

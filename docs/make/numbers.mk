@@ -19,12 +19,13 @@ room_RadarEsmTracking := radar_esm_tracking
 room_LooselyCoupledNavigation := loosely_coupled_navigation
 room_TightlyCoupledNavigation := tightly_coupled_navigation
 
-agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dqn kalman-net
+agents_ManeuveringTarget := bptt bptt-small bptt-linear ppo recurrent-ppo sac dqn kalman-net student
 agents_UavAutopilot := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
+# Its student is trained but not shipped: it is level with kalman-net.
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
 shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo kalman-net
@@ -58,7 +59,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -146,6 +147,12 @@ $(DONE)/budgets: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 $(DONE)/pairs: $(shipped)
 	$(BIN)/python benchmarks/front_pairs.py > build/pairs.txt
 	$(table) build/pairs.txt --name front_pairs --command "python benchmarks/front_pairs.py"
+	$(finish)
+
+$(DONE)/students: $(DONE)/train-ManeuveringTarget-student $(DONE)/ship-ManeuveringTarget
+	$(BIN)/python benchmarks/students.py runs/ManeuveringTarget/student-? > build/students.txt
+	$(table) build/students.txt --name students \
+	  --command "python benchmarks/students.py runs/ManeuveringTarget/student-?"
 	$(finish)
 
 $(DONE)/drive: $(DONE)/ship-LooselyCoupledNavigation

@@ -5,7 +5,7 @@ the rest is the same everywhere. With U the rotation into the frame, s the unit 
 answered of the motion and nu the innovation over the sensor's sigma, zero where nothing was received,
 
     predict   x' = f(x, m)
-    update    x = x' + U^T diag(s) (G nu + g),  G = G0 + G1 a_G,  g = offset_reach a_g
+    update    x = x' + U^T diag(s) (G nu + g),  G = G0 + (1 - |G0|) a_G,  g = offset_reach a_g
     report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_i,  L_ij = coupling_reach L_ii a_ij  (j < i)
 
 where a in [-1, 1] are the network's answers. All zero is a filter with the fixed gain G0. Because everything that is
@@ -42,7 +42,7 @@ class View(NamedTuple):
     mean: Array
     """Predicted, ``(C, N)``."""
     frame: Array
-    """U, ``(C, C, N)``; None: the components are the frame."""
+    """U, ``(C, C, N)``."""
     unit: Array
     """s, ``(C, N)``."""
     innovation: Array
@@ -71,8 +71,6 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
 
     gain: ClassVar[Sequence[Sequence[float]]]
     """G0, ``(C, m)``: what a network without training corrects by."""
-    gain_reach: ClassVar[Sequence[Sequence[float]] | None] = None
-    """G1, likewise: how far its answers go from there; None: ``1 - |G0|``."""
     axes: ClassVar[Sequence[str]]
     """Names of the numbers of an innovation, ``(m,)``."""
     motions: ClassVar[Sequence[str]] = ()
@@ -81,14 +79,13 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
     def __init__(self, task: TaskT, control: str) -> None:
         super().__init__(task, control)
         gain = numpy.array(self.gain, dtype=float)
-        reach = 1.0 - abs(gain) if self.gain_reach is None else numpy.array(self.gain_reach, dtype=float)
         self.size, self.measured = gain.shape
         constant = task.constant  # type: ignore[attr-defined]
-        self.fixed_gain, self.reach = (constant(each[..., None]) for each in (gain, reach))
+        self.fixed_gain, self.reach = (constant(each[..., None]) for each in (gain, 1.0 - abs(gain)))
 
+    @abstractmethod
     def rotate(self, mean: Array) -> Array:
-        """Return U at an estimate, ``(C, C, N)``; None, as by default, where the components are the frame."""
-        return None
+        """Return U at an estimate, ``(C, C, N)``; the identity where the components are the frame."""
 
     @abstractmethod
     def look(self, mean: Array, motion: Array, measurement: Any) -> View:
@@ -150,8 +147,7 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
         by_gain, offset, diagonal, coupling, motion = (
             a[first:last] for first, last in itertools.pairwise(ends)
         )
-        frame, unit = state.view.frame, state.view.unit
-        inverse = None if frame is None else transpose(frame)
+        inverse, unit = transpose(state.view.frame), state.view.unit
         gain = self.fixed_gain + self.reach * xp.reshape(by_gain, (C, m, -1))
         correction = apply(gain, state.view.innovation) + OFFSET_REACH * offset
         deviation = unit * xp.exp(math.log(DEVIATION_RANGE) * diagonal)
@@ -159,12 +155,12 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
         for i in range(C):
             beside = [COUPLING_REACH * deviation[i] * coupling[next(entry)] for _ in range(i)]
             factor.append(xp.stack([*beside, deviation[i], *([0.0 * deviation[i]] * (C - 1 - i))]))
-        rotated = xp.stack(factor) if inverse is None else product(inverse, xp.stack(factor))
+        rotated = product(inverse, xp.stack(factor))
         covariance = outer(rotated[:, 0], rotated[:, 0])
         for column in range(1, C):
             covariance = covariance + outer(rotated[:, column], rotated[:, column])
         return state._replace(
-            mean=state.mean + (unit * correction if inverse is None else apply(inverse, unit * correction)),
+            mean=state.mean + apply(inverse, unit * correction),
             covariance=covariance,
             motion=motion if self.motions else state.motion,
         )

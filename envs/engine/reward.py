@@ -8,8 +8,6 @@
   too.
 * ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must
   be both accurate and consistent.
-* ``cost-and-covariance``: the same with a fortieth of the log-likelihood, for an estimator that answers with its
-  covariance itself: accuracy rules what it estimates, and the covariance still follows the errors.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
@@ -34,10 +32,6 @@ from ..contract.observation import Array
 
 COMPRESSED_BEYOND = 30.0
 """Charge, in units of the paper's average one, from which on the reward falls slowly."""
-
-
-COVARIANCE_WEIGHT = 1 / 40
-"""Of the log-density of a component in ``cost-and-covariance``, ours: small beside what errors are charged."""
 
 
 def compress(model: Model, charged: Array) -> Array:
@@ -75,13 +69,7 @@ def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
     )
 
 
-def cost_and_covariance_reward(model: Model, state: Any) -> Array:
-    """Likewise, with the density weighted by ``COVARIANCE_WEIGHT``, ``(N,)``."""
-    weight = COVARIANCE_WEIGHT / len(model.task.components)
-    return cost_reward(model, state) + log_likelihood_reward(model, state) * weight
-
-
-LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0, "cost-and-covariance": COVARIANCE_WEIGHT}
+LIKELIHOOD_WEIGHTS = {"cost": 0.0, "cost-and-likelihood": 1.0}
 """Of the log-density of a component, in the rewards that a teacher can give."""
 
 
@@ -119,7 +107,6 @@ OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
-    "cost-and-covariance": cost_and_covariance_reward,
     "relative": cost_reward,
     "log-relative": log_cost_reward,
     "none": no_reward,

@@ -53,8 +53,8 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
-        reward: "cost", "log-likelihood", "cost-and-likelihood", "cost-and-covariance", "relative" or "log-relative";
-            default: the environment's own.
+        reward: "cost", "log-likelihood", "cost-and-likelihood", "relative" or "log-relative"; default: the
+            environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, their

@@ -31,7 +31,6 @@ from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
 from .scenarios import SCENARIOS
-from .student import AutopilotStudentBank
 from .world import AircraftWorld, Measurement, Start
 
 
@@ -129,7 +128,7 @@ class UavAutopilot(Task):
         "kalman-net": ("process_decades", "sensor_decades"),
     }
     banks = {"noise": NoiseBank, "gain": GainBank, "hypotheses": HypothesesBank, "mode": ModeBank}
-    trained_banks = {"kalman-net": KalmanNetBank, "student": AutopilotStudentBank}
+    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
     causes = CAUSES
