@@ -71,7 +71,8 @@ def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
     found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, report)
     means = {name: numpy.ascontiguousarray(values.T).mean(axis=0) for name, values in found.items()}
     density = means.get("density", 0.0)
-    return means["cost"] * numpy.exp(-density / len(model.task.components))
+    weighed: numpy.ndarray = means["cost"] * numpy.exp(-density / len(model.task.components))
+    return weighed
 
 
 def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy.ndarray:
@@ -79,7 +80,8 @@ def episode_costs(candidate: Candidate, workers: Workers | None = None) -> numpy
     workers, seeds = check_workers(workers), candidate.seeds
     share = max(FEWEST, -(-len(seeds) // workers.width))
     pieces = [candidate._replace(seeds=seeds[i : i + share]) for i in range(0, len(seeds), share)]
-    return numpy.concatenate(workers.results(_costs, pieces))
+    found: numpy.ndarray = numpy.concatenate(workers.results(_costs, pieces))
+    return found
 
 
 def geometric_cost(costs: numpy.ndarray) -> float:
