@@ -28,9 +28,9 @@ FILTERS = {
         "turn": ("probabilities", 2, 1),
     },
     "semi-markov": {
-        "straight": ("track_straight_probability", 0, 12),
-        "thrust": ("track_thrust_probability", 0, 4),
-        "turn": ("track_turns_probability", 0, 16),
+        "straight": ("track_0_probability", 0, 12),
+        "thrust": ("track_1_probability", 0, 4),
+        "turn": ("track_2_probability", 0, 16),
     },
     "bptt-small": {"gain": ("bank_alpha", 0, 1)},
 }
