@@ -1,239 +1,484 @@
-"""Frozen protocols: the file does not change, the number is what its formula says, the row repeats on any processor."""
+"""What other libraries rely on beside reset and step: keywords they try, specs, videos, types, copies."""
 
-import math
-import os
-import re
-import subprocess
-import sys
-import tomllib
+import concurrent.futures
+import copy
+import functools
+import multiprocessing
+import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.running.parallel import Workers
+from contract import BACKENDS, Subject, assert_properties, continued
+from filtergym.envs.data.trajectory import Trajectory
+from filtergym.envs.drawing import rendering
+from filtergym.envs.engine.lanes import ModelStepper
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit
 
-import filtergym
-from filtergym import protocol as protocols
-from filtergym.commands.protocol import quoted_row
-from filtergym.protocol import bib_entry, find_entries, read_protocol, run_protocol
+import filtergym  # noqa: F401  (registers the environments)
 
-FROZEN = {"filtergym-1": "25cfbd9dcaba4cbfdd3bedcbdcc51c265bb44cdd69a0f12273d6693c147446ff"}
-"""SHA-256 of every protocol that was ever published. Who changes one adds a file with the next number."""
-SMALL = """
-name = "small"
-year = 2026
-split = "test"
-seed = 3
-episodes = 12
-held_out_episodes = 6
-resamples = 1000
-statistic = "as of filtergym-1"
-time = "as of filtergym-1"
-
-[[environments]]
-id = "filtergym/ManeuveringTarget-v0"
-interface = 2
-paper = "imm-steady-state"
-lost_cost = 100.0
-training = "random"
-held_out = ["atc", "glint"]
-
-[[environments]]
-id = "filtergym/UavAutopilot-v0"
-interface = 5
-paper = "kalman"
-lost_cost = 100.0
-training = "random"
-"""
+ID = "filtergym/ManeuveringTarget-v0"
+make_three = functools.partial(gym.make_vec, num_envs=3)
 
 
-@pytest.fixture
-def small(tmp_path):
-    """Path of a protocol of few episodes of two environments."""
-    path = tmp_path / "small.toml"
-    path.write_text(SMALL, encoding="utf-8")
-    return str(path)
+def actions_for(env, count, seed=0):
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(count)]
 
 
-def test_published_protocols_are_frozen():
-    assert {name: read_protocol(name)[1] for name in protocols.protocol_names()} == FROZEN
+def assert_all_equal(some, others):
+    for one, other in zip(some, others, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
-def test_filtergym_1_is_of_all_five_environments_and_all_their_scenarios():
-    protocol, _ = read_protocol("filtergym-1")
-    shipped = {id: task for id, task in catalogue().items() if id.startswith("filtergym/")}
-    assert {own.id for own in protocol.environments} == {*shipped}
-    for own in protocol.environments:
-        assert {own.training, *own.held_out} == {*shipped[own.id].scenarios}
-        assert [name for name, one in shipped[own.id].scenarios.items() if one.training] == [own.training]
+def length(env):
+    """Decisions until the first truncation."""
+    env.reset(seed=0)
+    action, count, finished = env.action_space.sample(), 0, False
+    while not finished:
+        finished, count = np.all(env.step(action)[3]), count + 1
+    return count
 
 
-def test_the_number_is_what_the_formula_says(small):
-    """Against costs of episodes that ``evaluate`` gives, one environment and episode after another."""
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
-    logarithms, lost = [], []
-    for own in protocol.environments:
-        dataset = filtergym.evaluate(own.id, ["bptt-small", own.paper], None, 12, 3)
-        costs = dataset["cost"].mean("time")
-        logs = [math.log(costs.values[0, i] / costs.values[1, i]) for i in range(12)]
-        logarithms.append(sum(logs) / 12)
-        lost.append(float((costs.values[0] > own.lost_cost).mean()))
-    assert found.cost.value == pytest.approx(math.exp(sum(logarithms) / 2) - 1, rel=1e-12)
-    assert found.cost.low < found.cost.value < found.cost.high
-    assert found.lost == pytest.approx(sum(lost) / 2)
-    for one, logarithm in zip(found.environments, logarithms, strict=True):
-        assert one.cost.value == pytest.approx(math.expm1(logarithm), rel=1e-12)
-    held = {
-        name: filtergym.tidy_records(
-            filtergym.evaluate(
-                "filtergym/ManeuveringTarget-v0", ["bptt-small", "imm-steady-state"], name, 6, 3
-            )
-        )
-        for name in ("atc", "glint")
-    }
-    costs = {
-        name: next(
-            r.value for r in records if r.metric == "geometric_cost_difference" and r.policy == "bptt-small"
-        )
-        for name, records in held.items()
-    }
-    worst = max(costs, key=costs.get)
-    assert found.environments[0].worst == (worst, pytest.approx(costs[worst], rel=1e-12))
-    assert found.environments[1].worst is None
+# --- one pass over every environment
 
 
-def test_the_interval_covers_what_many_episodes_say(small):
-    """The interval of the number is that of a bootstrap of whole episodes, all environments at once."""
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
-    values = np.stack([one.logarithms for one in found.environments])
-    generator = np.random.default_rng(1)
-    naive = [np.expm1(values[:, generator.integers(0, 12, 12)].mean()) for _ in range(20_000)]
-    ends = np.percentile(naive, [2.5, 97.5])
-    # Of a thousand resamples an end is off by about 5 % of the interval's half width.
-    np.testing.assert_allclose([found.cost.low, found.cost.high], ends, atol=0.2 * (ends[1] - ends[0]) / 2)
+def test_every_environment(env_id):
+    assert_properties(Subject(env_id, backend="numpy"), PROPERTIES)
+    assert_properties(Subject(env_id), [draws_without_a_trace_and_copies_alike])
 
 
-def test_the_papers_algorithms_are_zero(small):
-    protocol, digest = read_protocol(small)
-    entries = find_entries(protocol, ["imm-steady-state", "UavAutopilot=kalman"])
-    found = run_protocol(protocol, digest, entries, Workers())
-    assert found.cost.value == found.cost.low == found.cost.high == 0.0
-    assert found.title == "imm-steady-state, kalman"
+def test_float32_on_every_backend(env_id):
+    for backend in BACKENDS:
+        assert_properties(Subject(env_id, backend=backend), [rounds_float64_to_float32])
 
 
-def test_no_number_without_all_environments(small):
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["UavAutopilot=mehra"]), Workers())
-    assert found.cost is found.lost is found.time is None
-    assert quoted_row(found)[-1].startswith("| mehra | - | - | 1 of 2 |")
+def refuses_keywords_as_a_client_expects_who_tries_them(subject):
+    # TorchRL's GymEnv does, and takes the keyword back if this is what Python says.
+    for make in (gym.make, make_three):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+            make(subject.id, frameskip=1)
+        with pytest.raises(
+            ValueError, match=r"unexpected keyword argument 'horizons'.*did you mean 'horizon'"
+        ):
+            make(subject.id, horizons=5)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "--protocol needs a competitor"),
-        (["imm", "adaptive"], "two competitors for all environments"),
-        (["semi-markov"], "UavAutopilot-v0: unknown policy 'semi-markov'.*--policy UavAutopilot=NAME"),
-        (["UavAutopilot=true-state"], "'true-state' is a reference: only policies and estimators"),
-    ],
+def says_in_its_spec_how_long_an_episode_is(subject):
+    for make in (subject.single, functools.partial(subject.native, 3)):
+        env, limited, unlimited = (make(**k) for k in ({}, *({"max_episode_steps": n} for n in (3, -1))))
+        assert env.spec.max_episode_steps == length(env) == 5
+        assert limited.spec.max_episode_steps == length(limited) == 3
+        assert unlimited.spec.max_episode_steps == length(unlimited) == 5
+        spec = EnvSpec.from_json(env.spec.to_json())
+        # A vector's spec holds the number of environments.
+        again = gym.make(spec) if make == subject.single else gym.make_vec(spec)
+        assert again.spec.max_episode_steps == length(again) == 5
+
+
+def says_how_long_each_scenario_is(subject):
+    task = subject.single().unwrapped.task
+    for name, scenario in {None: task.scenarios[task.default_scenario], **task.scenarios}.items():
+        parameters = task.Parameters(**scenario.parameters)
+        expected = parameters.horizon // parameters.decision_interval
+        for make in (gym.make, make_three):
+            env = make(subject.id, scenario=name, backend="numpy")
+            assert env.spec.max_episode_steps == expected, name
+
+
+def limits_only_whom_asks(subject):
+    def limited(env):
+        return isinstance(env, TimeLimit) or (isinstance(env, gym.Wrapper) and limited(env.env))
+
+    assert not limited(subject.single())
+    assert limited(subject.single(max_episode_steps=3))
+
+
+def is_aware_of_time(subject):
+    env = TimeAwareObservation(subject.single(), normalize_time=True)
+    shown, _ = env.reset(seed=0)
+    times, finished = [shown[-1]], False
+    while not finished:
+        shown, _, _, finished, _ = env.step(env.action_space.sample())
+        times.append(shown[-1])
+    np.testing.assert_allclose(times, np.arange(6) / 5, rtol=1e-6)
+
+
+def rounds_float64_to_float32(subject):
+    fine, rounded = (
+        subject.native(3, dtype=dtype, autoreset_mode="SameStep") for dtype in ("float64", "float32")
+    )
+    assert rounded.single_observation_space.dtype == rounded.observation_space.dtype == np.float32
+    assert fine.single_observation_space.dtype == np.float64
+    pairs = [(fine.reset(seed=0)[0], rounded.reset(seed=0)[0])]
+    for action in actions_for(fine, 7):
+        one, other = fine.step(action), rounded.step(action)
+        pairs += zip(one[:2], other[:2], strict=True)
+        if one[3].any():
+            final = [info["final_obs"] for info in (one[4], other[4])]
+            pairs.append(tuple(np.stack([np.asarray(row) for row in rows]) for rows in final))
+    assert len(pairs) == 1 + 2 * 7 + 1
+    for exact, coarse in pairs:
+        assert np.asarray(coarse).dtype == np.float32
+        np.testing.assert_array_equal(np.asarray(exact).astype(np.float32), np.asarray(coarse))
+
+
+def rounds_a_single_environment_as_a_vector(subject):
+    env, vector = subject.single(dtype="float32"), subject.native(1, dtype="float32")
+    shown = env.reset(seed=2)[0]
+    assert env.observation_space.dtype == shown.dtype == np.float32
+    np.testing.assert_array_equal(shown, vector.reset(seed=2)[0][0])
+    for action in actions_for(env, 5):
+        shown, paid, *_ = env.step(action)
+        many, all_paid, *_ = vector.step(np.asarray(action)[None])
+        assert env.observation_space.contains(shown)
+        np.testing.assert_array_equal(shown, many[0])
+        assert type(paid) is float
+        assert paid == all_paid[0]
+
+
+def draws_without_a_trace_and_copies_alike(subject):
+    """Whoever draws, closes or copies a picture changes no episode, and a copy draws what the original does."""
+    plain, env = subject.single(), subject.single(render_mode="rgb_array")
+    np.testing.assert_array_equal(plain.reset(seed=3)[0], env.reset(seed=3)[0])
+    actions = actions_for(env, 5)
+    assert_all_equal(continued(plain, actions[:2]), continued(env, actions[:2]))
+    env.render()
+    other = pickle.loads(pickle.dumps(env))
+    expected = continued(plain, actions[2:])
+    assert_all_equal(expected, continued(env, actions[2:]))
+    assert_all_equal(expected, continued(other, actions[2:]))
+    drawn = other.render()
+    assert (drawn.shape, drawn.dtype) == ((608, 960, 3), np.uint8)
+    np.testing.assert_array_equal(env.render(), drawn)
+
+
+PROPERTIES = (
+    refuses_keywords_as_a_client_expects_who_tries_them,
+    says_in_its_spec_how_long_an_episode_is,
+    says_how_long_each_scenario_is,
+    limits_only_whom_asks,
+    is_aware_of_time,
+    rounds_a_single_environment_as_a_vector,
 )
-def test_what_may_not_enter(small, words, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        find_entries(read_protocol(small)[0], words)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        (
-            "interface = 5",
-            "interface = 4",
-            "states interface of filtergym/UavAutopilot-v0 4, and this package has 5",
-        ),
-        ("lost_cost = 100.0", "lost_cost = 1e9", "states lost_cost"),
-        ("resamples = 1000", "resamples = 10", "states resamples 10"),
-        ('"glint"', '"glimt"', "unknown scenario of filtergym/ManeuveringTarget-v0 'glimt'"),
-        ('"kalman"', '"true-state"', "unknown paper of filtergym/UavAutopilot-v0 'true-state'"),
-        ("seed = 3", "seeds = 3", "holds no protocol"),
-        ('split = "test"', 'split = "train"', "holds no protocol"),
-    ],
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process that starts afresh."""
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        yield pool
+
+
+def test_episodes_go_on_in_another_process(env_id, short, elsewhere):
+    for make in (gym.make, make_three):
+        env = make(env_id, **short)
+        env.reset(seed=3)
+        actions = actions_for(env, 5)
+        continued(env, actions[:2])
+        there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
+        assert_all_equal(continued(env, actions[2:]), there)
+
+
+# --- keywords
+
+
+def test_keywords_of_the_environment_itself_are_hinted_at_too():
+    for name, meant in (("contol", "control"), ("scenari", "scenario"), ("detail_info", "detailed_info")):
+        with pytest.raises(ValueError, match=f"'{name}'.*did you mean '{meant}'"):
+            gym.make(ID, **{name: "x"})
+
+
+# --- specs as text
+
+FLIGHT = Trajectory(
+    time=np.arange(0.0, 200.0, 7.3),
+    position=np.stack([2e4 + 100.3 * np.arange(28), 5e3 + 0.1 * np.arange(28) ** 2], axis=1),
+    name="mine",
 )
-def test_what_is_no_protocol_of_this_package(tmp_path, old, new, sentence):
-    path = tmp_path / "altered.toml"
-    path.write_text(SMALL.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ValueError, match=sentence):
-        read_protocol(str(path))
 
 
-def row_of(output):
-    """Return the row to quote without the time, and the digest of the bib entry."""
-    row = next(line for line in output.splitlines() if line.startswith("| bptt-small"))
-    return row.rpartition("|")[0].rpartition("|")[0], re.search(r"SHA-256 (\w{64})", output)[1]
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_a_trajectory_survives_json(make, velocity):
+    moving = np.gradient(FLIGHT.position, FLIGHT.time, axis=0) if velocity else None
+    flight = Trajectory(FLIGHT.time, FLIGHT.position, moving, "mine")
+    env = make(ID, scenario=flight, gains=np.array([0.2, 0.8]), horizon=np.int64(20))
+    spec = EnvSpec.from_json(env.spec.to_json())
+    again = gym.make(spec) if make is gym.make else gym.make_vec(spec)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
+    actions = actions_for(env, 5)
+    assert_all_equal(continued(env, actions), continued(again, actions))
+    assert again.unwrapped.task.parameters == env.unwrapped.task.parameters
 
 
-PROCESSORS = {
-    "bare": {
-        "FILTERGYM_COMPILER_PROCESSOR": "x86-64",
-        "OPENBLAS_CORETYPE": "Prescott",
-        "OMP_NUM_THREADS": "2",
-    },
-    "numpy": {},
+def test_a_mode_of_resets_survives_json():
+    env = gym.make_vec(ID, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP)
+    again = gym.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.autoreset_mode is AutoresetMode.SAME_STEP
+
+
+def test_the_path_of_a_file_is_a_scenario(tmp_path):
+    path = tmp_path / "flight.csv"
+    rows = np.column_stack([FLIGHT.time, FLIGHT.position])
+    np.savetxt(path, rows, delimiter=",", header="time,x,y", comments="")
+    env = gym.make(ID, scenario=path)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
+
+
+# --- wrong arguments
+
+MAKING = {
+    "scenario=[]": ({"scenario": []}, "a scenario is a name, a Trajectory or the path.*got \\[\\].*paper"),
+    "scenario list": ({"scenario": ["paper", "atc"]}, "a scenario is a name.*got \\['paper', 'atc'\\]"),
+    "scenario number": ({"scenario": 3}, "a scenario is a name.*got 3"),
+    "scenario empty": ({"scenario": ""}, "unknown scenario ''"),
+    "scenario dictionary": ({"scenario": {"tme": [0, 1]}}, "a trajectory as a dictionary has time.*got 'tme'"),
+    "scenario half": ({"scenario": {"time": [0, 1], "position": [[0, 0], [1]]}}, "scenario as a dictionary: "),
+    "scenario words": ({"scenario": {"time": "ab", "position": [[0, 0]]}}, "scenario as a dictionary: "),
+    "control": ({"control": 0}, "unknown control 0: choose from evidence, gains, gain"),
+    "control list": ({"control": ["gain"]}, "unknown control .*did you mean 'gain'"),
+    "reward": ({"reward": 0}, "unknown reward 0"),
+    "reward list": ({"reward": ["cost"]}, "unknown reward .*did you mean 'cost'"),
+    "backend": ({"backend": 1}, "unknown backend 1"),
+    "render_mode": ({"render_mode": "rgb"}, "unknown render_mode 'rgb'.*rgb_array"),
+    "detailed_info": ({"detailed_info": "no"}, "detailed_info must be True or False, got 'no'"),
+    "dtype": ({"dtype": "float16"}, "unknown dtype 'float16': did you mean 'float"),
+    "dtype class": ({"dtype": np.float32}, "unknown dtype .*choose from float64, float32"),
+    "dtype none": ({"dtype": None}, "unknown dtype None: choose from float64, float32"),
+    "task": ({"task": 5}, "an environment is named by its id.*got 5"),
+}  # fmt: skip
+MAKING_VECTORS = {
+    "num_envs word": ({"num_envs": "2"}, "num_envs must be an integer of at least 1, got '2'"),
+    "num_envs fraction": ({"num_envs": 2.0}, "num_envs must be an integer of at least 1, got 2.0"),
+    "num_envs zero": ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"),
+    "num_envs boolean": ({"num_envs": True}, "num_envs must be an integer of at least 1, got True"),
+    "threads": ({"threads": "2"}, "threads must be an integer of at least 1, got '2'"),
+    "autoreset_mode": ({"autoreset_mode": "samestep"}, "unknown autoreset_mode 'samestep': did you mean 'SameStep'"),
+    "autoreset_mode number": ({"autoreset_mode": 1}, "unknown autoreset_mode 1: choose from NextStep"),
+    "max_episode_steps": ({"max_episode_steps": 0}, "max_episode_steps must be an integer of at least 1, got 0"),
+    "max_episode_steps word": ({"max_episode_steps": "9"}, "max_episode_steps must be an integer of at least 1"),
+    "device": ({"device": "cuda"}, "works on the CPU only, got device 'cuda'"),
+    "render_mode human": ({"render_mode": "human"}, "a window for one episode: use gymnasium.make"),
+}  # fmt: skip
+
+
+def assert_refused(face, keywords, message):
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        face(**{"task": ID, **keywords})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
+def test_wrong_arguments(face):
+    cases = MAKING if face is TaskEnv else MAKING | MAKING_VECTORS
+    for keywords, message in cases.values():
+        assert_refused(face, keywords, message)
+
+
+RESETS = {
+    "seed word": ({"seed": "1"}, "a seed is None or an integer of at least 0, got '1'"),
+    "seed fraction": ({"seed": 1.0}, "a seed is None or an integer of at least 0, got 1.0"),
+    "seed negative": ({"seed": -1}, "a seed is None or an integer of at least 0, got -1"),
+    "seed boolean": ({"seed": True}, "a seed is None or an integer of at least 0, got True"),
+    "options list": ({"options": [1]}, r"options of a reset are a dictionary or None, got \[1\]"),
+    "options word": ({"options": "reset_mask"}, "options of a reset are a dictionary or None"),
 }
+RESETS_OF_VECTORS = {
+    "seeds words": ({"seed": ["1", "2"]}, "a seed is None or an integer of at least 0, got '1'"),
+    "seeds few": ({"seed": [1]}, "expected 2 seeds, one for each sub-environment, got 1"),
+    "seeds negative": ({"seed": [1, -1]}, "a seed is None or an integer of at least 0, got -1"),
+    "unknown": ({"options": {"reset_masks": 1}}, "unknown option of a reset 'reset_masks': did you mean 'reset_mask'"),
+    "mask": ({"options": {"reset_mask": "all"}}, "'reset_mask'. must be a boolean array .*got 'all'"),
+    "shortened ragged": ({"options": {"shortened_by": [[1], [1, 2]]}}, "'shortened_by'. must hold 2 integers"),
+    "shortened fraction": ({"options": {"shortened_by": [0.5, 1.0]}}, "'shortened_by'. must hold 2 integers"),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "more"), [("bare", ["--jobs", "2"]), ("numpy", ["--backend", "numpy"])])
-def test_the_row_does_not_depend_on_the_processor(small, tmp_path, command, name, more):
-    words = ["evaluate", "--protocol", small, "--policy", "bptt-small"]
-    code, shown, errors = command(*words)
-    assert code == 0, errors
-    done = subprocess.run(
-        [sys.executable, "-m", "filtergym", *words, *more],
-        env={**os.environ, **PROCESSORS[name], "COLUMNS": "100"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert row_of(done.stdout) == row_of(shown)
+def assert_refused_without_a_trace(env, untouched, keywords, message):
+    for one in (env, untouched):
+        one.reset(seed=4)
+    with pytest.raises((ValueError, TypeError), match=message):
+        env.reset(**keywords)
+    actions = actions_for(env, 3)
+    assert_all_equal(continued(env, actions), continued(untouched, actions))
+    np.testing.assert_array_equal(env.reset()[0], untouched.reset()[0])
 
 
-def test_what_the_command_prints_and_refuses(small, tmp_path, command):
-    records = tmp_path / "records.json"
-    code, shown, errors = command(
-        "evaluate",
-        "--protocol",
-        small,
-        "--policy",
-        "adaptive",
-        "--policy",
-        "UavAutopilot=mehra",
-        "--json",
-        str(records),
-    )
-    assert code == 0, errors
-    _, digest = read_protocol(small)
-    assert "| adaptive, mehra | " in shown
-    assert f"protocol SHA-256 {digest}" in shown
-    assert "@misc{small," in shown
-    assert records.stat().st_size > 1000
-    for words in (["--seed", "1"], ["--scenario", "glint"], ["--out", "x"], ["--set", "horizon=5"]):
-        code, _, errors = command("evaluate", "--protocol", small, "--policy", "adaptive", *words)
-        assert code == 2
-        assert f"leave out {words[0]}" in errors
-    code, _, errors = command(
-        "evaluate", "filtergym/UavAutopilot-v0", "--protocol", small, "--policy", "kalman"
-    )
-    assert code == 2
-    assert "leave out the environment" in errors
+@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
+def test_wrong_arguments_of_a_reset(face):
+    many = {} if face is TaskEnv else {"num_envs": 2}
+    env, untouched = (face(ID, **many) for _ in range(2))
+    for keywords, message in (RESETS if face is TaskEnv else RESETS | RESETS_OF_VECTORS).values():
+        assert_refused_without_a_trace(env, untouched, keywords, message)
 
 
-def test_a_bib_entry_is_one(small):
-    protocol, digest = read_protocol(small)
-    entry = bib_entry(protocols.ProtocolResult(protocol, digest, [], []), "0.1.0")
-    assert re.fullmatch(r"@misc\{small,\n(  \w+ = \{[^\n]+\},\n)+\}", entry)
-    assert entry.count("{") == entry.count("}")
-    assert tomllib.loads(SMALL)["year"] == 2026
-    assert "year = {2026}" in entry
+def test_options_of_a_single_environment():
+    message = "unknown option of a reset 'reset_mask': choose from scenario, parameters"
+    assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), {"options": {"reset_mask": [True]}}, message)
+    TaskEnv(ID).reset(options={})
+
+
+def test_seeds_may_be_numpys():
+    single, vector = TaskEnv(ID), TaskVectorEnv(ID, 2)
+    expected = single.reset(seed=5)[0]
+    np.testing.assert_array_equal(single.reset(seed=np.int64(5))[0], expected)
+    for seed in (np.uint32(5), np.array([5, 9]), (5, None), [np.int64(5), 6]):
+        np.testing.assert_array_equal(vector.reset(seed=seed)[0][0], expected)
+
+
+# --- gradients
+
+
+def test_gradients_flow_through_float32():
+    torch = pytest.importorskip("torch")
+    slopes = []
+    for dtype in ("float64", "float32"):
+        env = TaskVectorEnv(ID, 2, "gain", backend="torch", dtype=dtype, horizon=5)
+        env.reset(seed=0)
+        action = torch.zeros((2, 1), dtype=torch.float64, requires_grad=True)
+        env.step(action)
+        _, paid, *_ = env.step(action)
+        paid.sum().backward()
+        slopes.append(action.grad.numpy())
+    assert (slopes[0] != 0.0).all()
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-6)
+
+
+# --- pictures of vectors
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 2)
+    count, keywords = 4, {"render_mode": "rgb_array", "horizon": 4, "control": "weights"}
+    vector = TaskVectorEnv(ID, count, autoreset_mode=mode, **keywords)
+    single = TaskEnv(ID, **keywords)
+    single.picture.caption = "sub-environment 1"
+    vector.reset(seed=3), single.reset(seed=4)
+    actions = actions_for(vector, 7)
+    for step, action in enumerate(actions):
+        if mode is AutoresetMode.DISABLED and step == 4:
+            vector.reset(), single.reset()
+        *_, finished, _ = vector.step(action)
+        if mode is AutoresetMode.NEXT_STEP and step == 4:
+            single.reset()
+        else:
+            single.step(action[1])
+        if mode is AutoresetMode.SAME_STEP and finished.all():
+            single.reset()
+    assert single.picture.count == {"NextStep": 2, "SameStep": 3, "Disabled": 3}[mode.value]
+    frames = vector.render()
+    assert isinstance(frames, tuple)
+    assert len(frames) == count
+    np.testing.assert_array_equal(frames[1], single.render())
+    assert [frame.min() < 255 for frame in frames] == [True, True, False, False]
+    assert {frame.shape for frame in frames} == {(608, 960, 3)}
+    assert (frames[0] != frames[1]).any()
+    vector.close()
+
+
+@pytest.mark.parametrize("backend", BACKENDS[1:])
+def test_drawing_a_vector_leaves_its_episodes_alone(backend, monkeypatch):
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
+    subject = Subject(ID, backend=backend)
+    plain, drawn = (subject.native(2, render_mode=mode) for mode in (None, "rgb_array"))
+    np.testing.assert_array_equal(plain.reset(seed=0)[0], drawn.reset(seed=0)[0])
+    actions = actions_for(plain, 7)
+    assert_all_equal(continued(plain, actions), continued(drawn, actions))
+    assert [(frame.shape, frame.dtype) for frame in drawn.render()] == [((608, 960, 3), np.uint8)] * 2
+
+
+def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_mode(monkeypatch):
+    pytest.importorskip("llvmlite")
+    called = []
+    monkeypatch.setattr(ModelStepper, "step", lambda *_: called.append("step"))
+    env = TaskVectorEnv(ID, 2, backend="compiled")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert called == []
+    assert env.pictures is None
+
+
+def test_vectors_render_before_reset_and_without_a_mode():
+    with pytest.raises(gym.error.ResetNeeded, match="reset before the first render"):
+        TaskVectorEnv(ID, 2, render_mode="rgb_array").render()
+    env = TaskVectorEnv(ID, 2)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+
+
+@pytest.mark.slow
+def test_video_of_a_vector(tmp_path):
+    pytest.importorskip("moviepy")
+    from moviepy import VideoFileClip
+
+    if not hasattr(gym.wrappers.vector, "RecordVideo"):
+        pytest.skip("this version of Gymnasium records no vectors")
+    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=3)
+    env = gym.wrappers.vector.RecordVideo(env, str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
+    env.reset(seed=0)
+    for action in actions_for(env, 4):
+        env.step(action)
+    env.close()
+    with VideoFileClip(str(tmp_path / "videos" / "rl-video-episode-0.mp4")) as clip:
+        assert tuple(clip.size) == (1920, 608)
+        # The reset's frame and one for each of three steps, at ten a second.
+        assert clip.duration == pytest.approx(0.4, abs=0.11)
+
+
+# --- copies
+
+WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
+
+
+def test_copies_of_vectors_are_drawn_alike(monkeypatch):
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
+    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
+    env.reset(seed=3)
+    actions = actions_for(env, 5)
+    continued(env, actions[:2])
+    env.render()
+    other = pickle.loads(pickle.dumps(env))
+    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
+    drawn = other.render()
+    np.testing.assert_array_equal(env.render(), drawn)
+    # What was closed is drawn anew.
+    env.close()
+    again = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(again.render(), drawn)
+    # Closed and drawn again, it can be copied as before.
+    again.close()
+    again.render()
+    np.testing.assert_array_equal(copy.deepcopy(again).render(), again.render())
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_copies_of_what_is_wrapped(way):
+    env = RecordEpisodeStatistics(gym.make(ID, max_episode_steps=4, horizon=9))
+    env.reset(seed=3)
+    actions = actions_for(env, 4)
+    continued(env, actions[:2])
+    other = WAYS[way](env)
+    assert other.spec == env.spec
+    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
+
+
+@pytest.mark.slow
+def test_specs_are_enough_for_spawned_processes():
+    here = gym.make(ID, scenario=FLIGHT, dtype="float32", horizon=4)
+    make = functools.partial(gym.make, here.spec)
+    there = gym.vector.AsyncVectorEnv([make], context="spawn")
+    try:
+        together, _ = there.reset(seed=8)
+        assert together.dtype == np.float32
+        np.testing.assert_array_equal(together[0], here.reset(seed=8)[0])
+    finally:
+        there.close()

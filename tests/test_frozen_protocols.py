@@ -1,0 +1,239 @@
+"""Frozen protocols: the file does not change, the number is what its formula says, the row repeats on any processor."""
+
+import math
+import os
+import re
+import subprocess
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.running.parallel import Workers
+
+import filtergym
+from filtergym import protocol as protocols
+from filtergym.commands.protocol import quoted_row
+from filtergym.protocol import bib_entry, find_entries, read_protocol, run_protocol
+
+FROZEN = {"filtergym-1": "25cfbd9dcaba4cbfdd3bedcbdcc51c265bb44cdd69a0f12273d6693c147446ff"}
+"""SHA-256 of every protocol that was ever published. Who changes one adds a file with the next number."""
+SMALL = """
+name = "small"
+year = 2026
+split = "test"
+seed = 3
+episodes = 12
+held_out_episodes = 6
+resamples = 1000
+statistic = "as of filtergym-1"
+time = "as of filtergym-1"
+
+[[environments]]
+id = "filtergym/ManeuveringTarget-v0"
+interface = 2
+paper = "imm-steady-state"
+lost_cost = 100.0
+training = "random"
+held_out = ["atc", "glint"]
+
+[[environments]]
+id = "filtergym/UavAutopilot-v0"
+interface = 5
+paper = "kalman"
+lost_cost = 100.0
+training = "random"
+"""
+
+
+@pytest.fixture
+def small(tmp_path):
+    """Path of a protocol of few episodes of two environments."""
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL, encoding="utf-8")
+    return str(path)
+
+
+def test_published_protocols_are_frozen():
+    assert {name: read_protocol(name)[1] for name in protocols.protocol_names()} == FROZEN
+
+
+def test_filtergym_1_is_of_all_five_environments_and_all_their_scenarios():
+    protocol, _ = read_protocol("filtergym-1")
+    shipped = {id: task for id, task in catalogue().items() if id.startswith("filtergym/")}
+    assert {own.id for own in protocol.environments} == {*shipped}
+    for own in protocol.environments:
+        assert {own.training, *own.held_out} == {*shipped[own.id].scenarios}
+        assert [name for name, one in shipped[own.id].scenarios.items() if one.training] == [own.training]
+
+
+def test_the_number_is_what_the_formula_says(small):
+    """Against costs of episodes that ``evaluate`` gives, one environment and episode after another."""
+    protocol, digest = read_protocol(small)
+    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
+    logarithms, lost = [], []
+    for own in protocol.environments:
+        dataset = filtergym.evaluate(own.id, ["bptt-small", own.paper], None, 12, 3)
+        costs = dataset["cost"].mean("time")
+        logs = [math.log(costs.values[0, i] / costs.values[1, i]) for i in range(12)]
+        logarithms.append(sum(logs) / 12)
+        lost.append(float((costs.values[0] > own.lost_cost).mean()))
+    assert found.cost.value == pytest.approx(math.exp(sum(logarithms) / 2) - 1, rel=1e-12)
+    assert found.cost.low < found.cost.value < found.cost.high
+    assert found.lost == sum(lost) / 2
+    for one, logarithm in zip(found.environments, logarithms, strict=True):
+        assert one.cost.value == pytest.approx(math.expm1(logarithm), rel=1e-12)
+    held = {
+        name: filtergym.tidy_records(
+            filtergym.evaluate(
+                "filtergym/ManeuveringTarget-v0", ["bptt-small", "imm-steady-state"], name, 6, 3
+            )
+        )
+        for name in ("atc", "glint")
+    }
+    costs = {
+        name: next(
+            r.value for r in records if r.metric == "geometric_cost_difference" and r.policy == "bptt-small"
+        )
+        for name, records in held.items()
+    }
+    worst = max(costs, key=costs.get)
+    assert found.environments[0].worst == (worst, pytest.approx(costs[worst], rel=1e-12))
+    assert found.environments[1].worst is None
+
+
+def test_the_interval_covers_what_many_episodes_say(small):
+    """The interval of the number is that of a bootstrap of whole episodes, all environments at once."""
+    protocol, digest = read_protocol(small)
+    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
+    values = np.stack([one.logarithms for one in found.environments])
+    generator = np.random.default_rng(1)
+    naive = [np.expm1(values[:, generator.integers(0, 12, 12)].mean()) for _ in range(20_000)]
+    ends = np.percentile(naive, [2.5, 97.5])
+    # Of a thousand resamples an end is off by about 5 % of the interval's half width.
+    np.testing.assert_allclose([found.cost.low, found.cost.high], ends, atol=0.2 * (ends[1] - ends[0]) / 2)
+
+
+def test_the_papers_algorithms_are_zero(small):
+    protocol, digest = read_protocol(small)
+    entries = find_entries(protocol, ["imm-steady-state", "UavAutopilot=kalman"])
+    found = run_protocol(protocol, digest, entries, Workers())
+    assert found.cost.value == found.cost.low == found.cost.high == 0.0
+    assert found.title == "imm-steady-state, kalman"
+
+
+def test_no_number_without_all_environments(small):
+    protocol, digest = read_protocol(small)
+    found = run_protocol(protocol, digest, find_entries(protocol, ["UavAutopilot=mehra"]), Workers())
+    assert found.cost is found.lost is found.time is None
+    assert quoted_row(found)[-1].startswith("| mehra | - | - | 1 of 2 |")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "--protocol needs a competitor"),
+        (["imm", "adaptive"], "two competitors for all environments"),
+        (["semi-markov"], "UavAutopilot-v0: unknown policy 'semi-markov'.*--policy UavAutopilot=NAME"),
+        (["UavAutopilot=true-state"], "'true-state' is a reference: only policies and estimators"),
+    ],
+)
+def test_what_may_not_enter(small, words, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        find_entries(read_protocol(small)[0], words)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "interface = 5",
+            "interface = 4",
+            "states interface of filtergym/UavAutopilot-v0 4, and this package has 5",
+        ),
+        ("lost_cost = 100.0", "lost_cost = 1e9", "states lost_cost"),
+        ("resamples = 1000", "resamples = 10", "states resamples 10"),
+        ('"glint"', '"glimt"', "unknown scenario of filtergym/ManeuveringTarget-v0 'glimt'"),
+        ('"kalman"', '"true-state"', "unknown paper of filtergym/UavAutopilot-v0 'true-state'"),
+        ("seed = 3", "seeds = 3", "holds no protocol"),
+        ('split = "test"', 'split = "train"', "holds no protocol"),
+    ],
+)
+def test_what_is_no_protocol_of_this_package(tmp_path, old, new, sentence):
+    path = tmp_path / "altered.toml"
+    path.write_text(SMALL.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=sentence):
+        read_protocol(str(path))
+
+
+def row_of(output):
+    """Return the row to quote without the time, and the digest of the bib entry."""
+    row = next(line for line in output.splitlines() if line.startswith("| bptt-small"))
+    return row.rpartition("|")[0].rpartition("|")[0], re.search(r"SHA-256 (\w{64})", output)[1]
+
+
+PROCESSORS = {
+    "bare": {
+        "FILTERGYM_COMPILER_PROCESSOR": "x86-64",
+        "OPENBLAS_CORETYPE": "Prescott",
+        "OMP_NUM_THREADS": "2",
+    },
+    "numpy": {},
+}
+
+
+@pytest.mark.parametrize(("name", "more"), [("bare", ["--jobs", "2"]), ("numpy", ["--backend", "numpy"])])
+def test_the_row_does_not_depend_on_the_processor(small, tmp_path, command, name, more):
+    words = ["evaluate", "--protocol", small, "--policy", "bptt-small"]
+    code, shown, errors = command(*words)
+    assert code == 0, errors
+    done = subprocess.run(
+        [sys.executable, "-m", "filtergym", *words, *more],
+        env={**os.environ, **PROCESSORS[name], "COLUMNS": "100"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert row_of(done.stdout) == row_of(shown)
+
+
+def test_what_the_command_prints_and_refuses(small, tmp_path, command):
+    records = tmp_path / "records.json"
+    code, shown, errors = command(
+        "evaluate",
+        "--protocol",
+        small,
+        "--policy",
+        "adaptive",
+        "--policy",
+        "UavAutopilot=mehra",
+        "--json",
+        str(records),
+    )
+    assert code == 0, errors
+    _, digest = read_protocol(small)
+    assert "| adaptive, mehra | " in shown
+    assert f"protocol SHA-256 {digest}" in shown
+    assert "@misc{small," in shown
+    assert records.stat().st_size > 1000
+    for words in (["--seed", "1"], ["--scenario", "glint"], ["--out", "x"], ["--set", "horizon=5"]):
+        code, _, errors = command("evaluate", "--protocol", small, "--policy", "adaptive", *words)
+        assert code == 2
+        assert f"leave out {words[0]}" in errors
+    code, _, errors = command(
+        "evaluate", "filtergym/UavAutopilot-v0", "--protocol", small, "--policy", "kalman"
+    )
+    assert code == 2
+    assert "leave out the environment" in errors
+
+
+def test_a_bib_entry_is_one(small):
+    protocol, digest = read_protocol(small)
+    entry = bib_entry(protocols.ProtocolResult(protocol, digest, [], []), "0.1.0")
+    assert re.fullmatch(r"@misc\{small,\n(  \w+ = \{[^\n]+\},\n)+\}", entry)
+    assert entry.count("{") == entry.count("}")
+    assert tomllib.loads(SMALL)["year"] == 2026
+    assert "year = {2026}" in entry
