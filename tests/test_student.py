@@ -67,6 +67,12 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
         np.testing.assert_array_equal(state.motion, np.clip(action[22:], -1.0, 1.0))
 
 
+def tame(model):
+    """A network whose answers are small: one that loses the track would let rounding grow."""
+    arrays = network(model, "random").arrays
+    return LearnedPolicy(model, arrays | {"weight_0": 0.2 * arrays["weight_0"]}, "tanh")
+
+
 def turned_about(angle, centre, initial, measurements):
     """The same flights seen by somebody who has turned and moved; all errors are as large in all directions."""
     c, s = np.cos(angle), np.sin(angle)
@@ -85,12 +91,6 @@ def test_of_a_radar_a_turned_and_moved_problem_has_turned_and_moved_estimates(an
     measurements = [m._replace(variance=1e4 * ones, available=ones[0]) for m in measurements]
     both, there, *other = turned_about(angle, (3e4, -2e4), initial, measurements)
     # Where nothing was received the position is zero, which would turn with the others: here all is.
-
-    def tame(model):
-        """A network whose answers are small: one that loses the track would let rounding grow."""
-        arrays = network(model, "random").arrays
-        return LearnedPolicy(model, arrays | {"weight_0": 0.2 * arrays["weight_0"]}, "tanh")
-
     estimator, found = Asked(EstimatorMaker(NAME, tame)(model.task)), []
     for start, seen in ((initial, measurements), other):
         memory, track = estimator.start(start, 8), []
@@ -104,6 +104,15 @@ def test_of_a_radar_a_turned_and_moved_problem_has_turned_and_moved_estimates(an
         expected = np.einsum("ij,jkn,lk->iln", both, P, both)
         np.testing.assert_allclose(turned_P, expected, rtol=1e-7, atol=1e-7 * abs(expected).max())
     assert abs(found[0][-1][0] - found[1][-1][0]).max() > 1e3
+
+
+def test_a_student_in_c_answers_as_on_numpy():
+    pytest.importorskip("llvmlite")
+    from test_exports_c import FLAGS, compile_and_test, compiler, mean_rows, run_filter, writer_of
+
+    writer, given = writer_of("ManeuveringTarget", EstimatorMaker(NAME, tame))
+    assert given.largest_difference(run_filter(writer.traced, given)[:, mean_rows(writer.traced)]) < 1e-9
+    compile_and_test(writer, given, compiler(), FLAGS)
 
 
 @pytest.mark.parametrize("kind", sorted(reward.LIKELIHOOD_WEIGHTS))

@@ -9,7 +9,8 @@ answered of the motion and nu the innovation over the sensor's sigma, zero where
     report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_i,  L_ij = coupling_reach L_ii a_ij  (j < i)
 
 where a in [-1, 1] are the network's answers. All zero is a filter with the fixed gain G0. Because everything that is
-shown and answered is relative to the frame, the estimator is as symmetric as the frame is.
+shown and answered is relative to the frame, the estimator is as symmetric as the frame is. Nothing makes it stable: a
+Kalman filter's gain follows from a covariance, and this one loses the track where its network answers wrongly.
 
 A network that is trained through its own recursive estimate is that of Haarnoja and others, "Backprop KF: Learning
 Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs answers with the measurement of a Kalman filter.
