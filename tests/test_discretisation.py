@@ -170,7 +170,7 @@ def test_a_filter_of_a_drift_is_exported(make, tmp_path):
     [
         ({"f": np.eye(2)}, "motion is said by f and Q, or by drift and diffusion, got f, drift, diffusion"),
         ({"drift": None, "diffusion": None}, "got neither"),
-        ({"drift": lambda x: [x[0]]}, "drift does not take u: write"),
+        ({"drift": lambda x: [x[0]]}, "neither drift nor h takes u: write"),
         ({"drift": lambda x, u: [x[0] * u[0]]}, "drift must return 2 numbers, got 1"),
         ({"drift": lambda x, dt, u: [x[0], u[0]]}, "drift takes the state, and u where there are inputs"),
         ({"diffusion": -np.eye(2)}, "diffusion must be symmetric"),
