@@ -370,6 +370,7 @@ class Sluggish(ConstantVelocity):
     """Constant velocity with less acceleration than there is."""
 
     parameters = {"acceleration": (0.15, 0.2, 0.25)}  # noqa: RUF012
+    lane_parameters = True
 
 
 def test_a_cheaper_family_that_predicts_worse_beyond_chance_is_not_chosen(monkeypatch, tmp_path):
