@@ -107,7 +107,7 @@ function measure(target, time, settings) {
 /* Moves the target: to the pointer where there is one, else as the keys say, else by itself. */
 class Target {
   constructor(height) {
-    Object.assign(this, { x: 0.25 * WIDTH, y: 0.3 * height, heading: 60, speed: 120, turn: 0, left: 60 });
+    Object.assign(this, { x: 0.25 * WIDTH, y: 0.3 * height, heading: 60, speed: 80, turn: 0, left: 60 });
     Object.assign(this, { height, pointer: null, keys: new Set() });
   }
 
@@ -137,14 +137,14 @@ class Target {
     [this.turn, this.left] = [TURN_RATE * (right - left), 60];
   }
 
-  /* Straight flight and turns in random order; towards the middle near the border. */
+  /* Straight flight and turns in random order; towards the middle near the border, by 5.6 m/s^2. */
   fly(seconds) {
     this.left -= seconds;
     const [east, north] = [WIDTH / 2 - this.x, this.height / 2 - this.y];
-    if (Math.abs(east) > 0.38 * WIDTH || Math.abs(north) > 0.34 * this.height) {
+    if (Math.abs(east) > 0.36 * WIDTH || Math.abs(north) > 0.22 * this.height) {
       const off = (Math.atan2(east, north) * 180) / Math.PI - this.heading;
       const nearer = off - 360 * Math.round(off / 360);
-      if (Math.abs(nearer) > 30) [this.turn, this.left] = [Math.sign(nearer) * 5, 15];
+      if (Math.abs(nearer) > 30) [this.turn, this.left] = [Math.sign(nearer) * 4, 15];
     } else if (this.left <= 0) {
       const straight = this.turn !== 0;
       [this.turn, this.left] = straight ? [0, 40 + 60 * Math.random()] : [Math.random() < 0.5 ? 3 : -3, 30];
