@@ -13,6 +13,7 @@ import numpy
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
+from ..filters.geodesy import PlaneOrigin
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable
@@ -76,6 +77,14 @@ class LogSetup(NamedTuple):
     """Of measurements that state none, in the names and units of the columns."""
     deviations_from: str
     """Who says so."""
+    origin: dict[str, float]
+    """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
+    were metres."""
+
+    @property
+    def plane(self) -> PlaneOrigin | None:
+        """That origin."""
+        return PlaneOrigin(**self.origin) if self.origin else None
 
     @property
     def assumed(self) -> dict[str, float]:
@@ -111,6 +120,7 @@ def setup_of(problem: Problem, recording: Any) -> LogSetup:
         dict(recording.columns),
         {name: round_value(value) for name, value in deviations.items()},
         source,
+        dict(recording.origin),
     )
 
 
@@ -208,7 +218,10 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         "columns": dict[str, str],
         "deviations": dict[str, float],
         "deviations_from": str,
+        "origin": dict[str, float],
     }
+    if isinstance(log, dict):
+        log = {"origin": {}, **log}  # files of older versions say nothing of it
     log_format = problem.task.log_format
     names = {
         "time",
@@ -224,6 +237,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not 0.0 < log["interval"] < math.inf
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
+        or not (not log["origin"] or _is_place(log["origin"]))
     ):
         raise ValueError(f"{path}: what it says of its log is none: filtergym advise writes it anew")
     try:
@@ -231,6 +245,12 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: parameters of its log: {error}") from error
     return LogSetup(**{key: log[key] for key in kinds})
+
+
+def _is_place(origin: Mapping[str, float]) -> bool:
+    """Whether it is one on the Earth, or near it."""
+    largest = {"latitude": 90.0, "longitude": 360.0, "altitude": 1e6}
+    return origin.keys() == largest.keys() and all(abs(origin[key]) <= most for key, most in largest.items())
 
 
 def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, float]) -> TunedPolicy:

@@ -39,7 +39,8 @@ def online(
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         policy: a name or a path, see :func:`~filtergym.names.competitor`, or an object or a class as in
             :func:`~filtergym.evaluate`. A file of ``filtergym advise`` brings the interval, the noise level and the
-            parameters of the log that it was advised for.
+            parameters of the log that it was advised for, and the origin of x and y where that had latitude and
+            longitude, which ``update`` takes then.
         control: demand this control; by default the policy's own.
         scenario: whose parameters are taken; default: the environment's.
         tracks: how many are followed side by side.
@@ -74,6 +75,7 @@ def online(
             second_sensor or getattr(maker, "anchored", False),
             () if log is None else tuple(log.deviations.items()),
             None if log is None else log.interval,
+            None if log is None else log.plane,
         ),
     )
     own = control_of(maker, kind, control, problem.task, name)

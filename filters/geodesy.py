@@ -10,6 +10,8 @@ with latitude B, longitude L and ellipsoidal height h; a and f are the defining 
 Plain NumPy on angles in radians: sites are constants of an experiment, and recorded positions are read once.
 """
 
+from typing import NamedTuple
+
 import numpy
 
 from .array_namespace import Array
@@ -75,6 +77,28 @@ def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[flo
     """
     away = earth_fixed(latitude, longitude, height) - earth_fixed(*site, 0.0)[:, None]
     return (east_north_up(*site) @ away)[:2]
+
+
+class PlaneOrigin(NamedTuple):
+    """Where the plane touches the ellipsoid in which positions of a log are metres east and north."""
+
+    latitude: float
+    """Degrees, likewise the longitude."""
+    longitude: float
+    altitude: float = 0.0
+    """Above the ellipsoid, m, of a position that says none; the plane itself lies at zero."""
+
+    def east_north(self, latitude: Array, longitude: Array, altitude: Array) -> Array:
+        """Coordinates east and north of it, ``(2, n)``, m.
+
+        Args:
+            latitude: degrees, ``(n,)``, likewise the longitude.
+            longitude: positive to the east.
+            altitude: above the ellipsoid, m, ``(n,)``; NaN where it is not known.
+        """
+        height = numpy.where(numpy.isfinite(altitude), altitude, self.altitude)
+        site = float(numpy.radians(self.latitude)), float(numpy.radians(self.longitude))
+        return east_north(numpy.radians(latitude), numpy.radians(longitude), height, site)
 
 
 def geodetic(position: Array) -> Array:

@@ -31,6 +31,7 @@ PROBLEM = problem_of(ID)
 STRICT = ("-Wconversion", "-Wdouble-promotion", "-Wshadow")
 POLAR = "range", "azimuth", "range_sigma", "azimuth_sigma"
 PLANE = "x", "y", "sigma_x", "sigma_y"
+PLACE = "lat", "lon", "altitude", "sigma_x", "sigma_y"
 
 
 def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, sigma=60.0, T=4.0):
@@ -47,9 +48,13 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
     values = {"x": plots[:, 0], "y": plots[:, 1], "sigma_x": np.full(n, sigma), "sigma_y": np.full(n, sigma)}
     values["range"], azimuth = np.hypot(*plots.T), np.degrees(np.arctan2(plots[:, 0], plots[:, 1]))
     values |= {"azimuth": azimuth, "range_sigma": np.full(n, sigma), "azimuth_sigma": np.full(n, 0.15)}
+    if "lat" in names:  # across the date line, and the altitude has gaps
+        values |= {"lat": 48.7 + plots[:, 1] / 111.2e3, "lon": (359.5 + plots[:, 0] / 73.6e3) % 360.0 - 180.0}
+        values["altitude"] = np.where(g.random(n) < 0.2, np.nan, g.uniform(500.0, 3000.0, n))
     kept = (g.random(n) >= missed) | (np.arange(n) < 3)
     columns = {"time": time, **{name: values[name] for name in names}}
-    columns |= {"truth_position_x": truth[:, 0], "truth_position_y": truth[:, 1]}
+    if "lat" not in names:
+        columns |= {"truth_position_x": truth[:, 0], "truth_position_y": truth[:, 1]}
     table = np.column_stack(list(columns.values()))[kept]
     np.savetxt(path, table, "%.9g", ",", header=",".join(columns), comments="")
     return path
@@ -61,6 +66,8 @@ LOGS = {
     "walk": {"names": PLANE, "speed": 1.4, "sigma": 1.0, "T": 0.25, "jitter": 0.02},
     "uneven": {"names": PLANE, "jitter": 0.2, "missed": 0.1},
     "no deviations": {"names": PLANE[:2], "sigma": 30.0},
+    "latitude": {"names": PLACE, "missed": 0.2, "outliers": 0.05},
+    "latitude only": {"names": PLACE[:2], "jitter": 0.2},
 }
 
 
@@ -76,7 +83,10 @@ def mean_of_evaluation(path, log):
 
 def mean_of_online(path, log):
     """The same, row by row."""
-    rows = [{k: float(v) for k, v in row.items() if "truth" not in k} for row in csv.DictReader(log.open())]
+    named = {old: new for new, old in find_log_setup(PROBLEM, path).columns.items()}
+    rows = [
+        {named[k]: float(v) for k, v in row.items() if "truth" not in k} for row in csv.DictReader(log.open())
+    ]
     running = filtergym.online(ID, str(path))
     running.start_from(*rows[:2])
     return np.array([running.update(**row).mean[:2] for row in rows[2:]])
@@ -99,7 +109,8 @@ def mean_of_program(path, log, folder):
 @pytest.mark.parametrize("case", LOGS)
 def test_all_doors_give_the_same_numbers(case, tmp_path):
     log = write_log(tmp_path / "log.csv", **LOGS[case])
-    recording = read_recording(log, ID, speeds=(0.001, 1000.0))
+    bare = {"range_sigma": 40.0} if case == "latitude only" else {}
+    recording = read_recording(log, ID, speeds=(0.001, 1000.0), **bare)
     family = log_families(recording)["constant-velocity"]
     values = {**family.start, "log10_outlier_share": -1.7, "log10_noise_scale": 0.1}
     path = tmp_path / "mine.filter.json"
@@ -139,6 +150,35 @@ def test_without_deviations_the_file_says_which(tmp_path):
     for deviation in (0.0, -1.0):
         with pytest.raises(ValueError, match="is a standard deviation and must be positive"):
             running.update(12.0, x=0.0, y=0.0, sigma_x=deviation, sigma_y=1.0)
+
+
+def test_latitude_needs_an_origin_and_lies_near_it(tmp_path):
+    path = _saved(tmp_path, write_log(tmp_path / "log.csv", PLACE))
+    running = filtergym.online(ID, str(path))
+    origin = find_log_setup(PROBLEM, path).plane
+    east, north = (math.degrees(10.0 / length) for length in (6.39e6 * math.cos(math.radians(48.8)), 6.37e6))
+    rows = [
+        {"time": 4.0 * k, "latitude": origin.latitude + k * north, "longitude": origin.longitude + k * east}
+        for k in range(4)
+    ]
+    running.start_from(*rows[:2])
+    # At the origin's own height, which a plot without one is given; 10 m within half a percent.
+    np.testing.assert_allclose(running.update(**rows[2]).mean[:2], 20.0, rtol=5e-3)
+    for wrong, sentence in (
+        ({"latitude": 91.0}, "degrees from -90 to 90"),
+        ({"latitude": origin.latitude + 5.0}, "km from latitude 48"),
+        ({"x": 3.0}, "leave one of them out"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            running.update(**{**rows[3], **wrong})
+    with pytest.raises(ValueError, match="unknown value 'latitude'"):
+        filtergym.online(ID, "kalman-imm").start_from(*rows[:2])
+    table = json.loads(path.read_text())
+    for name, value in (("latitude", 91.0), ("longitude", math.nan), ("height", 0.0)):
+        changed = {**table["log"], "origin": {**table["log"]["origin"], name: value}}
+        path.write_text(json.dumps(table | {"log": changed}))
+        with pytest.raises(ValueError, match="what it says of its log is none"):
+            find_competitor(PROBLEM, path)
 
 
 def test_measurements_of_one_time_are_fused(tmp_path):

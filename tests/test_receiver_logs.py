@@ -7,10 +7,12 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
+from filtergym.baselines.fitted_filters import write_advised
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.flight_tables import read_table
 from filtergym.filters import geodesy
 
-from filtergym import evaluate, read_flights, read_recording
+from filtergym import evaluate, online, read_flights, read_recording
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 COUNT = 40
@@ -220,6 +222,20 @@ def test_sentences(pynmea2, tmp_path):
         "2026-05-02T00:00:04.750000Z",
     ]
     assert np.isfinite(evaluate(TARGET, ["imm"], recording)["log_likelihood"].values).all()
+
+
+def test_sentences_run_online_as_they_are_judged(pynmea2, tmp_path):
+    """The file of a filter that was advised for them takes the same positions, and says the same to rounding."""
+    log, path = nmea(tmp_path / "walk.nmea"), tmp_path / "mine.filter.json"
+    recording = read_recording(log, TARGET)
+    write_advised(path, problem_of(TARGET), "kalman-imm", recording, None, {}, "test")
+    judged = evaluate(TARGET, str(path), recording, tracks=True)["estimate"].values.squeeze()
+    table = read_table(log, ["latitude", "longitude", "altitude", "sigma_x", "sigma_y"]).columns
+    rows = table.assign(time=TIME).to_dict("records")
+    running = online(TARGET, str(path))
+    running.start_from(*rows[:2])
+    found = np.array([running.update(**row).mean for row in rows[2:]])
+    np.testing.assert_allclose(found, judged[: len(found)], rtol=0.0, atol=1e-8)  # of coordinates of 6.4e6 m
 
 
 def test_sentences_without_a_date(pynmea2, tmp_path):

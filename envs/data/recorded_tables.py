@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ...filters.geodesy import east_north
+from ...filters.geodesy import PlaneOrigin
 from ..contract.log_format import TrackLog
 from ..contract.task import Task
 from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, ColumnNames, list_names, numbers, read_table, seconds
@@ -57,8 +57,8 @@ class Columns:
         self.log_time = self.time if log_time is None else log_time
         self.notes: list[str] = []
         """What was done to the table, a line each."""
-        self.origin: tuple[float, float] | None = None
-        """Latitude and longitude, degrees, of which metres east and north were made; None where they were given."""
+        self.origin: PlaneOrigin | None = None
+        """Around which latitude and longitude were made metres east and north; None where these were given."""
 
     def has(self, *names: str) -> bool:
         """Whether all of these columns are there."""
@@ -163,18 +163,17 @@ class Columns:
                 if not there.any():
                     raise ValueError(f"no row has {latitude} and {longitude}")
                 first = int(there.argmax())
-                self.origin = float(self[latitude][first]), float(self[longitude][first])
-                self.notes.append(
-                    f"x is east and y north of latitude {self.origin[0]:.8f}, longitude {self.origin[1]:.8f}, the "
-                    "first position"
+                self.origin = PlaneOrigin(
+                    float(self[latitude][first]), float(self[longitude][first]), self._usual_height(altitude)
                 )
-            height = self._height(altitude if self.has(altitude) else GEODETIC[2])
-            found = east_north(
-                numpy.radians(self[latitude]),
-                numpy.radians(self[longitude]),
-                height,
-                (numpy.radians(self.origin[0]), numpy.radians(self.origin[1])),
-            )
+                self.notes.append(
+                    f"x is east and y north of latitude {self.origin.latitude:.8f}, longitude "
+                    f"{self.origin.longitude:.8f}, the first position"
+                )
+            name = altitude if self.has(altitude) else GEODETIC[2]
+            usual = self.origin._replace(altitude=self._usual_height(name))
+            height = self[name] if self.has(name) else numpy.full(len(self.time), numpy.nan)
+            found = usual.east_north(self[latitude], self[longitude], height)
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
 
     def note_offset(self, plane: tuple[str, ...]) -> None:
@@ -188,12 +187,11 @@ class Columns:
             found = offset_note(self.time, numpy.stack([x, y], axis=1), numpy.stack([true_x, true_y], axis=1))
             self.notes += [found] * bool(found)
 
-    def _height(self, name: str) -> numpy.ndarray:
-        """A column of heights, the median where it says nothing, ``(rows,)``, m; zero where there is none."""
-        height = self[name] if self.has(name) else numpy.zeros(len(self.time))
+    def _usual_height(self, name: str) -> float:
+        """Median of a column of heights, m; zero where there is none."""
+        height = self[name] if self.has(name) else numpy.zeros(0)
         there = numpy.isfinite(height)
-        usual = float(numpy.median(height[there])) if there.any() else 0.0
-        return numpy.where(there, height, usual)
+        return float(numpy.median(height[there])) if there.any() else 0.0
 
     def whole(self, *names: str) -> numpy.ndarray:
         """Columns without an empty cell, ``(rows, columns)``.
@@ -504,6 +502,7 @@ def _side_by_side(
                 columns={name: original.get(name, name) for name in own.table if not name.startswith(TRUTH)},
                 deviations=found.deviations,
                 deviations_from=found.deviations_from,
+                origin={} if own.origin is None else own.origin._asdict(),
             )
         )
     return side_by_side(recordings, notes=tuple(limit_notes(notes)))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy
 
 from ...compiler.functions import map_arrays
+from ...filters.geodesy import PlaneOrigin
 from ..contract.draws import Draws
 from ..contract.model import Model
 from ..contract.observation import Array
@@ -217,12 +218,14 @@ class Feed:
         deviations: of measurements that come without, in the names and units of the columns of a log.
         scan_interval: s; where more time passes between two measurements, scans between have missed the target; None:
             the time between is one step.
+        origin: around which latitude and longitude become metres; None: they are not taken.
     """
 
     regular: bool = False
     second_sensor: bool = False
     deviations: tuple[tuple[str, float], ...] = ()
     scan_interval: float | None = None
+    origin: PlaneOrigin | None = None
     truth: ClassVar[None] = None
     has_whole_truth: ClassVar[bool] = False
 

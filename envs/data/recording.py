@@ -52,6 +52,8 @@ class Recording:
         columns: names in the log of the columns that were read, by what they are called here.
         deviations: typical deviations of what was measured, see :class:`.TrackLog`.
         deviations_from: who says so.
+        origin: latitude and longitude, degrees, and usual altitude, m, around which positions of the first episode were
+            made metres; empty where they were metres.
 
     Raises:
         ValueError: for arrays that do not fit each other, or are not finite where they must be.
@@ -75,6 +77,7 @@ class Recording:
     columns: Mapping[str, str] = field(default_factory=dict)
     deviations: Mapping[str, float] = field(default_factory=dict)
     deviations_from: str = ""
+    origin: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         episodes, _ = self.seconds.shape

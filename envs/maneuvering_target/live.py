@@ -7,25 +7,31 @@ import numpy
 
 from ...filters import polar
 from ..contract.live_input import LiveInput, Memory
-from .logs import COLUMNS, two_plot_start
+from ..data.plausibility import check_degrees
+from .logs import COLUMNS, FARTHEST_RANGE, two_plot_start
 from .world import Measurement, Odometry
 
 SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
+PLACE = ("latitude", "longitude", "altitude")
 VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "azimuth_sigma")
 
 
 class PlotInput(LiveInput):
-    """A plot, ``x`` and ``y`` or ``range`` and ``azimuth``, or none where the scan missed the target."""
+    """A plot, ``x`` and ``y`` or ``range`` and ``azimuth``, or none where the scan missed the target.
+
+    A filter whose file was advised for a log of ``latitude`` and ``longitude`` takes these in their place.
+    """
 
     counter = "scan"
     fuses = True
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return columns of a log; of a second sensor speed and heading at the start, too."""
+        names = VALUES if self.task.recording.origin is None else (*VALUES, *PLACE)
         if self.measurement.odometry is None:
-            return {name: COLUMNS[name] for name in VALUES}, {}
+            return {name: COLUMNS[name] for name in names}, {}
         at_start = {name: COLUMNS[name] for name in SECOND_SENSOR[2:]}
-        return {name: COLUMNS[name] for name in (*VALUES, *SECOND_SENSOR)}, at_start
+        return {name: COLUMNS[name] for name in (*names, *SECOND_SENSOR)}, at_start
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start as if a scan had just seen the target."""
@@ -66,10 +72,31 @@ class PlotInput(LiveInput):
         return self.read(values, "odometry_speed") * numpy.stack([numpy.sin(heading), numpy.cos(heading)])
 
     def _position(self, values: Mapping[str, Any]) -> numpy.ndarray:
+        if any(name in values for name in PLACE[:2]):
+            return self._project(values)
         if "range" not in values:
             return numpy.stack([self.read(values, "x"), self.read(values, "y")])
         distance, azimuth = self.read(values, "range"), numpy.radians(self.read(values, "azimuth"))
         return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)])
+
+    def _project(self, values: Mapping[str, Any]) -> numpy.ndarray:
+        """Position of latitude and longitude, around the origin of the log that the filter was advised for."""
+        twice = [name for name in VALUES[:4] if name in values]
+        if twice:
+            raise ValueError(f"a plot has {twice[0]} and latitude or longitude: leave one of them out")
+        latitude, longitude, altitude = (self.read(values, name) for name in PLACE)
+        check_degrees("latitude", latitude, 90.0)
+        check_degrees("longitude", longitude, 360.0)
+        origin: Any = self.task.recording.origin
+        position = origin.east_north(latitude, longitude, altitude)
+        farthest = float(numpy.nanmax(numpy.hypot(*position), initial=0.0))
+        if farthest > FARTHEST_RANGE:
+            raise ValueError(
+                f"a plot lies {farthest / 1e3:,.0f} km from latitude {origin.latitude:g}, longitude "
+                f"{origin.longitude:g}, around which the log was that the filter is advised for, and the plane there "
+                f"ends at {FARTHEST_RANGE / 1e3:,.0f} km: write another origin into the file"
+            )
+        return position
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
         """Start a track as a log's starts: the second plot, and the difference of both over the time between them."""

@@ -139,7 +139,7 @@ def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray)
     """
     measured = position
     if columns.origin is not None:  # x and y change with altitude, too
-        across = 111e3 * numpy.cos(numpy.radians(columns.origin[0]))
+        across = 111e3 * numpy.cos(numpy.radians(columns.origin.latitude))
         measured = numpy.stack([across * columns["longitude"], 111e3 * columns["latitude"]], axis=1)
     stale = numpy.zeros(len(position), dtype=bool)
     there = numpy.flatnonzero(numpy.isfinite(position).all(axis=1))

@@ -156,6 +156,40 @@ int main(int argc, char **argv) {{
 }}
 """
 """Reads a table of measurements and writes one of estimates."""
+POSITIONS = {
+    ("latitude", "longitude", "altitude"): "if (!(fabs(a) <= 90.0 && fabs(b) <= 360.0)) return 0;\n"
+    "    project(a, b, number(row, place[5]), p);",
+    ("x", "y"): "p[0] = a;\n    p[1] = b;",
+    ("range", "azimuth"): "p[0] = a * sin(b * DEGREE);\n    p[1] = a * cos(b * DEGREE);",
+}
+"""How a position p is made of the columns a and b of a log, the first pair that it has; a third one may lack."""
+PROJECT = """
+/* Latitude and longitude, degrees, around which positions are metres; the altitude of a row that has none, m. */
+static const double origin[3] = {{{origin}}};
+
+/* Earth-fixed coordinates, m, of angles in radians and a height above the ellipsoid WGS 84, m. */
+static void earth_fixed(double latitude, double longitude, double height, double *r) {{
+    const double flattening = 1.0 / 298.257223563, e2 = flattening * (2.0 - flattening);
+    const double n = 6378137.0 / sqrt(1.0 - e2 * (sin(latitude) * sin(latitude)));
+    const double across = (n + height) * cos(latitude);
+    r[0] = across * cos(longitude);
+    r[1] = across * sin(longitude);
+    r[2] = (n * (1.0 - e2) + height) * sin(latitude);
+}}
+
+/* Coordinates east and north of the origin, m, in the plane that touches the ellipsoid there. */
+static void project(double latitude, double longitude, double height, double *p) {{
+    const double b = origin[0] * DEGREE, l = origin[1] * DEGREE;
+    double r[3], r0[3];
+    int i;
+    earth_fixed(b, l, 0.0, r0);
+    earth_fixed(latitude * DEGREE, longitude * DEGREE, height - height == 0.0 ? height : origin[2], r);
+    for (i = 0; i < 3; ++i) r[i] -= r0[i];
+    p[0] = cos(l) * r[1] - sin(l) * r[0];
+    p[1] = cos(b) * r[2] - sin(b) * (cos(l) * r[0] + sin(l) * r[1]);
+}}
+"""
+"""Makes metres of latitude and longitude."""
 LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this filter was advised, and writes an
    estimate for each row: the track starts from the first two plots, and scans without a row have missed the target. */
 #include <math.h>
@@ -168,10 +202,10 @@ LOG = """/* Reads a log (CSV, a file or standard input) as it was read when this
 #define INTERVAL {interval} /* s */
 #define DEGREE (3.14159265358979323846 / 180.0)
 
-/* Time, two coordinates, and their deviations, which a log may lack. */
-static const char *const names[5] = {{{columns}}};
+/* Time, two coordinates, and their deviations, which a log may lack; so it may the altitude, where that is read. */
+static const char *const names[{count}] = {{{columns}}};
 static const double usual[2] = {{{first}, {second}}};
-static int place[5] = {{-1, -1, -1, -1, -1}};
+static int place[6] = {{-1, -1, -1, -1, -1, -1}};
 static char line[65536];
 
 static {own}_state state;
@@ -202,13 +236,13 @@ static void find_columns(char *row) {{
         word[length] = '\\0';
         for (i = 0; i < length; ++i)
             if (word[i] >= 'A' && word[i] <= 'Z') word[i] = (char)(word[i] - 'A' + 'a');
-        for (k = 0; k < 5; ++k)
+        for (k = 0; k < {count}; ++k)
             if (strcmp(word, names[k]) == 0) place[k] = column;
         if (after != ',') return;
         word += length + 1;
     }}
 }}
-
+{project}
 /* Position and variances of a row, in metres east and north; returns whether there is a plot. */
 static int read_plot(const char *row, double *p, double *v) {{
     const double a = number(row, place[1]), b = number(row, place[2]);
@@ -216,8 +250,7 @@ static int read_plot(const char *row, double *p, double *v) {{
     if (!(a - a == 0.0 && b - b == 0.0)) return 0;
     if (!(s > 0.0)) s = usual[0];
     if (!(r > 0.0)) r = usual[1];
-    p[0] = {polar} ? a * sin(b * DEGREE) : a;
-    p[1] = {polar} ? a * cos(b * DEGREE) : b;
+    {position}
     v[0] = s * s;
     v[1] = r * r;
     if ({stated_polar}) {{

@@ -29,7 +29,7 @@ from ..compiler.c_text import (
 )
 from ..evaluation.storage.files import whole_files
 from .c_network import memory_size, network_operations, network_text, scratch_size
-from .c_programs import LOG, MAIN, TEST
+from .c_programs import LOG, MAIN, POSITIONS, PROJECT, TEST
 from .c_structs import struct_text, structure
 from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
@@ -377,14 +377,15 @@ class Writer:
         """Text of a program that reads a log as it was read when the filter was advised; empty where it was no table of
         plots.
         """
-        polar = {"range", "azimuth"} <= {*log.columns}
-        if not polar and ("x" not in log.columns or "latitude" in log.columns):
+        names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
+        if names is None or (names[0] == "latitude") != (log.plane is not None):
             return ""
-        names = ["range", "azimuth"] if polar else ["x", "y"]
         deviations = (
             ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
         )
-        columns = [log.columns.get(name, name).lower() for name in ("time", *names, *deviations)]
+        columns = [
+            log.columns.get(name, name).lower() for name in ("time", *names[:2], *deviations, *names[2:])
+        ]
         real, C = self.scalar.name, len(self.components)
         values = {
             "scan": "scan", "position_0": "p[0]", "position_1": "p[1]", "variance_0": "v[0]", "variance_1": "v[1]",
@@ -414,7 +415,9 @@ class Writer:
             own=self.name,
             columns=", ".join(_string(name) for name in columns),
             header=_string(",".join(header)),
-            polar=int(polar),
+            count=len(columns),
+            position=POSITIONS[names],
+            project=PROJECT.format(origin=", ".join(map(literal, log.plane))) if log.plane else "",
             stated_polar=int(deviations[0] == "range_sigma"),
             first=literal(log.deviations[deviations[0]]),
             second=literal(log.deviations[deviations[1]]),
