@@ -2,8 +2,8 @@
 
 A number stands between comments that no reader sees, ``<!-- value: PATH -->-43.6 %<!-- end -->``, with ``number`` in
 place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`. What the command before
-``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``. A comment that begins a line ends a
-paragraph, so a number stands behind a word.
+``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``. A comment that begins a line ends
+a paragraph, so a number stands behind a word.
 """
 
 import os
