@@ -1,6 +1,6 @@
 """What belongs to an environment, found once where its id is given and handed down as one object."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import ModuleType
@@ -65,14 +65,20 @@ class Problem:
             )
         return self.baselines.score_paper
 
-    def paper_among(self, names: Collection[str]) -> str:
+    def paper_among(self, competitors: Mapping[str, Any]) -> str:
         """Return the name of the paper's algorithm that some competitors are compared with; empty: of none.
 
         Args:
-            names: of the competitors: the stronger reading of the paper where it is among them.
+            competitors: what makes them, by their names: the stronger reading of the paper where it is among them,
+                whatever it is called there.
         """
-        stronger = self.baselines.stronger_paper
-        return stronger if stronger in names else self.baselines.score_paper
+        known = self.baselines
+        readings = [name for name in (known.stronger_paper, known.score_paper) if name]
+        for reading in readings:
+            for name, maker in competitors.items():
+                if name == reading or maker is self.competitor(reading):
+                    return name
+        return known.score_paper
 
     @property
     def knows(self) -> dict[str, str]:

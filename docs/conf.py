@@ -52,6 +52,9 @@ html_theme = "pydata_sphinx_theme"
 html_title = "filtergym"
 html_static_path = ["_static"]
 html_css_files = ["filtergym.css"]
+# Said before the theme asks, which reports an error where nothing is said; `default_mode` would hide all colours from
+# browsers without scripts.
+html_js_files = [(None, {"body": "document.documentElement.dataset.mode ||= 'auto'"})]
 html_show_sourcelink = False
 html_copy_source = False
 html_use_index = html_domain_indices = False  # the search finds names

@@ -184,7 +184,8 @@ def evaluate(
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
-        :func:`.evaluate.run_experiment`.
+        :func:`.evaluate.run_experiment`. Costs are compared with the paper's algorithm where it is among the
+        competitors, whatever it is called there.
 
     Raises:
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or

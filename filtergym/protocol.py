@@ -313,7 +313,7 @@ def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iter
         )
         horizon = experiment.make_task().horizon
         yield [
-            EvaluationRequest(experiment, name, maker, None, horizon, curves=False)
+            EvaluationRequest(experiment, name, maker, problem.baselines.metrics, horizon, curves=False)
             for name, maker in makers.items()
         ]
 

@@ -16,9 +16,8 @@ import hashlib
 import inspect
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
@@ -34,8 +33,8 @@ from .evaluation.competitors.isolation import isolate_source
 from .evaluation.competitors.kinds import RANKED, kind_of
 from .evaluation.running.parallel import Workers
 from .evaluation.running.rollout import Progress
-from .evaluation.running.summary import EvaluationRequest, combine_summaries, summaries
 from .evaluation.storage.files import whole_file
+from .protocol import Entry, Protocol, protocol_names, read_protocol, run_protocol
 
 if TYPE_CHECKING:
     from .evaluation.running.metrics import Record
@@ -52,6 +51,10 @@ RATIOS = (
     "geometric_cost_difference", "lost_tracks", "relative_cost_difference", "anees", "lost_episodes",
 )  # fmt: skip
 """Metrics whose scale is one."""
+FROZEN = protocol_names()[-1]
+"""Name of the newest frozen protocol."""
+TRIAL = "trial"
+"""Name of a short one, to try."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""
 
@@ -63,20 +66,6 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 class _Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What stands in a file, and nothing else."""
-
-
-class Protocol(_Stored, frozen=True):
-    """Episodes that a submission is run over."""
-
-    name: Name
-    version: Count
-    scenarios: tuple[Name, ...]
-    """The training distribution first."""
-    episodes: Count
-    """Of every scenario."""
-    seed: Count
-    """Number of the experiment."""
-    split: Literal["test"] = "test"
 
 
 class Card(_Stored, frozen=True):
@@ -121,40 +110,40 @@ class Submission(_Stored, frozen=True):
 
     environment: Name
     """Gymnasium id."""
-    interface: Count
-    """Version of the environment's interface."""
     filtergym: Name
     """Version of the package that made the results."""
-    protocol: Protocol
+    protocol: Name
+    protocol_sha256: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    """Digest of the protocol's file; of a trial, of the file that it shortens."""
     card: Card
     competitor: Arrays | Source | Shipped
     results: tuple[Figure, ...]
     format: Literal["filtergym submission 1"] = "filtergym submission 1"
 
 
-EPISODES: Mapping[str, int] = MappingProxyType({"filtergym/TightlyCoupledNavigation-v0": 100})
-"""Of the protocol ``full``, where they are not 500."""
-PROTOCOLS = ("full", "trial")
-"""Names: the whole, and a short one to try."""
-
-
-def protocol_of(problem: Problem, name: str) -> Protocol:
-    """Return a protocol for an environment.
+def protocol_of(problem: Problem, name: str) -> tuple[Protocol, str]:
+    """Return the part of a frozen protocol that is of one environment, and the digest of the protocol's file.
 
     Args:
-        problem: whose scenarios it has.
-        name: ``"full"``: every scenario, the training distribution first; or ``"trial"``: 32 episodes of that.
+        problem: whose environment it is.
+        name: of the protocol; or ``"trial"``: 32 episodes of the training distribution, to try.
 
     Raises:
-        ValueError: for another name.
+        ValueError: for another name, and an environment that the protocol has not.
     """
-    if name not in PROTOCOLS:
-        raise nearest("protocol", name, PROTOCOLS)
-    default = problem.task.default_scenario
-    if name == "trial":
-        return Protocol(name, 1, (default,), 32, 0)
-    scenarios = (default, *(own for own in problem.task.scenarios if own != default))
-    return Protocol(name, 1, scenarios, EPISODES.get(problem.id, 500), 0)
+    names = (*protocol_names(), TRIAL)
+    if name not in names:  # a file names no other file
+        raise nearest("protocol", name, names)
+    whole, digest = read_protocol(FROZEN if name == TRIAL else name)
+    own = [one for one in whole.environments if one.id == problem.id]
+    if not own:
+        raise ValueError(
+            f"protocol {whole.name} has no environment {problem.id}: evaluate the competitor instead"
+        )
+    if name == TRIAL:
+        own = [msgspec.structs.replace(own[0], held_out=())]
+        whole = msgspec.structs.replace(whole, name=name, episodes=32)
+    return msgspec.structs.replace(whole, environments=tuple(own)), digest
 
 
 # --- files
@@ -349,74 +338,53 @@ def make_submission(
     """
     from . import __version__
 
-    held, own, path = pack(problem, name), protocol_of(problem, protocol), Path(name)
-    submission = Submission(problem.id, problem.task.interface, __version__, own, card, held, ())
+    _, digest = protocol_of(problem, protocol)
+    held, path = pack(problem, name), Path(name)
+    submission = Submission(problem.id, __version__, protocol, digest, card, held, ())
     submission = _decode(path, msgspec.json.encode(submission))  # of its declared types
-    check_submission(problem, submission, path)
-    maker = unpack(problem, submission, path, trust=True)
-    results = run_protocol(problem, maker, own, workers, progress)
+    results = run_submission(problem, submission, path, True, workers, progress)
     return msgspec.structs.replace(submission, results=results)
 
 
-def check_submission(problem: Problem, submission: Submission, path: Path) -> None:
-    """Check what a submission says against what this package knows, and run nothing.
+def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
+    """Check what a submission says against what this package knows, run nothing, and return its protocol.
 
     Raises:
-        ValueError: for another interface or an altered protocol.
+        ValueError: for a protocol that is not this package's.
     """
-    if submission.interface != problem.task.interface:
+    protocol, digest = protocol_of(problem, submission.protocol)
+    if submission.protocol_sha256 != digest:
         raise ValueError(
-            f"{path} was made for interface {submission.interface} of {problem.id}, which now has "
-            f"{problem.task.interface}: submit it again"
+            f"{path}: its protocol {protocol.name!r} is not that of this package, whose SHA-256 is {digest}"
         )
-    known = protocol_of(problem, submission.protocol.name)
-    if submission.protocol != known:
-        raise ValueError(f"{path}: its protocol {known.name!r} is not that of this package: {known}")
+    return protocol
 
 
-def run_protocol(
+def run_submission(
     problem: Problem,
-    maker: Any,
-    protocol: Protocol,
+    submission: Submission,
+    path: Path,
+    trust: bool,
     workers: Workers,
     progress: Progress | None = None,
 ) -> tuple[Figure, ...]:
-    """Run a competitor and the paper's algorithm over the episodes of a protocol, and time it in the first scenario.
+    """Run the competitor of a submission over its protocol, and return the results.
 
     Args:
-        problem: whose scenarios these are.
-        maker: of the competitor.
-        protocol: which episodes.
+        problem: that it is of.
+        submission: from a file.
+        path: of the file, for errors.
+        trust: run source.
         workers: who shares the work.
         progress: told of measurements done.
+
+    Raises:
+        ValueError: as :func:`check_submission` and :func:`unpack`.
     """
-    known = problem.baselines
-    makers = {OWN: maker} | (
-        {known.score_paper: problem.competitor(known.score_paper)} if known.score_paper else {}
-    )
-    requests = []
-    for scenario in protocol.scenarios:
-        timed = scenario == protocol.scenarios[0]
-        experiment = problem.experiment(
-            scenario, protocol.episodes, protocol.seed, protocol.split, timed=timed
-        )
-        horizon = experiment.make_task().horizon
-        requests += [
-            EvaluationRequest(experiment, name, own, known.metrics, horizon, curves=False)
-            for name, own in makers.items()
-        ]
-    found = dict(summaries(requests, workers, progress))
-    figures: list[Figure] = []
-    for i in range(0, len(requests), len(makers)):
-        records = combine_summaries([found[i + k] for k in range(len(makers))])[0]
-        figures += _figures(records, known.physical)
-    return tuple(figures)
-
-
-def measurements_of(problem: Problem, protocol: Protocol) -> int:
-    """Return how many measurements a run of a protocol has, of both competitors."""
-    tasks = (problem.experiment(scenario).make_task() for scenario in protocol.scenarios)
-    return (1 + bool(problem.baselines.score_paper)) * protocol.episodes * sum(task.horizon for task in tasks)
+    protocol = check_submission(problem, submission, path)
+    entry = Entry(protocol.environments[0], OWN, unpack(problem, submission, path, trust))
+    found = run_protocol(protocol, submission.protocol_sha256, [entry], workers, progress)
+    return tuple(_figures(found.records, problem.baselines.physical))
 
 
 def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator[Figure]:
@@ -503,12 +471,10 @@ def verify(
         progress: told of measurements done.
 
     Raises:
-        ValueError: if it is no submission, not of this package's protocol and interface, or holds source and is not
+        ValueError: if it is no submission, not of this package's protocol, or holds source and is not
             trusted.
     """
     submission, digest = read_submission(path)
     problem = problem_of(submission.environment)
-    check_submission(problem, submission, path)
-    maker = unpack(problem, submission, path, trust)
-    again = run_protocol(problem, maker, submission.protocol, workers or Workers(), progress)
+    again = run_submission(problem, submission, path, trust, workers or Workers(), progress)
     return Verification(submission, digest, deviation(submission.results, again), again)

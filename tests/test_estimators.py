@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.storage.dataset import notes_of
 from models import make_model
 
@@ -338,6 +339,25 @@ def test_a_name_that_is_taken_is_refused(name):
         filtergym.evaluate(ID, {name: Start}, episodes=2, horizon=3)
 
 
+@pytest.mark.parametrize("given", ["name", "class"])
+def test_the_papers_algorithm_is_known_by_another_name(given):
+    def compare(paper, other="imm"):
+        found = filtergym.evaluate(ID, {**paper, "bptt": "bptt", other: "imm"}, episodes=4, horizon=20)
+        records = filtergym.tidy_records(found)
+        return found.attrs["paper"], {
+            r.policy: r.value for r in records if (r.metric, r.window) == ("geometric_cost_difference", "all")
+        }
+
+    makers = {"name": str, "class": problem_of(ID).competitor}
+    stronger = makers[given]("imm-steady-state")
+    name, differences = compare({"paper": stronger}, "other reading")
+    assert (name, differences["paper"]) == ("paper", 0.0)
+    known = compare({"imm-steady-state": "imm-steady-state"})[1]
+    assert differences["bptt"] == known["bptt"]
+    assert differences["other reading"] == known["imm"]
+    assert compare({"another": "kalman-imm"}, "first reading")[0] == "first reading"
+
+
 def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkeypatch):
     """The example of the page, as the page runs it."""
     monkeypatch.delitem(sys.modules, "mine", raising=False)
@@ -348,4 +368,4 @@ def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkey
     assert code == 0, errors
     assert [line for line in output.splitlines() if line.startswith("mine:Mine  ")]
     assert "mine:Mine: " in output  # why, in sentences: it is the first that is named
-    monkeypatch.delitem(sys.modules, "mine")
+    sys.modules.pop("mine")

@@ -148,6 +148,9 @@ def test_readme_gets_its_numbers(tmp_path, make_page, monkeypatch):
     page.write_text("no numbers")
     code, _, errors = make_page("readme", page)
     assert (code, "holds no number of a record" in errors) == (2, True)
+    page.write_text("It is\n<!-- value: ManeuveringTarget/random/bptt/difference --><!-- end -->")
+    code, _, errors = make_page("readme", page)
+    assert (code, "begins a line, which ends a paragraph" in errors) == (2, True)
     path = "ManeuveringTarget/random/imm-tuned/difference"
     page.write_text(f"a <!-- value: {path} -->old<!-- end --> b <!-- number: {path} --><!-- end -->\nc")
     code, _, errors = make_page("readme", page, "--picture", "front.svg")

@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 import zipfile
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from filtergym.evaluation.competitors import isolated_estimator
 from filtergym.evaluation.running.parallel import Workers
 
 from filtergym import submission as submissions
+from filtergym.protocol import read_protocol
 from filtergym.submission import (
     MOST_BYTES,
     TIME,
@@ -25,6 +27,7 @@ from filtergym.submission import (
     Card,
     deviation,
     make_submission,
+    protocol_of,
     read_submission,
     verify,
     write_submission,
@@ -32,6 +35,7 @@ from filtergym.submission import (
 
 WALL = isolated_estimator.landlock_version() > 0
 ID = "filtergym/ManeuveringTarget-v0"
+FIVE = [own.id for own in read_protocol("filtergym-1")[0].environments]
 AGENTS = PRETRAINED / "ManeuveringTarget-v0"
 ROOT = Path(__file__).parent.parent
 MINE = (ROOT / "docs" / "examples" / "mine.py").read_text(encoding="utf-8")
@@ -103,7 +107,7 @@ def test_what_runs_is_the_text_wherever_it_runs(honest):
 def test_results_are_those_of_an_evaluation(honest):
     from filtergym import evaluate, tidy_records
 
-    data = evaluate(ID, ["bptt-small", "imm"], episodes=32)
+    data = evaluate(ID, ["bptt-small", "imm-steady-state"], episodes=32)
     known = {
         (r.metric, r.component): (r.value, r.low, r.high)
         for r in tidy_records(data)
@@ -129,7 +133,7 @@ def found(honest):
 @pytest.fixture
 def run_once(found, monkeypatch):
     """Take those, for tests that edit nothing but what the file says of them."""
-    monkeypatch.setattr(submissions, "run_protocol", lambda *arguments: found)
+    monkeypatch.setattr(submissions, "run_submission", lambda *arguments: found)
 
 
 def lower(figure):
@@ -269,17 +273,25 @@ def test_training_on_what_is_tested_is_refused(scenario, sentence, edited, comma
 @pytest.mark.parametrize(
     "change",
     [
-        {"episodes": 16}, {"seed": 7}, {"version": 2}, {"scenarios": []}, {"scenarios": ["random", "random"]},
-        {"split": "train"}, {"split": "validation"}, {"name": "full"}, {"name": "own"}, {"backend": "numpy"},
+        {"protocol_sha256": 64 * "0"}, {"protocol_sha256": ""}, {"protocol": "own"}, {"protocol": "own.toml"},
+        {"protocol": {"name": "trial", "episodes": 16}}, {"protocol_seed": 1},
     ],
 )  # fmt: skip
 def test_an_altered_protocol_is_refused(change, edited, command):
-    assert "protocol" in refused(command, edited("agent", lambda content: content["protocol"].update(change)))
+    Path("own.toml").write_text(files("filtergym").joinpath("protocols/filtergym-1.toml").read_text("utf-8"))
+    assert "protocol" in refused(command, edited("agent", lambda content: content.update(change)))
 
 
-def test_another_interface_is_refused(edited, command):
-    text = refused(command, edited("agent", lambda content: content.update(interface=1)))
-    assert "was made for interface 1" in text
+@pytest.mark.parametrize("id", FIVE)
+def test_a_protocol_is_that_of_filtergym_1(id):
+    whole, digest = read_protocol("filtergym-1")
+    [known] = [own for own in whole.environments if own.id == id]
+    own, said = protocol_of(problem_of(id), "filtergym-1")
+    assert (own.environments, said) == ((known,), digest)
+    assert (own.episodes, own.held_out_episodes, own.seed, own.split) == (2000, 500, 0, "test")
+    trial, said = protocol_of(problem_of(id), "trial")
+    assert (trial.environments[0].training, trial.environments[0].held_out) == (known.training, ())
+    assert (trial.episodes, trial.seed, trial.split, said) == (32, 0, "test", digest)
 
 
 # --- code
@@ -322,8 +334,8 @@ def test_source_runs_only_when_it_is_trusted(trap, edited, command):
         lambda c: c.update(competitor={"type": "shipped", "name": "run"}),
         lambda c: c.update(competitor={"type": "source", "text": MINE, "name": "import_trap:Mine"}),
         lambda c: c.update(competitor={"type": "module", "name": "import_trap"}),
-        lambda c: c["protocol"].update(name="import_trap:Mine"),
-        lambda c: c["protocol"].update(scenarios=["import_trap.py"]),
+        lambda c: c.update(protocol="import_trap:Mine"),
+        lambda c: c.update(protocol="import_trap.toml"),
     ],
 )
 def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, command):

@@ -2,7 +2,8 @@
 
 A number stands between comments that no reader sees, ``<!-- value: PATH -->-43.6 %<!-- end -->``, with ``number`` in
 place of ``value`` where its interval is shown too. Paths are those of :mod:`sentence_numbers`. What the command before
-``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``.
+``<!-- printed: begin -->`` prints stands between that and ``<!-- printed: end -->``. A comment that begins a line ends
+a paragraph, so a number stands behind a word.
 """
 
 import os
@@ -22,11 +23,17 @@ def with_numbers(page: Path) -> str:
     """Return the text of a page with every number as its record has it.
 
     Raises:
-        ValueError: if there is no such page, it holds no number of a record, or a path leads nowhere.
+        ValueError: if there is no such page, it holds no number of a record, a number begins a line, or a path leads
+            nowhere.
     """
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     if not NUMBER.search(text):
         raise ValueError(f"{page} holds no number of a record, such as <!-- value: PATH --><!-- end -->")
+    for found in NUMBER.finditer(text):
+        if text[: found.start()].endswith("\n"):
+            raise ValueError(
+                f"in {page} {found[1]} begins a line, which ends a paragraph: put a word before it"
+            )
     return NUMBER.sub(lambda m: m[1] + number_text(m[3], interval=m[2] == "number") + m[4], text)
 
 

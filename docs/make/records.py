@@ -73,7 +73,7 @@ class BenchmarkRecords(NamedTuple):
     @property
     def paper(self) -> str:
         """Name of the paper's algorithm that costs are compared with."""
-        return self.problem.paper_among({record.policy for record in self.records})
+        return self.problem.paper_among(dict.fromkeys(record.policy for record in self.records))
 
 
 def environment_id(name: str) -> str:

@@ -53,13 +53,15 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
     """Make a competitor for a problem.
 
     Args:
-        maker: a class or function that takes the problem, or nothing; or the competitor itself.
+        maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first argument
+            has a default is given nothing, unless it is called ``task`` or ``model``.
         problem: of a policy the model that it acts in, of anything else the task.
     """
     if not callable(maker):
         return maker
     try:
-        takes_problem = bool(inspect.signature(maker).parameters)
+        first = next(iter(inspect.signature(maker).parameters.values()), None)
+        takes_problem = first is not None and (first.default is first.empty or first.name in ("task", "model"))
     except ValueError:  # of a class that is compiled
         takes_problem = True
     return maker(problem) if takes_problem else maker()

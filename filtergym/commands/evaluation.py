@@ -305,8 +305,9 @@ def run(
             bar.update(line, advance=done)
 
         if task.flights or outputs.estimates is not None or whole:
-            named = replace(experiment, paper=problem.paper_among(names))
-            dataset = run_experiment(named, competitors_of(problem, names, trust), tick, workers)
+            makers = competitors_of(problem, names, trust)
+            named = replace(experiment, paper=problem.paper_among(makers))
+            dataset = run_experiment(named, makers, tick, workers)
             records = tidy_records(dataset)
             if outputs.estimates is None:
                 tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]

@@ -10,16 +10,18 @@ from .. import __version__
 from ..baselines.problem import problem_of
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, write_text
+from ..protocol import Entry, measurements_of
 from ..reports.tables.terminal_tables import HEADLINE
 from ..submission import (
-    PROTOCOLS,
+    FROZEN,
+    OWN,
     TIME,
     TOLERANCE,
+    TRIAL,
     Card,
     Figure,
     Source,
     make_submission,
-    measurements_of,
     protocol_of,
     read_submission,
     verify,
@@ -31,7 +33,6 @@ from .terminal import (
     Trust,
     complete_policy,
     console,
-    import_environments,
     one_of,
     progress_bar,
 )
@@ -51,11 +52,11 @@ def submit(
     protocol: Annotated[
         str,
         typer.Option(
-            help="full: 500 episodes of every scenario, 100 in TightlyCoupledNavigation; trial: 32 of the training "
-            "distribution.",
-            autocompletion=one_of(*PROTOCOLS),
+            help="filtergym-1: its 2,000 episodes of the training distribution and 500 of every other scenario; trial: "
+            "32 of the training distribution.",
+            autocompletion=one_of(FROZEN, TRIAL),
         ),
-    ] = "full",
+    ] = FROZEN,
     title: Annotated[str | None, typer.Option(help="Of the competitor; default: the name.")] = None,
     author: Annotated[str, typer.Option(help="Who hands it in.")] = "-",
     jobs: Jobs = 1,
@@ -68,9 +69,11 @@ def submit(
     """
     problem = problem_of(environment)
     writable_file(out)
+    episodes, _ = protocol_of(problem, protocol)
+    total = measurements_of(episodes, [Entry(episodes.environments[0], OWN, None)])
     card = Card(title or Path(name).stem.rpartition(":")[2], author)
     with Workers(jobs) as workers, progress_bar() as bar:
-        line = bar.add_task("evaluating", total=measurements_of(problem, protocol_of(problem, protocol)))
+        line = bar.add_task("evaluating", total=total)
         made = make_submission(
             problem, name, protocol, card, workers, lambda done: bar.update(line, advance=done)
         )
@@ -84,10 +87,6 @@ def verify_file(
     source: Annotated[
         Path | None,
         typer.Option(help="Write the source code of the submission, to read it, and run nothing."),
-    ] = None,
-    environment: Annotated[
-        str | None,
-        typer.Option(help="module:id of an environment of your own.", callback=import_environments),
     ] = None,
     trust: Trust = False,
     jobs: Jobs = 1,
