@@ -2,12 +2,14 @@
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors.kinds import make_competitor
 from filtergym.evaluation.storage.dataset import notes_of
 from models import make_model
 
@@ -337,6 +339,25 @@ def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch
 def test_a_name_that_is_taken_is_refused(name):
     with pytest.raises(ValueError, match=f"'{name}' is the name of what {ID} has already"):
         filtergym.evaluate(ID, {name: Start}, episodes=2, horizon=3)
+
+
+def test_a_constructor_gets_the_task_where_it_needs_one():
+    class Setting(Start):
+        def __init__(self, gain=0.5):
+            self.gain = gain
+
+    class Told(Start):
+        def __init__(self, task=None):
+            self.task = task
+
+    class Needing(Start):
+        def __init__(self, problem, gain=0.5):
+            self.task, self.gain = problem, gain
+
+    assert make_competitor(Setting, "task").gain == 0.5
+    assert make_competitor(partial(Setting, gain=0.7), "task").gain == 0.7
+    assert make_competitor(Told, "task").task == "task"
+    assert make_competitor(partial(Needing, gain=0.7), "task").__dict__ == {"task": "task", "gain": 0.7}
 
 
 @pytest.mark.parametrize("given", ["name", "class"])

@@ -76,10 +76,9 @@ class Track {
     const seen = Number.isFinite(plot.x) && Number.isFinite(plot.y);
     const step = { ...plot, seen, estimates: {} };
     if (this.scan > 0) {
-      const position = seen ? [plot.x, plot.y] : [0, 0];
       const variance = [plot.sigma_x ** 2, plot.sigma_y ** 2];
       const clocks = [plot.time - this.time, plot.time - this.last.time];
-      const row = [this.scan, ...position, ...variance, seen ? 1 : 0, ...clocks];
+      const row = [this.scan, ...(seen ? [plot.x, plot.y] : [0, 0]), ...variance, seen ? 1 : 0, ...clocks];
       for (const filter of this.filters) step.estimates[filter.name] = filter.update(row);
       this.scan += 1;
     } else if (seen && this.last) {
@@ -97,8 +96,7 @@ class Track {
 const normal = () => Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
 
 /* What the radar says of a target at a time. */
-function measure(target, time, settings) {
-  const { noise, missed, glint } = settings;
+function measure(target, time, { noise, missed, glint }) {
   const factor = Math.random() < missed / 100 ? NaN : Math.random() < glint / 100 ? GLINT_FACTOR : 1;
   const [x, y] = [target.x, target.y].map((truth) => truth + factor * noise * normal());
   return { time, x, y, sigma_x: noise, sigma_y: noise, truth_x: target.x, truth_y: target.y };
@@ -146,8 +144,7 @@ class Target {
       const nearer = off - 360 * Math.round(off / 360);
       if (Math.abs(nearer) > 30) [this.turn, this.left] = [Math.sign(nearer) * 4, 15];
     } else if (this.left <= 0) {
-      const straight = this.turn !== 0;
-      [this.turn, this.left] = straight ? [0, 40 + 60 * Math.random()] : [Math.random() < 0.5 ? 3 : -3, 30];
+      [this.turn, this.left] = this.turn ? [0, 40 + 60 * Math.random()] : [Math.random() < 0.5 ? 3 : -3, 30];
     }
   }
 }
@@ -193,8 +190,7 @@ class View {
     return (this.colours[name] ??= getComputedStyle(this.canvas).getPropertyValue(`--${name}`).trim());
   }
 
-  /* points: [x, y] or null for a gap. */
-  /* In pieces: the time that a long line takes grows faster than its length. */
+  /* points: [x, y] or null for a gap. In pieces: the time that a long line takes grows faster than its length. */
   line(points, colour, { width = 1.5, alpha = 1 } = {}) {
     const { context } = this;
     Object.assign(context, { strokeStyle: colour, lineWidth: width, globalAlpha: alpha });
@@ -253,11 +249,6 @@ function drawMap(view, steps, filters, region) {
   const length = 10 ** Math.floor(Math.log10(region.width / 4));
   view.line([[12, size[1] - 12], [12 + scale * length, size[1] - 12]], view.colour("text"), { width: 2 });
   view.text(length >= 1000 ? `${length / 1000} km` : `${length} m`, 12, size[1] - 18);
-}
-
-function drawTarget(view, target, region) {
-  const { toPixel } = scaleOf(view.begin(), region);
-  view.line(Array(2).fill(toPixel(target.x, target.y)), view.colour("text"), { width: 9 });
 }
 
 /* Distance to the truth, m; where that is not known, the innovation in sigma of a coordinate. */
@@ -322,8 +313,7 @@ function element(tag, properties = {}, ...children) {
 
 class Playground {
   constructor(root, filters) {
-    const paused = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    Object.assign(this, { root, filters, paused });
+    Object.assign(this, { root, filters, paused: matchMedia("(prefers-reduced-motion: reduce)").matches });
     this.settings = Object.fromEntries(Object.entries(SETTINGS).map(([name, { value }]) => [name, value]));
     this.build();
     this.views = [this.layer, this.map, this.errors, ...this.weights].map((canvas) => new View(canvas));
@@ -383,14 +373,12 @@ class Playground {
 
   listen() {
     const { map, root } = this;
-    const follow = (event) => {
+    map.onpointermove = map.onpointerdown = (event) => {
       const box = map.getBoundingClientRect();
       const [x, y] = [(event.clientX - box.left) / box.width, (box.bottom - event.clientY) / box.height];
       this.target.pointer = { x: x * WIDTH, y: y * this.target.height };
     };
-    const leave = () => (this.target.pointer = null);
-    for (const name of ["pointermove", "pointerdown"]) map.addEventListener(name, follow);
-    for (const name of ["pointerleave", "pointercancel"]) map.addEventListener(name, leave);
+    map.onpointerleave = map.onpointercancel = () => (this.target.pointer = null);
     map.addEventListener("keydown", (event) => {
       if (event.key === " ") this.togglePause();
       else if (event.key.startsWith("Arrow")) this.target.keys.add(event.key);
@@ -457,16 +445,17 @@ class Playground {
   frame(before, now) {
     requestAnimationFrame((later) => this.frame(now, later));
     if (!this.visible) return;
-    if (this.text === null && !this.paused) this.advance(Math.min((now - before) / 1000, 0.1) * HASTE);
+    const live = this.text === null;
+    if (live && !this.paused) this.advance(Math.min((now - before) / 1000, 0.1) * HASTE);
     if (this.stale) this.parts.forEach((part) => this.waiting.add(part));
     this.stale = false;
     const [part] = this.waiting;
     this.waiting.delete(part);
-    const live = this.text === null;
     const steps = live ? this.track.steps : this.track.steps.slice(0, this.end.value).slice(-IN_VIEW);
     part?.(steps, this.filters.filter((filter) => filter.shown), steps.some((step) => Number.isFinite(step.truth_x)));
-    if (live) drawTarget(this.above, this.target, this.region(steps));
-    else this.above.begin();
+    const { toPixel } = scaleOf(this.above.begin(), this.region(steps));
+    const target = Array(2).fill(toPixel(this.target.x, this.target.y));
+    if (live) this.above.line(target, this.above.colour("text"), { width: 9 });
   }
 
   /* Let the target move; whenever a scan is due, the filters get what it says. */
@@ -493,12 +482,11 @@ class Playground {
   }
 
   tabulate(steps, known) {
-    const unit = known ? " m" : " sigma";
     [this.heads[1].textContent, this.heads[2].textContent] = known ? ["error", "RMSE"] : ["innovation", "RMS"];
     this.filters.forEach((filter, i) => {
       const errors = steps.map((step) => errorOf(step, filter.name, known)).filter(Number.isFinite);
       const rmse = Math.sqrt(errors.reduce((sum, error) => sum + error ** 2, 0) / errors.length);
-      const number = (value) => (Number.isFinite(value) ? value.toFixed(known ? 0 : 2) + unit : "");
+      const number = (e) => (!Number.isFinite(e) ? "" : known ? `${e.toFixed(0)} m` : `${e.toFixed(2)} sigma`);
       const beyond = steps.map((step) => isOutside(step, filter.name)).filter((is) => is !== null);
       const share = beyond.length ? `${((100 * beyond.filter(Boolean).length) / beyond.length).toFixed(0)} %` : "";
       [number(errors.at(-1)), number(rmse), share].forEach((words, j) => (this.cells[i][j].textContent = words));

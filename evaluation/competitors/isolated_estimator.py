@@ -143,17 +143,22 @@ def load(request: dict[str, Any]) -> Any:
     return found
 
 
-def make(found: Any, task: Any) -> Any:
-    """Make an estimator of its class, for the task if the constructor takes an argument."""
+def takes_problem(maker: Any) -> bool:
+    """Whether a class or function is given the problem: its first argument has no default, or is called so."""
     import inspect
 
+    try:
+        first = next(iter(inspect.signature(maker).parameters.values()), None)
+    except ValueError:  # of a class that is compiled
+        return True
+    return first is not None and (first.default is first.empty or first.name in ("task", "model"))
+
+
+def make(found: Any, task: Any) -> Any:
+    """Make an estimator of its class, for the task if the constructor takes it."""
     if not isinstance(found, type):
         return found
-    try:
-        takes_task = bool(inspect.signature(found).parameters)
-    except ValueError:
-        takes_task = True
-    return found(task) if takes_task else found()
+    return found(task) if takes_problem(found) else found()
 
 
 def main() -> None:

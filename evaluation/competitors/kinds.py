@@ -10,7 +10,6 @@ Stable-Baselines3.
 """
 
 import functools
-import inspect
 import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Protocol, get_args
@@ -21,6 +20,7 @@ from ...envs.contract.filter import Filter
 from ...envs.contract.model import Model
 from ...envs.contract.task import Array, Task
 from ...filters.array_namespace import host_array
+from .isolated_estimator import takes_problem
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
@@ -53,18 +53,13 @@ def make_competitor(maker: Any, problem: Task | Model) -> Any:
     """Make a competitor for a problem.
 
     Args:
-        maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first argument
-            has a default is given nothing, unless it is called ``task`` or ``model``.
+        maker: a class or function that takes the problem, or nothing; or the competitor itself. One whose first
+            argument has a default is given nothing, unless it is called ``task`` or ``model``.
         problem: of a policy the model that it acts in, of anything else the task.
     """
     if not callable(maker):
         return maker
-    try:
-        first = next(iter(inspect.signature(maker).parameters.values()), None)
-        takes_problem = first is not None and (first.default is first.empty or first.name in ("task", "model"))
-    except ValueError:  # of a class that is compiled
-        takes_problem = True
-    return maker(problem) if takes_problem else maker()
+    return maker(problem) if takes_problem(maker) else maker()
 
 
 def answers_by_track(competitor: Any) -> bool:
