@@ -371,7 +371,7 @@ def _time_compiled(
 
     with optimised_code():
         run(1)  # compiles
-    # And a first decision. Where the clock has not moved meanwhile, as on systems that count ticks, it took a tick at most.
+    # And a first decision. Where a clock that counts ticks has not moved meanwhile, it took one at most.
     setting_up = max(min(run(1) for _ in range(FEWEST_RUNS)), time.get_clock_info("process_time").resolution)
     # No step branches, so that every decision takes as long: a dear one need not be repeated to the end.
     count = min(decisions, 1 + math.ceil(RUN_SECONDS / setting_up))
