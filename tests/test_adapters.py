@@ -168,6 +168,7 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
 def test_every_example_is_tried():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {
         *LIBRARIES,
+        "budgeted_sensing",
         "filterpy_file",
         "mine",
         "inverted_pendulum",
