@@ -47,7 +47,7 @@ NAMED = re.compile(r"\{record\}`|docs/records/")
 """How a section says where its numbers are from; README, which nobody renders, by a link."""
 COMMAND = re.compile(r"`(filtergym|python) [^`]+`")
 """How a section of an appendix says so too: its measurements were made once, and stand in no record."""
-MOST_BYTES = 300_000
+MOST_BYTES = 400_000
 
 
 def unnamed_numbers(text: str, appendix: bool = False) -> list[str]:
