@@ -73,10 +73,10 @@ class Problem:
                 whatever it is called there.
         """
         known = self.baselines
-        readings = [name for name in (known.stronger_paper, known.score_paper) if name]
-        for reading in readings:
+        for reading in filter(None, (known.stronger_paper, known.score_paper)):
+            paper = self.competitor(reading)
             for name, maker in competitors.items():
-                if name == reading or maker is self.competitor(reading):
+                if name == reading or maker is paper:
                     return name
         return known.score_paper
 

@@ -190,9 +190,8 @@ class ProgramEstimator:
         self.tracks: int | None = None
         self.fault, self.step_number = 0, 0
         self.feedback: numpy.ndarray | None = None
-        self._steers: tuple[int, ...] | None = None
-        """Shape of the feedback of a track; None where none is offered."""
-        self._reports_feedback = False
+        self._steering: Field | None = None
+        """Feedback of a track: offered in the hello, and reported from then on; None where it is not."""
         self._process: ProgramProcess | None = None
         self._format = ""
         self._initial: numpy.ndarray | None = None
@@ -208,9 +207,10 @@ class ProgramEstimator:
         self.fault, self.step_number = 0, 0
         self.count = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
-        self.feedback, self._reports_feedback, self._steers = None, False, None
+        self.feedback, self._steering = None, None
         if self.task.closes_loop and self.task.feedback_words:
-            self._steers = self.task.feedback(initial.mean, initial.covariance, initial).shape[:-1]
+            shape = self.task.feedback(initial.mean, initial.covariance, initial).shape[:-1]
+            self._steering = Field("feedback", shape, "float64", self.task.feedback_words)
         try:
             own = self.program.environment
             self._process = ProgramProcess(
@@ -246,12 +246,11 @@ class ProgramEstimator:
                 )
                 self.end()
         if answer is None:
-            answer = numpy.full((self.count, C + C * C + self._feedback_size), numpy.nan)
+            answer = numpy.full((self.count, self._answer_size), numpy.nan)
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         answer = answer[lanes].T
-        if self._reports_feedback:
-            assert self._steers is not None
-            self.feedback = answer[C + C * C :].reshape(*self._steers, width)
+        if self._steering is not None:
+            self.feedback = answer[C + C * C :].reshape(*(self._steering.shape or ()), width)
         return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
@@ -269,9 +268,9 @@ class ProgramEstimator:
         C, measured = len(self.task.components), list(fields_of(measurement))
         numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
         offered = {}
-        if self._steers is not None:
-            own = Field("feedback", self._steers, "float64", self.task.feedback_words)
-            numbers["feedback"], offered = _count([own]), {"feedback": [own._asdict()]}
+        if self._steering is not None:
+            offered = {"feedback": [self._steering._asdict()]}
+            numbers["feedback"] = _count([self._steering])
         return {
             "filtergym": VERSION,
             "tracks": self.count,
@@ -286,13 +285,10 @@ class ProgramEstimator:
         }
 
     @property
-    def _feedback_size(self) -> int:
-        """Numbers of the feedback of a track that it reports."""
-        return (
-            int(numpy.prod(self._steers, dtype=int))
-            if self._reports_feedback and self._steers is not None
-            else 0
-        )
+    def _answer_size(self) -> int:
+        """Numbers of a track that an answer has."""
+        C = len(self.task.components)
+        return C + C * C + (0 if self._steering is None else _count([self._steering]))
 
     def _greet(self, measurement: Any) -> None:
         """Say hello, and hand over the initial estimate."""
@@ -311,7 +307,8 @@ class ProgramEstimator:
         if isinstance(answer.get("warning"), str):
             warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
         self._format = answer["format"]
-        self._reports_feedback = answer.get("feedback") is True and self._steers is not None
+        if answer.get("feedback") is not True:
+            self._steering = None
         self._process.tell(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
 
@@ -332,7 +329,7 @@ class ProgramEstimator:
         """Answer to a measurement, ``(tracks, C + C * C)``."""
         assert self._process is not None
         question = self._message("measurement", self._fields, rows)
-        size = self.count * (C + C * C + self._feedback_size)
+        size = self.count * self._answer_size
         if self._format == "float64":
             answer = self._process.exchange(question, 8 * size)
             return numpy.frombuffer(answer, dtype="<f8").reshape(self.count, -1)
@@ -341,8 +338,8 @@ class ProgramEstimator:
         )
         found = []
         asked = [("mean", (self.count, C)), ("covariance", (self.count, C, C))]
-        if self._reports_feedback:
-            asked.append(("feedback", (self.count, *(self._steers or ()))))
+        if self._steering is not None:
+            asked.append(("feedback", (self.count, *(self._steering.shape or ()))))
         for name, shape in asked:
             try:
                 values = numpy.array(answered.get(name), dtype=float)  # None is NaN
