@@ -262,12 +262,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
         position: of its plots, m, ``(n, 2)``.
         time: s, likewise.
     """
-    if (
-        not columns.has("x")
-        or columns.origin is not None
-        or columns.has("sigma_x")
-        or columns.has("range_sigma")
-    ):
+    if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
     if "range_sigma" in columns.given:
         return float(columns.given["range_sigma"])
@@ -281,8 +276,6 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
         if columns.has(*pair):
             medians = {name: float(f"{numpy.nanmedian(columns[name][there]):.6g}") for name in pair}
             return medians, f"columns {pair[0]} and {pair[1]}"
-    if columns.origin is not None:
-        assumed = float(columns.given["range_sigma"])
     if assumed:
         named = "range_sigma" in columns.given
         who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
@@ -305,15 +298,6 @@ def _variances(
         return variance
     if assumed:
         variance[there] = assumed**2
-        return variance
-    if columns.origin is not None:
-        # No radar stands at the first position, by whose distance errors could be told.
-        if "range_sigma" not in columns.given:
-            raise ValueError(
-                "nothing says how large the errors of latitude and longitude are: add the columns sigma_x and sigma_y "
-                "(m, east and north; of NMEA the sentences GST), or name one deviation of both, --set range_sigma=3"
-            )
-        variance[there] = float(columns.given["range_sigma"]) ** 2
         return variance
     if columns.has("range_sigma", "azimuth_sigma"):
         sigmas = columns.only(there).sigmas("range_sigma", "azimuth_sigma").T
