@@ -215,6 +215,11 @@ def test_places_without_deviations_scatter_as_x_and_y_do(tmp_path):
     assert sigma == pytest.approx(expected, rel=0.02)  # a plane that touches elsewhere, and three digits
     assert places.deviations_from == plane.deviations_from
     assert (places.measurements["variance"] == sigma**2).all()
+    for recording in (places, plane):  # whoever evaluates filters on it reads what was assumed
+        assert (
+            f"assumed as positions scatter about their neighbours: sigma_x {recording.deviations['sigma_x']:.3g} m"
+            in str(recording.notes)
+        )
 
 
 def test_truth_that_one_file_lacks_judges_nobody(tmp_path):

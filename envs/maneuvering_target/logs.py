@@ -107,7 +107,11 @@ def read_log(columns: Columns) -> TrackLog:
         parameters,
         float(columns.time[first]),
         time,
-        (*_stale_notes(stale), *_gap_notes(rows)),
+        (
+            *_assumption_notes(columns, said_deviations, deviations_from),
+            *_stale_notes(stale),
+            *_gap_notes(rows),
+        ),
         {"range_sigma": said_deviations["sigma_x"]} if assumed else _typical_sigma(columns, there),
         said_deviations,
         deviations_from,
@@ -286,6 +290,15 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
         for column, name in names.items()
     }
     return values, "no column states deviations, assumed as of the environment's radar"
+
+
+def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
+    """Say which deviations are assumed where neither a column nor the user states one."""
+    if "no column" not in source or "range_sigma" in columns.given:
+        return []
+    units = {"azimuth_sigma": "degrees"}
+    listed = ", ".join(f"{name} {value:.3g} {units.get(name, 'm')}" for name, value in deviations.items())
+    return [f"{source}: {listed}"]
 
 
 def _variances(
