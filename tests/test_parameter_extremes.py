@@ -193,6 +193,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("TightlyCoupledNavigation", {"gravity": 1e6, "initial_attitude_sigma": 180.0}),
         ("TightlyCoupledNavigation", {"reset_acceleration_sigma": 1e6}),
         ("TightlyCoupledNavigation", {"increment_sigma": 1e6, "initial_velocity_sigma": 1e6}),
+        ("TightlyCoupledNavigation", {"frequency_walk_density": 1e6, "rate_sigma": 1e-6}),
     ],
 )
 def test_what_no_filter_can_answer_is_refused(environment, parameters):
