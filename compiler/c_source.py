@@ -27,6 +27,9 @@ from .rolling import roll_where_shorter
 
 PART = 200
 """Statements of a function."""
+INLINED = 8_000
+"""Operations of a program above which the compiler of CUDA keeps its functions apart: put into one, 23,000 operations
+take it more than three minutes in place of half of one, and 9,500 run a quarter slower; 2,700 run twice as fast."""
 
 
 class Source(NamedTuple):
@@ -172,7 +175,9 @@ def write_program(
     lines = blocks
     if not together:
         listed = [*parameters, Parameter(f"{scalar.name} *", "w")]
-        defined += [_function(f"{name}_part_{i}", listed, block, qualifier) for i, block in enumerate(blocks)]
+        apart = "__device__" in qualifier and count_operations > INLINED
+        own = f"{qualifier}__noinline__ " if apart else qualifier
+        defined += [_function(f"{name}_part_{i}", listed, block, own) for i, block in enumerate(blocks)]
         names = ", ".join(parameter.name for parameter in listed)
         lines = [[f"{name}_part_{i}({names});"] for i in range(len(blocks))]
     body = [line for block in lines[:before] for line in block]
