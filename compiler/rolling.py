@@ -99,8 +99,8 @@ class _Roller:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
         self.drafts: list[_Draft] = []
-        self.group, self.order = numpy.array(program.origins, dtype=numpy.int64).reshape(-1, 2).T
-        self.logical = numpy.array([logical for _, _, logical in self.steps], dtype=bool)
+        self.group, self.order = program.origins.T
+        self.logical = self.steps.logical
         # Where a free step's number is found, and at which place there; what others are made of, -1 where of less.
         self.source, self.place = numpy.full((2, len(self.steps)), COMPUTED)
         self.parts = numpy.full((len(self.steps), 3), -1)
@@ -119,24 +119,21 @@ class _Roller:
         self._copy_what_is_mixed()
 
     def _read_steps(self) -> None:
-        """Put steps into arrays, operation by operation."""
-        operations = [operation for operation, _, _ in self.steps]
-        arguments = [given for _, given, _ in self.steps]
-        self.names = sorted(set(operations))
-        numbers = {name: number for number, name in enumerate(self.names)}
-        self.kinds = numpy.array([numbers[name] for name in operations], dtype=numpy.int64)
-        self.tables = numpy.zeros(len(self.steps), dtype=numpy.int64)
-        for name, number in numbers.items():
-            there = numpy.flatnonzero(self.kinds == number)
-            given = numpy.array([arguments[index] for index in there.tolist()], dtype=numpy.int64)
+        """Put what steps are made of into arrays, operation by operation."""
+        steps = self.steps
+        self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
+        for kind, name in enumerate(steps.names):
+            there = numpy.flatnonzero(steps.kinds == kind)
+            first = steps.begins[there]
             if name == "constant":
-                self.source[there], self.place[there] = CONSTANTS, given[:, 0]
+                self.source[there], self.place[there] = CONSTANTS, steps.arguments[first]
             elif name == "input":
-                self.source[there], self.place[there] = given.T
+                self.source[there], self.place[there] = steps.arguments[first], steps.arguments[first + 1]
             elif name == "take":
-                self.tables[there], self.parts[there, 0] = given[:, 0], given[:, 2]
+                self.tables[there], self.parts[there, 0] = steps.arguments[first], steps.arguments[first + 2]
             else:
-                self.parts[there, : given.shape[1]] = given
+                for i in range(int((steps.begins[there + 1] - first).max(initial=0))):
+                    self.parts[there, i] = steps.arguments[first + i]
 
     def _add(self, draft: _Draft) -> None:
         if len(draft.members):
@@ -152,16 +149,14 @@ class _Roller:
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
             return
-        own_kinds = self.kinds[computed]
-        extremes = [number for number, kind in enumerate(self.names) if kind in ("maximum", "minimum")]
-        extreme = numpy.isin(own_kinds, extremes)
+        extreme = self.steps.which("maximum", "minimum")[computed]
         own = parts[computed]
         known = (self.source[own] == CONSTANTS) & extreme[:, None] & (own >= 0)
         flags = numpy.column_stack([known, self.logical[own] & (own >= 0), self.logical[computed]])
         form = flags @ (1 << numpy.arange(flags.shape[1]))
         keys = numpy.stack(
             [
-                own_kinds,
+                self.steps.kinds[computed],
                 self.tables[computed],
                 form,
                 self._levels()[computed],
@@ -393,9 +388,9 @@ def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
         program: with origins.
         results: as :func:`roll` has it.
     """
-    if any(step.operation == "product" for step in program.steps):
+    if "product" in program.steps.operations:
         return None
-    operations = sum(step.operation not in FREE for step in program.steps)
+    operations = numpy.count_nonzero(~program.steps.which(*FREE))
     rolled = roll(program, results)
     statements = sum(len(loop.body) for loop in rolled.loops)
     return rolled if SHORTER * statements < operations + len(program.results) else None
