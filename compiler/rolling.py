@@ -72,6 +72,17 @@ class Rolled(NamedTuple):
     """Numbers in the scratch array."""
 
 
+class _Read(NamedTuple):
+    """Where a whole operand comes from."""
+
+    source: int | None
+    """The argument, or the constants; None: the scratch array, or the turn."""
+    turn: int | None
+    """The statement whose members it is, one by one."""
+    statements: set[int]
+    """Those whose members it has."""
+
+
 class _Draft:
     """A statement whose places are not known yet: members and operands are steps."""
 
@@ -90,6 +101,7 @@ class _Draft:
         self.group = 0
         self.loop = -1
         self.results: list[Operand] = []
+        self.reads: list[_Read] = []
 
 
 class _Roller:
@@ -117,6 +129,9 @@ class _Roller:
             for argument, nodes in rows.items():
                 self._write(argument, nodes, late)
         self._copy_what_is_mixed()
+        reads = self._find_sources()
+        for draft in self.drafts:
+            draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
         """Put what steps are made of into arrays, operation by operation."""
@@ -215,18 +230,23 @@ class _Roller:
         draft.results.append(Operand(argument, tuple(rows), draft.logical))
         self._add(draft)
 
-    def _source(self, column: numpy.ndarray) -> int | None:
-        """Argument or constants that a whole operand is read from; None: the scratch array."""
-        source = int(self.source[column[0]])
-        if source == COMPUTED or (len(column) > 1 and (self.source[column] != source).any()):
-            return None
-        return source
+    def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
+        """For each operand the argument or the constants that all of it is read from; None: the scratch array."""
+        steps, starts, lengths = _joined(columns)
+        sources = self.source[steps]
+        own = sources[starts]
+        alike = numpy.logical_and.reduceat(sources == numpy.repeat(own, lengths), starts)
+        return [
+            source if same and source != COMPUTED else None
+            for source, same in zip(own.tolist(), alike.tolist(), strict=True)
+        ]
 
     def _copy_what_is_mixed(self) -> None:
         """Inputs and constants that stand beside other values in an operand are copied to the scratch array, once."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
-            mixed = [column[self.statement[column] < 0] for column in columns if self._source(column) is None]
+            pairs = zip(columns, self._sources(columns), strict=True)
+            mixed = [column[self.statement[column] < 0] for column, source in pairs if source is None]
             free = numpy.unique(numpy.concatenate(mixed)) if mixed else numpy.zeros(0, dtype=numpy.int64)
             for source in numpy.unique(self.source[free]):
                 inputs = free[self.source[free] == source]
@@ -237,24 +257,32 @@ class _Roller:
 
     # --- in which order
 
+    def _find_sources(self) -> Iterator[_Read]:
+        """Where all operands of all statements come from."""
+        columns = [column for draft in self.drafts for column in draft.columns]
+        counts = numpy.array([draft.count for draft in self.drafts])
+        steps, starts, lengths = _joined(columns)
+        first = numpy.repeat(steps[starts], lengths)
+        members = numpy.arange(len(steps)) - numpy.repeat(starts, lengths)
+        numbers = self.statement[steps]
+        of_one = numpy.logical_and.reduceat(numbers == self.statement[first], starts)
+        in_order = numpy.logical_and.reduceat(self.member[steps] == members, starts)
+        of_all = of_one & in_order & (counts[numbers[starts]] == lengths)
+        of_one, of_all, number = of_one.tolist(), of_all.tolist(), numbers[starts].tolist()
+        for i, source in enumerate(self._sources(columns)):
+            if source is not None:
+                yield _Read(source, None, set())
+            else:
+                statements = {number[i]} if of_one[i] else set(self.statement[columns[i]].tolist())
+                yield _Read(None, number[i] if of_all[i] else None, statements)
+
     def _needs(self, draft: _Draft) -> dict[int, bool]:
         """Statements that one takes members of, and whether the same turn of a loop will do."""
         needs: dict[int, bool] = {}
-        for column in draft.columns:
-            if self._source(column) is None:
-                turn = self._same_turn(column)
-                for number in self._statements(column):
-                    needs[number] = needs.get(number, True) and number == turn
+        for _, turn, statements in draft.reads:
+            for number in statements:
+                needs[number] = needs.get(number, True) and number == turn
         return needs
-
-    def _statements(self, column: numpy.ndarray) -> set[int]:
-        """Statements whose members these are."""
-        return set(self.statement[column].tolist())
-
-    def _same_turn(self, column: numpy.ndarray) -> int | None:
-        """Statement whose members these are, one by one."""
-        number = int(self.statement[column[0]])
-        return number if numpy.array_equal(column, self.drafts[number].members) else None
 
     def schedule(self) -> list[list[int]]:
         """Put every statement into a loop with others of its count, as early as what it takes allows."""
@@ -305,14 +333,11 @@ class _Roller:
         last: dict[int, int] = {}
         kept: set[int] = set()
         for number, draft in enumerate(drafts):
-            for i, column in enumerate(draft.columns):
-                if self._source(column) is not None:
-                    continue
-                turn = self._same_turn(column)
+            for i, (_, turn, statements) in enumerate(draft.reads):
                 if turn is not None and drafts[turn].loop == draft.loop:
                     turns[number, i] = turn
                     continue
-                for other in self._statements(column):
+                for other in statements:
                     kept.add(other)
                     group = drafts[other].group
                     last[group] = max(last.get(group, 0), draft.loop)
@@ -327,7 +352,7 @@ class _Roller:
             logical = drafts[number].logical if copied else bool(self.logical[column[0]])
             if (number, i) in turns:
                 return Operand(TURN, (turns[number, i],), logical)
-            source = self._source(column)
+            source = drafts[number].reads[i].source
             places = own_places if source is None else self.place
             return Operand(SCRATCH if source is None else source, tuple(places[column].tolist()), logical)
 
@@ -368,6 +393,13 @@ class _Roller:
             busy.append((place, place + sizes[group], last[group]))
         top = max((base[group] + sizes[group] for group in sizes), default=0)
         return {number: base[self.drafts[number].group] + k for number, k in inside.items()}, top
+
+
+def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
+    """Columns one after the other, where each begins, and how long it is."""
+    lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
+    steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
+    return steps, numpy.cumsum(lengths) - lengths, lengths
 
 
 @without_collection()
