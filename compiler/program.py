@@ -211,7 +211,7 @@ class Graph:
         logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
         return self._intern(key, name, arguments, None, logical)
 
-    def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> list[int]:
+    def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
         """Expressions of others, member by member: what :meth:`node` makes of each, in a fraction of the time.
 
         Args:
@@ -219,9 +219,8 @@ class Graph:
             columns: for each argument the expressions of all members, ``(n,)``.
         """
         if len(columns[0]) < FEW:
-            return [
-                self.node(name, *row) for row in zip(*(column.tolist() for column in columns), strict=True)
-            ]
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            return numpy.array([self.node(name, *row) for row in rows], dtype=numpy.int64)
         self._count()
         known = [self._known[column] for column in columns]
         numbers = [numpy.where(self._known[column], self._numbers[column], numpy.nan) for column in columns]
@@ -242,7 +241,7 @@ class Graph:
         made[plain] = self._intern_all(name, [column[plain] for column in columns])
         for k in numpy.flatnonzero(made < 0).tolist():
             made[k] = self.node(name, *(int(column[k]) for column in columns))
-        return made.tolist()
+        return made
 
     def _may_be_simpler(
         self,
@@ -278,23 +277,27 @@ class Graph:
         self._known[first:count] = [value is not None for value in new]
         self._counted = count
 
-    def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> list[int]:
+    def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
         """Expressions of others that have no simpler form."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
-        keys = zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False)
-        found, made, fresh = self._found, [], []
+        keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
-        for place, key in enumerate(keys):
-            node = found.setdefault(key, count)
-            if node == count:
-                count += 1
-                fresh.append(place)
-            made.append(node)
-        arguments = list(zip(*(column[fresh].tolist() for column in columns), strict=True))
+        # As if all were new; where some are not, the new ones are numbered again.
+        made = numpy.array(list(map(self._found.setdefault, keys, itertools.count(count))))
+        fresh = numpy.flatnonzero(made == count + numpy.arange(len(keys)))
+        if len(fresh) < len(keys):
+            self._found.update({keys[place]: count + i for i, place in enumerate(fresh.tolist())})
+            new = made >= count
+            made[new] = count + numpy.searchsorted(fresh, made[new] - count)
+            columns = [column[fresh] for column in columns]
+        arguments = list(zip(*(column.tolist() for column in columns), strict=True))
         self.operations += [name] * len(fresh)
         self.arguments += arguments
         self.values += [None] * len(fresh)
-        self.logical += [name in LOGICAL or (name == "where" and self.logical[each[1]]) for each in arguments]
+        if name == "where":
+            self.logical += [self.logical[one] for _, one, _ in arguments]
+        else:
+            self.logical += [name in LOGICAL] * len(fresh)
         self.groups += [self.group] * len(fresh)
         return made
 
@@ -339,9 +342,9 @@ class Graph:
         """What the wanted expressions are made of, each after its own parts and as late as that allows: a sum of
         products is finished before the next begins, and its terms need not be kept.
         """
-        seen: set[int] = set()
+        seen = bytearray(len(self.operations))
         order: list[int] = []
-        operations, arguments, add, finish = self.operations, self.arguments, seen.add, order.append
+        operations, arguments, finish = self.operations, self.arguments, order.append
         for root in wanted:
             waiting = [root]
             pop, wait, wait_all = waiting.pop, waiting.append, waiting.extend
@@ -349,8 +352,8 @@ class Graph:
                 node = pop()
                 if node < 0:  # its parts are there
                     finish(~node)
-                elif node not in seen:
-                    add(node)
+                elif not seen[node]:
+                    seen[node] = True
                     name = operations[node]
                     if name == "input" or name == "constant":
                         finish(node)
@@ -479,8 +482,10 @@ class Program(NamedTuple):
 def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
-    operations = [graph.operations[node] for node in order]
-    given = [graph.arguments[node] for node in order]
+    operations, given, logical, groups = (
+        list(map(column.__getitem__, order))
+        for column in (graph.operations, graph.arguments, graph.logical, graph.groups)
+    )
     names = sorted(set(operations))
     number = {name: kind for kind, name in enumerate(names)}
     kinds = _integers(map(number.__getitem__, operations), len(order))
@@ -507,15 +512,14 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     place = numpy.empty(len(graph.operations), dtype=numpy.int64)
     place[order] = numpy.arange(len(order))
     arguments[of_steps] = place[arguments[of_steps]]
-    logical = numpy.array([graph.logical[node] for node in order], dtype=bool)
 
     values: list[Any] = [graph.values[order[step]] for step in scalars]
     constants = numpy.concatenate(
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
     results = [Result(r.argument, r.row, int(place[r.node])) for r in wanted]
-    origins = numpy.column_stack([_integers((graph.groups[node] for node in order), len(order)), order])
-    return Program(Steps(names, kinds, begins, arguments, logical), constants, results, origins)
+    steps = Steps(names, kinds, begins, arguments, numpy.array(logical, dtype=bool))
+    return Program(steps, constants, results, numpy.column_stack([groups, order]))
 
 
 def _integers(numbers: Iterable[int], count: int) -> numpy.ndarray:

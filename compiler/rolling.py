@@ -119,8 +119,7 @@ class _Roller:
         self._read_steps()
         # Statement of a step, and which member it is there.
         self.statement, self.member = numpy.full((2, len(self.steps)), -1)
-        for members in self._alike():
-            self._compute(members)
+        self._compute(list(self._alike()))
         early = program.results[:results]
         for late, some in ((False, early), (True, program.results[results:])):
             rows: dict[int, dict[int, int]] = {}
@@ -182,11 +181,12 @@ class _Roller:
         order = numpy.lexsort([self.order[computed], *keys])
         sorted_keys = keys[:, order]
         cuts = numpy.flatnonzero((sorted_keys[:, 1:] != sorted_keys[:, :-1]).any(axis=0)) + 1
-        for members in numpy.split(computed[order], cuts):
-            if len(members) < LEAST:
-                yield from numpy.split(members, len(members))
+        steps = computed[order]
+        for start, end in pairwise([0, *cuts.tolist(), len(steps)]):
+            if end - start < LEAST:
+                yield from (steps[place : place + 1] for place in range(start, end))
             else:
-                yield members
+                yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
         """Of what one operation makes in several steps: how many come before."""
@@ -197,14 +197,22 @@ class _Roller:
             levels[index] = levels[self.parts[index][inside[index]]].max() + 1
         return levels
 
-    def _compute(self, members: numpy.ndarray) -> None:
-        first = self.steps[members[0]]
-        columns = list(self.parts[members].T[: len(first.parts)])
-        draft = _Draft(first.operation, members, columns, bool(members[0] >= self.pause), first.logical)
-        if first.operation == "take":
-            draft.table = first.arguments[0], first.arguments[1]
-        draft.group = int(self.group[members[0]])
-        self._add(draft)
+    def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
+        """Statements of steps that are alike."""
+        heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
+        kinds, logical, number = (
+            column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
+        )
+        operands = (self.parts[heads] >= 0).sum(axis=1).tolist()
+        for i, members in enumerate(groups):
+            name = self.steps.names[kinds[i]]
+            columns = [self.parts[members, k] for k in range(operands[i])]
+            draft = _Draft(name, members, columns, bool(heads[i] >= self.pause), logical[i])
+            if name == "take":
+                start, length, _ = self.steps[int(heads[i])].arguments
+                draft.table = start, length
+            draft.group = number[i]
+            self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
         """Statements that write results: those of a whole statement with it, the others together."""
