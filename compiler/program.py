@@ -456,7 +456,9 @@ class Steps(Sequence[Step]):
         if self._made is None:
             numbers, names = self.arguments.tolist(), self.names
             given = [tuple(numbers[begin:end]) for begin, end in itertools.pairwise(self.begins.tolist())]
-            parts = zip([names[kind] for kind in self.kinds.tolist()], given, self.logical.tolist(), strict=True)
+            parts = zip(
+                [names[kind] for kind in self.kinds.tolist()], given, self.logical.tolist(), strict=True
+            )
             # Step itself takes twice as long.
             self._made = list(map(tuple.__new__, itertools.repeat(Step), parts))
         return self._made
