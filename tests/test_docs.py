@@ -142,7 +142,6 @@ def test_every_page_of_results_says_what_makes_it():
         ("comparison.md", "python docs/make record results/results.json"),
         ("training_seeds.md", "--into docs/records"),
         ("compiled.md", "python benchmarks/throughput.py"),
-        ("many_cores.md", "python benchmarks/plan.py"),
     ):
         assert words in (DOCS / name).read_text(encoding="utf-8"), name
     for report in (DOCS / "reproductions").glob("*/report.md"):
@@ -165,7 +164,6 @@ def test_one_command_makes_all_that_is_shipped_and_published():
             "drive.py",
             "public_problems.py",
             "optimised_kalman.py",
-            "attitude.py",
             "clients.py",
             "nclt/",
         )
