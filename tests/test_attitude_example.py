@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.signal
+from contract import assert_equals_its_vector
 from filtergym.baselines import catalogue as baselines
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.backend import make_model
-from gymnasium.utils.env_checker import check_env
 from records import markdown_tables, read_record
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -303,18 +303,7 @@ def test_filters_converge_from_a_wrong_start_at_rest(attitude, rng):
 
 
 def test_environment(attitude):
-    env = gymnasium.make(ID, horizon=120)
-    check_env(env.unwrapped)
-    vector = gymnasium.make_vec(ID, num_envs=3, horizon=120)
-    shown, _ = vector.reset(seed=4)
-    single, _ = env.reset(seed=6)
-    np.testing.assert_array_equal(shown[2], single)
-    for k in range(3):
-        action = np.full((3, 1), 0.3 * k)
-        shown, *_ = vector.step(action)
-        single, *_, truncated, _ = env.step(action[2])
-        np.testing.assert_array_equal(shown[2], single)
-    assert truncated
+    assert_equals_its_vector(ID, [np.full(1, 0.3 * k) for k in range(3)], horizon=120)
 
 
 @pytest.mark.parametrize("control", ["gain", "gains", "time_constants"])

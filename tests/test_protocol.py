@@ -406,15 +406,6 @@ def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_m
     assert env.pictures is None
 
 
-def test_vectors_render_before_reset_and_without_a_mode():
-    with pytest.raises(gym.error.ResetNeeded, match="reset before the first render"):
-        TaskVectorEnv(ID, 2, render_mode="rgb_array").render()
-    env = TaskVectorEnv(ID, 2)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert env.render() is None
-
-
 @pytest.mark.slow
 def test_video_of_a_vector(tmp_path):
     pytest.importorskip("moviepy")

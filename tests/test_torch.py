@@ -24,6 +24,12 @@ CONTINUOUS = [
     for id, control in CONTROLS
     if isinstance(make_model(id, control).action_space, gymnasium.spaces.Box)
 ]
+LONG = [
+    (id, control)
+    for id, control in CONTINUOUS
+    if control == "hypotheses" or ("Tightly" in id and control != "gain")
+]
+"""Cells of which a step takes longest."""
 MODES = [mode.value for mode in gymnasium.vector.AutoresetMode]
 
 
@@ -196,7 +202,10 @@ def test_actions_may_be_arrays_lists_or_whole_numbers(id):
         assert torch.equal(paid(convert), first)
 
 
-@pytest.mark.parametrize(("id", "control"), CONTINUOUS)
+@pytest.mark.parametrize(
+    ("id", "control"),
+    [pytest.param(*cell, marks=[pytest.mark.slow] if cell in LONG else []) for cell in CONTINUOUS],
+)
 def test_gradient_of_an_episode_equals_finite_differences(id, control):
     """Loss: mean charge of a short episode on fixed noise, through bank, mixing and update.
 
