@@ -299,14 +299,14 @@ def test_levels_of_a_rate_find_the_noisy_one():
 # --- policies
 
 
-def test_sticky_changes_the_chain_of_the_bank(on_random):
+def test_sticky_changes_the_chain_of_the_bank():
     assert make_model(ID, **policies.Sticky.task_keywords).task.parameters.transition == policies.chain(
         0.9999
     )
     assert policies.chain(0.998) == pytest.approx(
         numpy.array(make_model(ID).task.parameters.transition), abs=1e-15
     )
-    error = on_random["error"]
+    error = evaluate(ID, ["sticky", "multi-hypothesis"], episodes=4, horizon=40)["error"]
     assert (error.sel(policy="sticky") != error.sel(policy="multi-hypothesis")).any()
 
 
