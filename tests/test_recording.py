@@ -771,6 +771,7 @@ NOT_FINITE = "position is not finite at measurement 3; what is missing has the v
         ),
         (lambda d: d.drop_vars("variance"), "lacks variance; filtergym/ManeuveringTarget-v0 measures scan"),
         (lambda d: d.drop_vars("initial_mean"), "lacks initial_mean"),
+        (lambda d: d.assign(variance=d["variance"].astype(str)), "variance must be numbers, got "),
         (lambda d: d.assign(height=d["scan"]), "has height, which is nothing that"),
         (lambda d: d.isel(position_axis0=[0]), "position has the shape (1,)"),
         (lambda d: d.drop_vars("seconds"), "lacks the variable seconds"),
