@@ -19,7 +19,7 @@ from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.running.metrics import chi_square_band
 
 from filtergym.__main__ import main
-from filtergym.reports.tables.advice import further_sentences, verdict
+from filtergym.reports.tables.advice import advice_rows, further_sentences, verdict
 
 pytest.importorskip("plotly")
 pytest.importorskip("jinja2")
@@ -72,6 +72,10 @@ def test_the_sentence_comes_first_and_tables_hold_what_was_fitted(advice, page):
     assert text.index(verdict(advice).split("[")[0]) < text.index("<table>")
     for name in advice.fits:
         assert name in text
+    first, *others = [row.label for row in advice_rows(advice, [])]
+    assert first == f"{advice.advised.name} (advised)"
+    assert not any(label.endswith("(advised)") for label in others)
+    assert {f"{name} (fitted)" for name in advice.fits} <= {*others}
     for sentence in further_sentences(advice, []):
         assert sentence.replace("'", "&#39;") in text
     assert "10 scans have no row: they missed the target" in text

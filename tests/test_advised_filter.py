@@ -62,9 +62,7 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
 
 LOGS = {
     "radar": {"names": POLAR, "missed": 0.2, "outliers": 0.05},
-    "clean": {"names": PLANE},
     "walk": {"names": PLANE, "speed": 1.4, "sigma": 1.0, "T": 0.25, "jitter": 0.02},
-    "uneven": {"names": PLANE, "jitter": 0.2, "missed": 0.1},
     "no deviations": {"names": PLANE[:2], "sigma": 30.0},
     "latitude": {"names": PLACE, "missed": 0.2, "outliers": 0.05},
     "latitude only": {"names": PLACE[:2], "jitter": 0.2},

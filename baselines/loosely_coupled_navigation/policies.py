@@ -298,7 +298,6 @@ BASELINES = Baselines(
     score_reference="matched",
     tunable=TUNABLE,
     alarm=FusionAlarm,
-    best_constant="best-constant",
     compared=("augmented",),
     benchmark=(
         "plain-reduced",

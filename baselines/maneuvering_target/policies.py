@@ -221,7 +221,6 @@ BASELINES = Baselines(
     fallback="semi-markov-vague-pda",
     alarm=RadarAlarm,
     metrics=METRICS,
-    best_constant="fixed-best",
     benchmark=(
         "imm",
         "imm-steady-state",
