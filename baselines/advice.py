@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy
@@ -60,11 +61,12 @@ class FittedLog:
 
     problem: Problem
     recording: Recording
-    noise: bool
+    """With truth or without."""
+    noise: bool = True
     """Fit the scale of the measurement noise, too, where measurements state one."""
-    seed: int
+    seed: int = 0
     """Of the starts of the fits."""
-    keywords: Mapping[str, Any]
+    keywords: Mapping[str, Any] = MappingProxyType({})
     """Parameters of the task."""
 
     @cached_property
@@ -210,34 +212,26 @@ class Advice(NamedTuple):
 
 
 def advise(
-    problem: Problem,
-    recording: Recording,
+    log: FittedLog,
     shipped: Mapping[str, Any],
     own: Mapping[str, Tunable] | None = None,
-    noise: bool = True,
-    seed: int = 0,
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
-    **keywords: Any,
 ) -> Advice:
     """Fit every family of filters to a recording, choose one, and judge it against what is shipped.
 
     Args:
-        problem: of the recording.
-        recording: with truth or without.
+        log: the recording, and how filters are fitted to it.
         shipped: competitors that are not fitted, by name.
         own: further families, such as an estimator of a user's with limits of its parameters.
-        noise: fit the scale of the measurement noise, too, where measurements state one.
-        seed: of the starts of the fits.
         progress: told what is done, and which share of all.
         price_of: says what an update of a competitor costs, of its name and what makes it: ``operations`` and
             whatever else counts; None where that is not known, and then it is taken for dearer than all others.
-        **keywords: parameters of the task.
 
     Raises:
         ValueError: if nothing can be fitted, or the recording is too short.
     """
-    log = FittedLog(problem, recording, noise, seed, keywords)
+    problem, recording = log.problem, log.recording
     fits = _fit_families(log, own or {}, progress)
     makers = {**shipped, **{name: fits.make(name) for name in fits.found}}
     prices = Prices(makers, price_of)
@@ -245,7 +239,7 @@ def advise(
 
     def judge(makers: Mapping[str, Any]) -> Judgement:
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
-            dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
+            dataset = problem.evaluate(makers, recording, tracks=True, **log.keywords)
         predictions = Predictions(dataset, log.task)
         return Judgement(predictions, log.share, counts, problem.baselines.score_paper, fits.anchored)
 
@@ -370,40 +364,24 @@ def _first_verdict(fits: Fits, shipped: int) -> str:
     )
 
 
-def fit_all(
-    problem: Problem,
-    recording: Recording,
-    family: Tunable,
-    noise: bool = True,
-    seed: int = 0,
-    **keywords: Any,
-) -> tuple[Tunable, Fit, dict[str, Interval]]:
+def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, Interval]]:
     """Fit one filter to all of a recording; nothing is left to judge it.
-
-    Args:
-        problem: of the recording.
-        recording: with truth or without.
-        family: what is fitted.
-        noise: as of :func:`advise`.
-        seed: of the starts of the fit.
-        **keywords: parameters of the task.
 
     Returns:
         The family with the scale of the noise, what was found, and the intervals of the parameters.
     """
-    log = FittedLog(problem, recording, noise, seed, keywords)
-    share = log.share
-    spans = [Span(i, min(share.warm_up, int(rows) - 1), int(rows)) for i, rows in enumerate(recording.rows)]
+    share, rows = log.share, log.recording.rows
+    spans = [Span(i, min(share.warm_up, int(each) - 1), int(each)) for i, each in enumerate(rows)]
     if share.apart:  # side by side it takes a fraction of the time
         spans = [*share.fitted, *share.chosen, *share.judged]
     tunable = log.with_noise(family)
     likelihood = log.likelihood(spans, tunable)
-    found = fit(likelihood, tunable, seed)
+    found = fit(likelihood, tunable, log.seed)
     robust = log.with_noise(family, robust=True)
     if robust != tunable:
         begin = dataclasses.replace(robust, start={**robust.start, **found.values})
         other = log.likelihood(spans, begin)
-        again = fit(other, begin, seed)
+        again = fit(other, begin, log.seed)
         if again.log_likelihood > found.log_likelihood + DROP:
             tunable, likelihood, found = robust, other, again
     found, profiles = fit_profiles(likelihood, tunable, found)
