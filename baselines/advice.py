@@ -15,7 +15,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy
@@ -66,7 +65,7 @@ class FittedLog:
     """Fit the scale of the measurement noise, too, where measurements state one."""
     seed: int = 0
     """Of the starts of the fits."""
-    keywords: Mapping[str, Any] = MappingProxyType({})
+    keywords: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the task."""
 
     @cached_property
