@@ -596,8 +596,13 @@ def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
         read = read_recording(source, TARGET)
         assert read.names == ("a", "b")
         assert read.lengths.tolist() == [3, 2]
+        assumed = (
+            "no column states deviations of x and y, assumed as positions scatter about their neighbours: "
+        )
         assert read.notes == (
             "c.csv: left out: time decreases between rows 1 and 2: rows must be in the order of their times",
+            f"a: {assumed}sigma_x 121 m, sigma_y 121 m",
+            f"b: {assumed}sigma_x 90.8 m, sigma_y 90.8 m",
             "d: left out: sampling_interval is 6.0, and of a 5.0",
         )
     dataset = evaluate(TARGET, ["imm"], scenario=read)

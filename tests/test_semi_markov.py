@@ -70,6 +70,20 @@ def test_update_with_outliers_is_two_kalman_updates_merged(n, probability, facto
         assert found.squared_distance[0] == pytest.approx(nis, rel=1e-10)
 
 
+@pytest.mark.parametrize("sigmas", [1.0, 10.0, 20.0, 60.0])
+def test_a_measurement_far_off_is_an_outlier_in_single_precision_too(sigmas):
+    covariance, z, variance = 0.5 * np.eye(4)[..., None], np.array([[sigmas], [0.0]]), np.full((2, 1), 0.5)
+    double, single = (
+        contaminated_normal.update_position(
+            *(array.astype(dtype) for array in (np.zeros((4, 1)), covariance, z, variance)), 0.05, 5.0
+        )
+        for dtype in (np.float64, np.float32)
+    )
+    for one, other in zip(single, double, strict=True):
+        assert one.dtype == np.float32
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
 # --- every sequence of modes, each with its own filter
 
 

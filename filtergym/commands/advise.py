@@ -1,6 +1,6 @@
 """The command that advises which filter to take for a log."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,6 +50,19 @@ def price_words(price: Mapping[str, int] | None) -> str:
         f" ({price['operations']:,} operations an update in C, {price['state_bytes']:,} bytes of state, about "
         f"{price['stack_bytes']:,} of stack)"
     )
+
+
+def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
+    """Return what says what an update of a competitor costs in C, by its name and what makes it."""
+    parameters = setup_of(problem, recording).parameters
+
+    def price(name: str, maker: Any) -> Mapping[str, int] | None:
+        from ..exports.c_source import price_of
+        from ..exports.request import ExportRequest
+
+        return price_of(ExportRequest(problem, name, maker, keywords=parameters))
+
+    return price
 
 
 def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
@@ -162,15 +175,8 @@ def advise_on_log(
             bar.update(line, completed=share)
             bar.say(what)
 
-        parameters = setup_of(problem, found).parameters
-
-        def price(name: str, maker: Any) -> dict[str, int] | None:
-            from ..exports.c_source import price_of
-            from ..exports.request import ExportRequest
-
-            return price_of(ExportRequest(problem, name, maker, keywords=parameters))
-
-        advice = advise(FittedLog(problem, found, noise, seed, keywords), shipped, own, progress, price)
+        prices = update_prices(problem, found)
+        advice = advise(FittedLog(problem, found, noise, seed, keywords), shipped, own, progress, prices)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:
