@@ -505,10 +505,8 @@ class Program(NamedTuple):
 def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
-    operations, given, logical, groups = (
-        list(map(column.__getitem__, order))
-        for column in (graph.operations, graph.arguments, graph.logical, graph.groups)
-    )
+    operations = list(map(graph.operations.__getitem__, order))
+    given = list(map(graph.arguments.__getitem__, order))
     names = sorted(set(operations))
     number = {name: kind for kind, name in enumerate(names)}
     kinds = _integers(map(number.__getitem__, operations), len(order))
@@ -541,8 +539,11 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
     results = [Result(r.argument, r.row, int(place[r.node])) for r in wanted]
-    steps = Steps(names, kinds, begins, arguments, numpy.array(logical, dtype=bool))
-    return Program(steps, constants, results, numpy.column_stack([groups, order]), graph.callers or {})
+    logical = numpy.array(list(map(graph.logical.__getitem__, order)), dtype=bool)
+    steps = Steps(names, kinds, begins, arguments, logical)
+    groups = _integers(map(graph.groups.__getitem__, order), len(order))
+    origins = numpy.column_stack([groups, _integers(order, len(order))])
+    return Program(steps, constants, results, origins, graph.callers or {})
 
 
 def _integers(numbers: Iterable[int], count: int) -> numpy.ndarray:
