@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import xarray
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
 from filtergym.filters import alpha_beta
@@ -185,6 +186,18 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
     ]
     beaten = [r._replace(low=0.01) if (r.policy, r.metric) == ("bptt", "behind_best") else r for r in swapped]
     assert who_is_best(beaten) == "classical best"
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0 - 1e-6, "bptt"), (1.0 - 1e-3, "copy")])
+def test_of_equals_the_first_is_called_the_best(dataset, factor, expected):
+    """A filter and what is made of it may differ by rounding alone: then the simpler one is named."""
+    copy = dataset.sel(policy=["bptt"]).assign_coords(policy=["copy"])
+    copy["cost"] = factor * copy["cost"]
+    records = tidy_records(xarray.concat([dataset, copy], "policy", data_vars="minimal"))
+    assert {r.component for r in records if r.metric == "behind_best"} == {expected}
+    shares = {r.policy: r.value for r in records if r.metric == "best_share"}
+    assert (shares[expected], sum(shares.values())) == (1.0, pytest.approx(1.0))
+    assert ranking(records)[0].name == expected
 
 
 def test_tracks_hold_what_a_track_is_drawn_from(dataset):

@@ -21,11 +21,13 @@ from filtergym.evaluation.figures.looks import (
 from filtergym.evaluation.figures.print_layout import WIDTHS, logarithmic, save, sensible_limits
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.times import Point, ProcessorTime
+from front import draw_fronts, panels_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pictures import draw_differences, draw_learning_curves
+from records import read_benchmark, recorded_environments
 
 from filtergym import evaluate, record
 
@@ -329,6 +331,19 @@ def test_names_leave_the_line_of_the_papers_cost_free():
     for name in axis.texts:
         box = name.get_window_extent(figure.canvas.get_renderer())
         assert not box.y0 < zero < box.y1, name
+
+
+def test_names_of_the_fronts_lie_on_no_other():
+    """As the records have them, in the picture of README."""
+    figure = draw_fronts(panels_of([read_benchmark(name)[0] for name in recorded_environments()]))
+    for axis in figure.axes:
+        names = [text for text in axis.texts if "beyond" not in text.get_text()]
+        boxes = {name.get_text(): name.get_window_extent(figure.canvas.get_renderer()) for name in names}
+        assert not [
+            (one, other)
+            for one, other in itertools.combinations(boxes, 2)
+            if boxes[one].overlaps(boxes[other])
+        ]
 
 
 def test_consistency_is_labelled_with_plain_numbers(figures):

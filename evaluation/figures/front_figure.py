@@ -25,6 +25,9 @@ DISTANCES = (5.0, 9.0, 15.0, 23.0, 33.0, 45.0)
 """Of a name from its point, points of print; the nearest that is free is taken."""
 DIRECTIONS = 16
 
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top, pixels."""
+
 
 class Panel(NamedTuple):
     """What is drawn of one environment in one scenario."""
@@ -155,8 +158,8 @@ class _Names:
         self.pixels = figure.dpi / 72.0
         self.size = FONT_SIZES[1 if figure.get_figwidth() < 5.0 else 2] - 1.0
         self.window = axis.get_window_extent(self.renderer)
-        self.taken: list[tuple[float, float, float, float]] = []
-        """Boxes of names and points: left, bottom, right, top."""
+        self.points: list[Box] = []
+        self.names: list[Box] = []
         self.lines: list[numpy.ndarray] = []
         """Points along lines, ``(n, 2)``."""
 
@@ -168,7 +171,7 @@ class _Names:
         for point in shown:
             x, y = self._at(point.time.nanoseconds, point.cost)
             reach = 2.6 * self.pixels
-            self.taken.append((x - reach, y - reach, x + reach, y + reach))
+            self.points.append((x - reach, y - reach, x + reach, y + reach))
         corners = [self._at(point.time.nanoseconds, point.cost) for point in on_front]
         for (x, y), (x2, y2) in itertools.pairwise(corners):
             self._add_line((x, y), (x2, y))
@@ -188,9 +191,9 @@ class _Names:
         orders = [
             [*on_front[i:], *on_front[:i], *others][::step] for i in range(len(on_front)) for step in (1, -1)
         ]
-        before, best, least = (list(self.taken), list(self.lines)), None, math.inf
+        before, best, least = (list(self.names), list(self.lines)), None, math.inf
         for order in orders or [others]:
-            self.taken, self.lines = list(before[0]), list(before[1])
+            self.names, self.lines = list(before[0]), list(before[1])
             places = [(point, *self._find_place(point)) for point in order]
             badness = sum(bad for *_, bad in places)
             if badness < least:
@@ -212,19 +215,19 @@ class _Names:
         return float(box.width), float(box.height)
 
     def _name_line(self, point: Point, y: float) -> None:
-        """Name the reference on its line, at the end with fewer points."""
+        """Name the reference on its line, at the end with fewer points, or at the right."""
         width, height = self._extent(point.name)
         gap = 2.0 * self.pixels
         boxes = [
             (left, bottom, left + width, bottom + height)
-            for bottom in (y + 0.5 * gap, y - height - 0.5 * gap)
             for left in (self.window.x1 - width - gap, self.window.x0 + gap)
+            for bottom in (y + 0.5 * gap, y - height - 0.5 * gap)
         ]
         best = boxes[int(numpy.argmin(self._crowding(numpy.array(boxes))))]
-        self.taken.append(best)
+        self.names.append(best)
         self._write(point.name, best, "black")
 
-    def _find_place(self, point: Point) -> tuple[tuple[float, float, float, float], float]:
+    def _find_place(self, point: Point) -> tuple[Box, float]:
         """Find and take the best free box for a name; return it and how bad it is."""
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
@@ -242,11 +245,11 @@ class _Names:
         badness += 5.0 * self._crosses((x, y), boxes)
         best = int(numpy.argmin(badness))
         box = left, bottom, right, top = tuple(boxes[best].tolist())
-        self.taken.append((left, bottom, right, top))
+        self.names.append((left, bottom, right, top))
         self._add_line((x, y), _nearest(box, (x, y)))
         return box, float(badness[best])
 
-    def _name(self, point: Point, box: tuple[float, float, float, float], colour: str) -> None:
+    def _name(self, point: Point, box: Box, colour: str) -> None:
         """Write a name, with a line to its point where that is not near."""
         x, y = self._at(point.time.nanoseconds, point.cost)
         end = _nearest(box, (x, y))
@@ -259,19 +262,21 @@ class _Names:
         """Whether a line from a point to its name, in each of the boxes, runs through another name or point."""
         ends = numpy.clip(numpy.array(start), boxes[:, :2], boxes[:, 2:])
         x, y = numpy.linspace(numpy.broadcast_to(start, ends.shape), ends, 12, axis=1).T[..., None]
-        a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
+        a, b, c, d = numpy.array(self.points + self.names).reshape(-1, 4).T
         others = ~((a <= start[0]) & (start[0] <= c) & (b <= start[1]) & (start[1] <= d))
         found: numpy.ndarray = ((x > a) & (x < c) & (y > b) & (y < d) & others).any(axis=(0, 2))
         return found
 
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
-        """How much else there is in each box: names and points weigh more than lines, and the frame most."""
+        """How much else there is in each box: points weigh more than lines, names more, and the frame most."""
         left, bottom, right, top = boxes.T[..., None]
         margin = 0.8 * self.pixels
-        a, b, c, d = numpy.array(self.taken).reshape(-1, 4).T
-        across = numpy.minimum(right + margin, c) - numpy.maximum(left - margin, a)
-        along = numpy.minimum(top + margin, d) - numpy.maximum(bottom - margin, b)
-        found = 10.0 * numpy.count_nonzero((across > 0.0) & (along > 0.0), axis=1)
+        found = numpy.zeros(len(boxes))
+        for weight, taken in ((10.0, self.points), (50.0, self.names)):
+            a, b, c, d = numpy.array(taken).reshape(-1, 4).T
+            across = numpy.minimum(right + margin, c) - numpy.maximum(left - margin, a)
+            along = numpy.minimum(top + margin, d) - numpy.maximum(bottom - margin, b)
+            found += weight * numpy.count_nonzero((across > 0.0) & (along > 0.0), axis=1)
         lines = numpy.array(self.lines)
         x, y = lines.reshape(-1, 2).T
         inside = (x > left) & (x < right) & (y > bottom - margin) & (y < top)
@@ -286,7 +291,7 @@ class _Names:
         found += 100.0 * outside[:, 0]
         return found
 
-    def _write(self, text: str, box: tuple[float, float, float, float], colour: str) -> None:
+    def _write(self, text: str, box: Box, colour: str) -> None:
         from matplotlib.patheffects import withStroke
 
         middle = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
@@ -297,7 +302,7 @@ class _Names:
         self.axis.text(x, y, text, transform=self.axis.transAxes, ha="center", va="center", **style)
 
 
-def _nearest(box: tuple[float, float, float, float], point: tuple[float, float]) -> tuple[float, float]:
+def _nearest(box: Box, point: tuple[float, float]) -> tuple[float, float]:
     """Point of a box that is nearest to another."""
     return min(max(point[0], box[0]), box[2]), min(max(point[1], box[1]), box[3])
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from .own_metrics import OwnMetrics
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
+NEGLIGIBLE = 5e-5
+"""Relative difference of costs that is rounding, or as good as none."""
 
 
 class Record(NamedTuple):
@@ -338,8 +340,9 @@ class _Against:
         self.wins = dict(zip(self.ratios, parts[3], strict=True))
         self.ranked = [c.name for c in contenders if c.kind in RANKED and c.costs is not None]
         self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
-        # The first where none is a number, as of flights in which nobody was measured.
-        places = numpy.argmin([self.logs[name] for name in self.ranked], axis=0) if self.ranked else []
+        # Of equals the first, and so where none is a number, as of flights in which nobody was measured.
+        own_logs = numpy.array([self.logs[name] for name in self.ranked])
+        places = numpy.argmax(own_logs <= own_logs.min(axis=0) + NEGLIGIBLE, axis=0) if self.ranked else []
         self.best = self.ranked[places[0]] if self.ranked else ""
         self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
 
@@ -466,7 +469,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
     and ``relative_cost_difference`` of the means, ``median_cost_ratio`` and ``win_rate`` over episodes, ``score`` =
     (L_paper - L) / (L_paper - L_reference), L mean logarithms of the cost. Against the best of what is ranked
     ``behind_best`` (as the geometric difference; the component names the best) and ``best_share``, the share of
-    resamples of the episodes in which this one is the best. And the environment's own metrics.
+    resamples of the episodes in which this one is the best; of those whose costs are as good as equal the first is.
+    And the environment's own metrics.
 
     Args:
         dataset: from an evaluation.

@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 from ...agents.named_policies import pretrained_agents
 from ...evaluation.competitors.kinds import RANKED
-from ...evaluation.running.metrics import Record
+from ...evaluation.running.metrics import NEGLIGIBLE, Record
 from .results import Result
 from .terminal_tables import HEADLINE, INCONSISTENT_WORDS, consistency_word, with_interval
 
-NEGLIGIBLE = 5e-5
-"""Relative difference of costs that is rounding, or as good as none."""
 HARM = 0.02
 """Relative difference to the paper's algorithm beyond which, with its whole interval, a competitor does harm."""
 
@@ -32,6 +30,9 @@ class Place(NamedTuple):
 def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> list[Place]:
     """Competitors of one environment and scenario that are ranked, lowest geometric mean of the cost first.
 
+    Those that are as good as equal to the lowest stand in the order of the records, which is the catalogue's: a filter
+    comes before what is made of it.
+
     Args:
         records: of the scenario.
         learned: names of those that were learned; default: the environment's shipped agents.
@@ -45,7 +46,8 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
             role = "learned" if name in learned else kind
             chosen = math.nan if share is None or share.value is None else share.value
             places.append(Place(name, role, record.value, found.get((name, "behind_best")), chosen))
-    return sorted(places, key=lambda place: place.cost)
+    equal = (1.0 + NEGLIGIBLE) * min((place.cost for place in places), default=0.0)
+    return sorted(places, key=lambda place: max(place.cost, equal))
 
 
 def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
