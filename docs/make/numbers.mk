@@ -25,7 +25,7 @@ agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
-# Its student is trained but not shipped: it is level with kalman-net.
+# Its student is trained but not shipped: nothing but its training makes it stable.
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
 shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo kalman-net
