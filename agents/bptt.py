@@ -65,9 +65,11 @@ class NetworkPolicy(torch.nn.Module):
         first_action: about what is answered before anything is learned; default: the middle of the box.
         network: one of ``NETWORKS``.
         fields_kept: how many fields of the observation the agent reads that is saved; None: all.
+        longest_memory: decisions over which the slowest unit of a memory forgets at first, the quickest in one; None:
+            all of them in about two.
 
     Raises:
-        ValueError: if that is no action or no network, or for fewer than one field.
+        ValueError: if that is no action, no network or no memory, or for fewer than one field.
     """
 
     low: torch.Tensor
@@ -85,6 +87,7 @@ class NetworkPolicy(torch.nn.Module):
         first_action: Sequence[float] | None = None,
         network: str = "recurrent",
         fields_kept: int | None = None,
+        longest_memory: float | None = None,
     ) -> None:
         super().__init__()
         if network not in NETWORKS:
@@ -104,6 +107,12 @@ class NetworkPolicy(torch.nn.Module):
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
             self.head.bias.copy_(torch.as_tensor(numpy.arctanh(inside)))
+            if self.gru is not None and longest_memory is not None:
+                check("longest_memory", longest_memory, float, Limits(above=1.0))
+                # A unit whose update gate has the logit log T forgets over about T decisions (Tallec and Ollivier,
+                # "Can recurrent neural networks warp time?", ICLR 2018).
+                update = slice(hidden_size, 2 * hidden_size)
+                self.gru.bias_ih[update] = torch.linspace(0.0, math.log(longest_memory), hidden_size)
         self.register_buffer("low", torch.as_tensor(space.low))
         self.register_buffer("high", torch.as_tensor(space.high))
         self.register_buffer("mean", torch.zeros(observations))
@@ -330,6 +339,7 @@ class Descent:
             values.get("first_action"),
             values.get("network", "recurrent"),
             values.get("fields_kept"),
+            values.get("longest_memory"),
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()

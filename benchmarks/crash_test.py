@@ -3,7 +3,8 @@
     python benchmarks/crash_test.py [--environment ID] [--policy NAME ...] [--episodes N] [--steps N] [--record]
 
 One row for each policy, estimator, tuned one and agent: how many alterations it passed, and under which it is degraded
-or failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out.
+or failed. References and bounds, which need the truth, and smoothers, which answer afterwards, are left out. With
+``--policy`` the rows of these are put into the record that is there.
 """
 
 import argparse
@@ -52,6 +53,16 @@ def row(name: str, findings: Sequence[Finding]) -> list[str]:
 
 def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) -> None:
     """Write the record; see ``docs/make/records.py``."""
+    FOLDER.mkdir(exist_ok=True)
+    path, known = FOLDER / f"{bare_name(problem.id)}.json", {row[0]: list(row) for row in rows}
+    if options.policy and path.exists():
+        record = json.loads(path.read_text(encoding="utf-8"))
+        table = {row[0]: row for row in record["data"]["rows"]} | known
+        record["data"]["rows"] = [table[name] for name in names_of(problem) if name in table]
+        today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+        record["note"] += f" Rows of {', '.join(options.policy)} are of {today}."
+        path.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+        return
     versions = {"Python": platform.python_version()}
     versions |= {name: importlib.metadata.version(name) for name in LIBRARIES}
     record: dict[str, Any] = {
@@ -60,10 +71,8 @@ def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) 
         "versions": versions,
         "note": f"{options.episodes} tracks, long runs of {options.steps:,} measurements; {len(ALTERATIONS)} "
         "alterations, of which some do not apply.",
-        "data": {"columns": COLUMNS, "rows": list(map(list, rows))},
+        "data": {"columns": COLUMNS, "rows": list(known.values())},
     }
-    FOLDER.mkdir(exist_ok=True)
-    path = FOLDER / f"{bare_name(problem.id)}.json"
     path.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
 
 

@@ -15,7 +15,8 @@ import time
 from pathlib import Path
 
 import numpy
-from filtergym.baselines.advice import advise
+from filtergym.agents.named_policies import pretrained_agents
+from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.fitted_filters import write_advised
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording
@@ -23,6 +24,7 @@ from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.statistics.predictions import Predictions
 from scipy.optimize import minimize
 
+from filtergym.commands.advise import update_prices
 from filtergym.commands.evaluation import causal_names
 from filtergym.names import find_competitor
 
@@ -117,13 +119,17 @@ def judge(first: Recording, second: Recording, folder: Path) -> list[str]:
     """Row of the table for one log."""
     problem = problem_of(ID)
     shipped = {name: find_competitor(problem, name) for name in causal_names(problem, first)}
+    learned = pretrained_agents(problem.id)  # which the command compares only if it is asked to
+    rivals = {name: maker for name, maker in shipped.items() if name not in learned}
     begun, verdict = time.process_time(), [math.nan]
 
     def progress(what: str, share: float) -> None:
         if what.startswith("First verdict"):
             verdict[0] = time.process_time() - begun
 
-    advice = advise(problem, first, shipped, progress=progress)
+    advice = advise(
+        FittedLog(problem, first), rivals, progress=progress, price_of=update_prices(problem, first)
+    )
     used, name = time.process_time() - begun, advice.advised.name
     path = folder / "advised.filter.json"
     fitted = advice.fits[name] if advice.advised.fitted else None

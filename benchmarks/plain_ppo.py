@@ -2,6 +2,7 @@
 
     python benchmarks/plain_ppo.py --out plain_ppo.json
     python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
+    python benchmarks/plain_ppo.py --algo sac --set gradient_steps=-1 --split validation --out more_updates.json
 
 One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 in
 TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's
@@ -51,23 +52,32 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--episodes", type=int, default=2000, help="of the test; a fifth in TightlyCoupledNavigation"
     )
+    parser.add_argument("--split", default="test", help="whose episodes the policies meet")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="in place of the algorithm's default"
+    )
     parser.add_argument("--out", type=Path, default=Path("plain_ppo.json"))
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
     return parser.parse_args()
 
 
-def run(algo: str, id: str, seed: int, steps: int, episodes: int, envs: int) -> dict:
+def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
     """Train once and compare with the paper's algorithm and with the action zero."""
     import torch
     from filtergym.agents import to_sb3
     from filtergym.agents.sb3_training import ALGORITHMS
+    from filtergym.agents.settings import parse_settings
 
+    algo, envs = chosen.algo, chosen.envs
+    quarter, fifth = (4, 5) if id in LONG else (1, 1)
+    steps, episodes = chosen.steps // quarter, chosen.episodes // fifth
     torch.set_num_threads(1)
     env: Any = gymnasium.make(id)
-    settings = {}
+    settings: dict[str, Any] = {}
     if envs > 1:
         env = to_sb3(gymnasium.make_vec(id, num_envs=envs, autoreset_mode="SameStep"))
         settings = {"n_steps": ROLLOUT[algo] // envs} if algo in ROLLOUT else {}
+    settings |= parse_settings([f"algo.{word}" for word in chosen.set])[1]
     begun = time.perf_counter()
     model: Any = ALGORITHMS[algo](POLICIES[algo], env, seed=seed, device="cpu", **settings).learn(steps)
     seconds = time.perf_counter() - begun
@@ -76,7 +86,11 @@ def run(algo: str, id: str, seed: int, steps: int, episodes: int, envs: int) -> 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
         results = filtergym.evaluate(
-            id, {"plain": model, paper: paper, "nothing": nothing}, episodes=episodes, seed=0
+            id,
+            {"plain": model, paper: paper, "nothing": nothing},
+            episodes=episodes,
+            seed=0,
+            split=chosen.split,
         )
     names = ("plain", paper, "nothing")
     cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in names}
@@ -142,12 +156,9 @@ def main() -> None:
     ids = chosen.environment or sorted(i for i in gymnasium.registry if i.startswith("filtergym/"))
     for seed in range(chosen.seeds):
         for id in ids:
-            quarter, fifth = (4, 5) if id in LONG else (1, 1)
             if any((found["environment"], found["seed"]) == (id, seed) for found in runs):
                 continue
-            runs.append(
-                run(chosen.algo, id, seed, chosen.steps // quarter, chosen.episodes // fifth, chosen.envs)
-            )
+            runs.append(run(chosen, id, seed))
             chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
             console.print(
                 f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s"

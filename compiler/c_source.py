@@ -9,6 +9,8 @@ are those of the code of :mod:`.emission`; of the two zeros a ``maximum`` may re
 from collections.abc import Callable, Mapping, Sequence, Set
 from typing import NamedTuple
 
+import numpy
+
 from .c_loops import Arrays, Loops
 from .c_text import (
     DOUBLE,
@@ -27,6 +29,9 @@ from .rolling import roll_where_shorter
 
 PART = 200
 """Statements of a function."""
+INLINED = 8_000
+"""Operations of a program above which the compiler of CUDA keeps its functions apart: put into one, 23,000 operations
+take it more than three minutes in place of half of one, and 9,500 run a quarter slower; 2,700 run twice as fast."""
 
 
 class Source(NamedTuple):
@@ -65,7 +70,7 @@ _HELPERS = {
 
 def helper_functions(programs: Sequence[Program], scalar: Scalar = DOUBLE, qualifier: str = "static ") -> str:
     """Return the functions that statements of these programs call beside those of ``math.h``."""
-    used = {step.operation for program in programs for step in program.steps}
+    used = {name for program in programs for name in program.steps.operations}
     words = {
         "real": scalar.name,
         "f": scalar.suffix,
@@ -82,13 +87,14 @@ class _Text:
         self, program: Program, read: Callable[[int, int], str], scalar: Scalar, tables: Mapping[int, str]
     ) -> None:
         self.program, self.read, self.scalar, self.tables = program, read, scalar, tables
+        self.steps = program.steps.all()
 
     def literal(self, value: float) -> str:
         return literal(value, self.scalar)
 
     def value(self, step: int) -> str:
         """Return an expression for a step's value where it is used."""
-        operation, arguments, logical = self.program.steps[step]
+        operation, arguments, logical = self.steps[step]
         if operation == "input":
             return self.read(*arguments)
         if operation == "constant":
@@ -99,19 +105,19 @@ class _Text:
     def as_number(self, step: int) -> str:
         """Return an expression for a step's value that is a number, one for true and zero for false."""
         value = self.value(step)
-        if not self.program.steps[step].logical:
+        if not self.steps[step].logical:
             return value
         return f"({value} ? {self.literal(1.0)} : {self.literal(0.0)})"
 
     def declaration(self, step: int, expression: str) -> str:
-        kind = "int" if self.program.steps[step].logical else self.scalar.name
+        kind = "int" if self.steps[step].logical else self.scalar.name
         return f"const {kind} v{step} = {expression};"
 
     def expression(self, index: int) -> str:
         """Return what computes a step."""
-        operation, arguments, _ = self.program.steps[index]
-        parts = self.program.steps[index].parts
-        known = [self.program.steps[part].operation == "constant" for part in parts]
+        operation, arguments, _ = self.steps[index]
+        parts = self.steps[index].parts
+        known = [self.steps[part].operation == "constant" for part in parts]
         table = (self.tables[arguments[0]], arguments[1]) if operation == "take" else None
         return expression(operation, [self.value(part) for part in parts], known, self.scalar, table)
 
@@ -144,11 +150,11 @@ def write_program(
         results: how many these are.
         arrays: where the rows of all arguments lie, for loops; default: no loops.
     """
-    if any(step.operation == "product" for step in program.steps):
+    if "product" in program.steps.operations:
         raise ValueError("a product that is a loop has no form in C: trace it with Graph(loops=False)")
-    starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
+    starts = sorted({step.arguments[:2] for step in program.steps.named("take")})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
-    count_operations = sum(step.operation not in FREE for step in program.steps)
+    count_operations = int(numpy.count_nonzero(~program.steps.which(*FREE)))
     defined = [
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
@@ -172,7 +178,9 @@ def write_program(
     lines = blocks
     if not together:
         listed = [*parameters, Parameter(f"{scalar.name} *", "w")]
-        defined += [_function(f"{name}_part_{i}", listed, block, qualifier) for i, block in enumerate(blocks)]
+        apart = "__device__" in qualifier and count_operations > INLINED
+        own = f"{qualifier}__noinline__ " if apart else qualifier
+        defined += [_function(f"{name}_part_{i}", listed, block, own) for i, block in enumerate(blocks)]
         names = ", ".join(parameter.name for parameter in listed)
         lines = [[f"{name}_part_{i}({names});"] for i in range(len(blocks))]
     body = [line for block in lines[:before] for line in block]
@@ -181,8 +189,8 @@ def write_program(
         body.insert(0, f"{scalar.name} w[{max(count, 1)}];")
     constants = [
         float(program.constants[step.arguments[0]])
-        for step in program.steps
-        if step.operation == "constant" and not step.logical
+        for step in program.steps.named("constant")
+        if not step.logical
     ]
     replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
     return Source("\n".join(defined), body, count_operations, count, replaced)
@@ -210,7 +218,7 @@ def _statements(
     """Statements of a part."""
     lines: list[str] = []
     fetched: set[int] = set()
-    steps = text.program.steps
+    steps = text.steps
     for statement in part:
         used = steps[statement].parts if isinstance(statement, int) else (statement.node,)
         for step in used:

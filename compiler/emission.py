@@ -39,12 +39,12 @@ class _Part(Instructions):
 
     def __init__(self, program: Program, lane_first: Sequence[bool], places: "_Places", block: Block) -> None:
         super().__init__(lane_first, block)
-        self.program, self.places = program, places
+        self.steps, self.places = program.steps.all(), places
         self.known: set[int] = set()
 
     def value(self, step: int) -> str:
         """Name of a step's value; what is free, or lies in the scratch array, is fetched where it is first needed."""
-        operation, arguments, logical = self.program.steps[step]
+        operation, arguments, logical = self.steps[step]
         name = f"%v{step}"
         if step not in self.known:
             self.known.add(step)
@@ -67,7 +67,7 @@ class _Part(Instructions):
 
     def step(self, index: int) -> None:
         """Compute a step."""
-        step = self.program.steps[index]
+        step = self.steps[index]
         self.known.add(index)
         if step.operation == "product":
             self._product(index)
@@ -76,12 +76,12 @@ class _Part(Instructions):
         if step.operation == "take":
             self.take(step.arguments[0], step.arguments[1], values[0], f"%v{index}")
             return
-        known = [self.program.steps[part].operation == "constant" for part in step.parts]
+        known = [self.steps[part].operation == "constant" for part in step.parts]
         self.operate(step.operation, values, step.logical, known, f"%v{index}")
 
     def _product(self, index: int) -> None:
         """Put the vector where the loop reads it, and let the loop write what comes out."""
-        table, rows, *vector = self.program.steps[index].arguments
+        table, rows, *vector = self.steps[index].arguments
         for place, step in enumerate(vector):
             value = self.value(step)
             address = self.scratch(self.places.vector + place)
@@ -96,7 +96,7 @@ class _Part(Instructions):
     def store(self, argument: int, row: int, step: int) -> None:
         """Write a result."""
         value = self.value(step)
-        self.write(argument, row, self.as_number(value) if self.program.steps[step].logical else value)
+        self.write(argument, row, self.as_number(value) if self.steps[step].logical else value)
 
     def scratch(self, place: int) -> str:
         """Address of a place in the scratch array."""
@@ -104,7 +104,7 @@ class _Part(Instructions):
 
     def hand_on(self, step: int) -> None:
         """Put a value into the scratch array."""
-        kind = self.truths if self.program.steps[step].logical else self.numbers
+        kind = self.truths if self.steps[step].logical else self.numbers
         address = self.scratch(self.places.slots[step])
         self.lines.append(f"store {kind} {self.value(step)}, ptr {address}")
 
@@ -152,7 +152,7 @@ def _parts(
     parts, _ = cut_parts(program, size)
     slots = scratch_slots(program, parts)
     places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
-    vectors = [len(step.parts) for step in program.steps if step.operation == "product"]
+    vectors = [len(step.parts) for step in program.steps.named("product")]
     functions = []
     for number, statements in enumerate(parts):
         own = _Part(program, lane_first, places, block)
@@ -248,7 +248,7 @@ def _product_lines(block: Block) -> Iterator[str]:
 
 def _declarations(program: Program, library: Library, block: Block) -> Iterator[str]:
     """Intrinsics, and functions of a block made of the library's."""
-    used = {step.operation for step in program.steps}
+    used = program.steps.operations
     if "product" in used:
         yield f"declare void @{product_symbol(block)}(ptr, ptr, ptr, i64, i64)"
     yield f"declare {block.numbers} {block.gather}({block.addresses}, i32, {block.truths}, {block.numbers})"

@@ -194,11 +194,12 @@ def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None
 def _elementwise(name: str, arrays: Sequence[Traced], dtype: Any) -> Traced:
     graph = _OPEN.get()
     graph.begin_group()
-    spread = (
-        numpy.broadcast_arrays(*(array.nodes for array in arrays)) if len(arrays) > 1 else [arrays[0].nodes]
-    )
-    made = graph.nodes(name, [part.ravel() for part in spread])
-    return Traced(numpy.array(made, dtype=numpy.int64).reshape(spread[0].shape), dtype)
+    nodes = [array.nodes for array in arrays]
+    shape = nodes[0].shape
+    if builtins.any(each.shape != shape for each in nodes):
+        nodes = list(numpy.broadcast_arrays(*nodes))
+        shape = nodes[0].shape
+    return Traced(graph.nodes(name, [each.ravel() for each in nodes]).reshape(shape), dtype)
 
 
 def _numbers(array: Traced) -> Traced:
@@ -207,6 +208,8 @@ def _numbers(array: Traced) -> Traced:
 
 def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
     """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
+    if builtins.all(isinstance(array, Traced) and array.dtype == float64 for array in arrays):
+        return list(arrays), float64
     found = [asarray(array) for array in arrays]
     # NumPy asks Python's own numbers only for their kind.
     kinds = [

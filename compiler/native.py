@@ -199,7 +199,7 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         binding, (_, features) = llvm(), processor()
         library = library or fastest(features)
         symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
-        has_products = any(step.operation == "product" for step in program.steps)
+        has_products = "product" in program.steps.operations
         quick = quick_setting(features, has_products)
         in_loops = quick.loops and len(program.steps) >= emission.LONG
         better = better_setting(quick, len(program.steps), in_loops)
@@ -254,12 +254,9 @@ def _text_of(program: Program) -> str:
     """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
     and other numbers leave it as it is.
     """
-    operations = " ".join([step[0] for step in program.steps])
-    arguments = numpy.fromiter(
-        (number for step in program.steps for number in (len(step[1]), *step[1], step[2])), dtype=numpy.int64
-    )
-    results = numpy.array(program.results, dtype=numpy.int64)
-    return operations + hashlib.sha256(arguments.tobytes() + results.tobytes()).hexdigest()
+    steps, results = program.steps, numpy.array(program.results, dtype=numpy.int64)
+    columns = (steps.kinds, steps.begins, steps.arguments, steps.logical, results)
+    return " ".join(steps.names) + hashlib.sha256(b"".join(map(numpy.ndarray.tobytes, columns))).hexdigest()
 
 
 @functools.cache

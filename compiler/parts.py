@@ -44,11 +44,12 @@ def scratch_slots(program: Program, parts: list[list[Statement]]) -> dict[int, i
         program: that was cut.
         parts: of :func:`cut_parts`.
     """
+    steps = program.steps.all()
     part_of = {step: i for i, part in enumerate(parts) for step in part if isinstance(step, int)}
     last_user: dict[int, int] = {}
     for number, part in enumerate(parts):
         for statement in part:
-            used = program.steps[statement].parts if isinstance(statement, int) else (statement.node,)
+            used = steps[statement].parts if isinstance(statement, int) else (statement.node,)
             for step in used:
                 if part_of.get(step, number) < number:
                     last_user[step] = number

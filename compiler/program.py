@@ -4,13 +4,17 @@ An expression is a number: its place in the :class:`Graph`. One that is made aga
 subexpressions), one of constants is computed at once, and what no result needs never enters a program.
 """
 
+import functools
 import gc
 import itertools
 import os
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, overload
 
 import numpy
 
@@ -66,6 +70,8 @@ BAND = 8
 """Rows of a matrix of constants that a loop sums side by side."""
 OTHERS = {"take": 1, "product": 2, "entry": 1}
 """How many arguments of these expressions come before those that are expressions."""
+BEFORE = {"input": 2, "constant": 1, "take": 2, "product": 2, "entry": 1}
+"""How many arguments of a step come before those that are steps."""
 
 
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
@@ -103,10 +109,12 @@ class Graph:
         groups: number of the array operation that made an expression: those of one do not depend on one another.
         tables: what ``take`` and ``product`` read, ``(length,)`` each.
         loops: whether products with large matrices of constants may be kept whole, for code that has loops.
+        callers: functions that asked for each array operation, by its number; None: nobody wants to know.
     """
 
-    def __init__(self, loops: bool = False) -> None:
+    def __init__(self, loops: bool = False, callers: bool = False) -> None:
         self.loops = loops
+        self.callers: dict[int, str] | None = {} if callers else None
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
@@ -132,6 +140,8 @@ class Graph:
     def begin_group(self) -> None:
         """Say that what is made from now on is another array operation."""
         self.group += 1
+        if self.callers is not None:
+            self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
         """Number in a row of an argument."""
@@ -208,7 +218,7 @@ class Graph:
         logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
         return self._intern(key, name, arguments, None, logical)
 
-    def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> list[int]:
+    def nodes(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
         """Expressions of others, member by member: what :meth:`node` makes of each, in a fraction of the time.
 
         Args:
@@ -216,9 +226,8 @@ class Graph:
             columns: for each argument the expressions of all members, ``(n,)``.
         """
         if len(columns[0]) < FEW:
-            return [
-                self.node(name, *row) for row in zip(*(column.tolist() for column in columns), strict=True)
-            ]
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            return numpy.array([self.node(name, *row) for row in rows], dtype=numpy.int64)
         self._count()
         known = [self._known[column] for column in columns]
         numbers = [numpy.where(self._known[column], self._numbers[column], numpy.nan) for column in columns]
@@ -239,7 +248,7 @@ class Graph:
         made[plain] = self._intern_all(name, [column[plain] for column in columns])
         for k in numpy.flatnonzero(made < 0).tolist():
             made[k] = self.node(name, *(int(column[k]) for column in columns))
-        return made.tolist()
+        return made
 
     def _may_be_simpler(
         self,
@@ -275,23 +284,27 @@ class Graph:
         self._known[first:count] = [value is not None for value in new]
         self._counted = count
 
-    def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> list[int]:
+    def _intern_all(self, name: str, columns: Sequence[numpy.ndarray]) -> numpy.ndarray:
         """Expressions of others that have no simpler form."""
         ordered = (numpy.minimum(*columns), numpy.maximum(*columns)) if name in COMMUTATIVE else columns
-        keys = zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False)
-        found, made, fresh = self._found, [], []
+        keys = list(zip(itertools.repeat(name), *(column.tolist() for column in ordered), strict=False))
         count = len(self.operations)
-        for place, key in enumerate(keys):
-            node = found.setdefault(key, count)
-            if node == count:
-                count += 1
-                fresh.append(place)
-            made.append(node)
-        arguments = list(zip(*(column[fresh].tolist() for column in columns), strict=True))
+        # As if all were new; where some are not, the new ones are numbered again.
+        made = numpy.array(list(map(self._found.setdefault, keys, itertools.count(count))))
+        fresh = numpy.flatnonzero(made == count + numpy.arange(len(keys)))
+        if len(fresh) < len(keys):
+            self._found.update({keys[place]: count + i for i, place in enumerate(fresh.tolist())})
+            new = made >= count
+            made[new] = count + numpy.searchsorted(fresh, made[new] - count)
+            columns = [column[fresh] for column in columns]
+        arguments = list(zip(*(column.tolist() for column in columns), strict=True))
         self.operations += [name] * len(fresh)
         self.arguments += arguments
         self.values += [None] * len(fresh)
-        self.logical += [name in LOGICAL or (name == "where" and self.logical[each[1]]) for each in arguments]
+        if name == "where":
+            self.logical += [self.logical[one] for _, one, _ in arguments]
+        else:
+            self.logical += [name in LOGICAL] * len(fresh)
         self.groups += [self.group] * len(fresh)
         return made
 
@@ -336,9 +349,9 @@ class Graph:
         """What the wanted expressions are made of, each after its own parts and as late as that allows: a sum of
         products is finished before the next begins, and its terms need not be kept.
         """
-        seen: set[int] = set()
+        seen = bytearray(len(self.operations))
         order: list[int] = []
-        operations, arguments, add, finish = self.operations, self.arguments, seen.add, order.append
+        operations, arguments, finish = self.operations, self.arguments, order.append
         for root in wanted:
             waiting = [root]
             pop, wait, wait_all = waiting.pop, waiting.append, waiting.extend
@@ -346,8 +359,8 @@ class Graph:
                 node = pop()
                 if node < 0:  # its parts are there
                     finish(~node)
-                elif node not in seen:
-                    add(node)
+                elif not seen[node]:
+                    seen[node] = True
                     name = operations[node]
                     if name == "input" or name == "constant":
                         finish(node)
@@ -360,6 +373,18 @@ class Graph:
         """Expressions that one is directly made of."""
         name = self.operations[node]
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
+
+
+def _callers() -> str:
+    """The nearest function outside of this package, and the nearest of another file that has called it."""
+    found: dict[str, str] = {}
+    frame: types.FrameType | None = sys._getframe(2)
+    while frame is not None and len(found) < 2:
+        place, name = Path(frame.f_code.co_filename), frame.f_code.co_name
+        if place.parent != Path(__file__).parent and not name.startswith("<"):
+            found.setdefault(place.stem, name)
+        frame = frame.f_back
+    return " of ".join(f"{file}.{name}" for file, name in found.items())
 
 
 class Result(NamedTuple):
@@ -382,11 +407,80 @@ class Step(NamedTuple):
     @property
     def parts(self) -> tuple[int, ...]:
         """Steps that it is directly made of."""
-        if self.operation in ("input", "constant"):
-            return ()
-        return self.arguments[{"take": 2, "product": 2, "entry": 1}.get(self.operation, 0) :]
+        return self.arguments[BEFORE.get(self.operation, 0) :]
 
     logical: bool
+
+
+class Steps(Sequence[Step]):
+    """Operations one after the other, as columns of numbers: a step is made where somebody looks at it.
+
+    Args:
+        names: what the operations are called.
+        kinds: ``(n,)``: for each step which of them it is.
+        begins: ``(n + 1,)``: where the arguments of each step begin in ``arguments``.
+        arguments: those of :class:`Step`, one after the other.
+        logical: ``(n,)``.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        kinds: numpy.ndarray,
+        begins: numpy.ndarray,
+        arguments: numpy.ndarray,
+        logical: numpy.ndarray,
+    ) -> None:
+        self.names, self.kinds, self.begins = names, kinds, begins
+        self.arguments, self.logical = arguments, logical
+        self._made: list[Step] | None = None
+
+    @functools.cached_property
+    def operations(self) -> frozenset[str]:
+        """Operations that occur."""
+        return frozenset([self.names[kind] for kind in numpy.unique(self.kinds).tolist()])
+
+    def which(self, *operations: str) -> numpy.ndarray:
+        """For each step whether it is one of some operations, ``(n,)``."""
+        return numpy.isin(self.kinds, [kind for kind, name in enumerate(self.names) if name in operations])
+
+    def named(self, operation: str) -> list[Step]:
+        """Return the steps of an operation."""
+        return [self[index] for index in numpy.flatnonzero(self.which(operation)).tolist()]
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    @overload
+    def __getitem__(self, place: int) -> Step: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> "Steps": ...
+
+    def __getitem__(self, place: int | slice) -> "Step | Steps":
+        if not isinstance(place, slice):
+            if self._made is not None:
+                return self._made[place]
+            given = self.arguments[self.begins[place] : self.begins[place + 1]].tolist()
+            return Step(self.names[self.kinds[place]], tuple(given), bool(self.logical[place]))
+        begins = self.begins[place.start or 0 : len(self.begins[:-1][: place.stop]) + 1]
+        given = self.arguments[begins[0] : begins[-1]]
+        return Steps(self.names, self.kinds[place], begins - begins[0], given, self.logical[place])
+
+    def __iter__(self) -> Iterator[Step]:
+        return iter(self.all())
+
+    def all(self) -> list[Step]:
+        """Return all steps; from then on they are kept."""
+        if self._made is None:
+            numbers, names = self.arguments.tolist(), self.names
+            given = [tuple(numbers[begin:end]) for begin, end in itertools.pairwise(self.begins.tolist())]
+            parts = zip(
+                [names[kind] for kind in self.kinds.tolist()], given, self.logical.tolist(), strict=True
+            )
+            # Step itself takes twice as long.
+            self._made = list(map(tuple.__new__, itertools.repeat(Step), parts))
+        return self._made
 
 
 class Program(NamedTuple):
@@ -395,46 +489,62 @@ class Program(NamedTuple):
     Constants are told apart from the steps, so that programs that differ only in numbers have the same code.
     """
 
-    steps: list[Step]
+    steps: Steps
     constants: numpy.ndarray
     """``(n,)``: scalars, then the tables one after the other."""
     results: list[Result]
     """``node`` is a step's place."""
-    origins: Sequence[tuple[int, int]] = ()
-    """For each step the number of the array operation that made it, and one that grows from member to member."""
+    origins: numpy.ndarray
+    """``(n, 2)``: for each step the number of the array operation that made it, and one that grows from member to
+    member."""
+    callers: Mapping[int, str] = types.MappingProxyType({})
+    """Functions that asked for an array operation, where the graph knows them."""
 
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
-    place = {node: i for i, node in enumerate(order)}
-    scalars = [node for node in order if graph.values[node] is not None]
-    scalar = {node: i for i, node in enumerate(scalars)}
-    tables = sorted(
-        {graph.arguments[node][0] for node in order if graph.operations[node] in ("take", "product")}
+    operations = list(map(graph.operations.__getitem__, order))
+    given = list(map(graph.arguments.__getitem__, order))
+    names = sorted(set(operations))
+    number = {name: kind for kind, name in enumerate(names)}
+    kinds = _integers(map(number.__getitem__, operations), len(order))
+    scalars, takes, products = (
+        numpy.flatnonzero(kinds == number[name]).tolist() if name in number else []
+        for name in ("constant", "take", "product")
     )
-    lengths = [len(graph.tables[table]) for table in tables]
-    starts = dict(zip(tables, numpy.cumsum([len(scalars), *lengths]).tolist(), strict=False))
-    sizes = dict(zip(tables, lengths, strict=True))
-    steps = []
-    operations, given, logical, make = graph.operations, graph.arguments, graph.logical, tuple.__new__
-    for node in order:
-        name, arguments = operations[node], given[node]
-        if name == "constant":
-            arguments = (scalar[node],)
-        elif name == "take":
-            arguments = (starts[arguments[0]], sizes[arguments[0]], place[arguments[1]])
-        elif name == "product":
-            arguments = (starts[arguments[0]], arguments[1], *(place[part] for part in arguments[2:]))
-        elif name == "entry":
-            arguments = (arguments[0], place[arguments[1]])
-        elif name != "input":
-            arguments = tuple([place[argument] for argument in arguments])
-        steps.append(make(Step, (name, arguments, logical[node])))  # Step itself takes twice as long
-    values: list[Any] = [graph.values[node] for node in scalars]
+    for i, step in enumerate(scalars):
+        given[step] = (i,)
+    tables = sorted({given[step][0] for step in [*takes, *products]})
+    sizes = {table: len(graph.tables[table]) for table in tables}
+    starts = dict(zip(tables, itertools.accumulate(sizes.values(), initial=len(scalars)), strict=False))
+    for step in takes:
+        table, index = given[step]
+        given[step] = (starts[table], sizes[table], index)
+    for step in products:
+        given[step] = (starts[given[step][0]], *given[step][1:])
+
+    lengths = _integers(map(len, given), len(order))
+    begins = numpy.concatenate([[0], numpy.cumsum(lengths)])
+    arguments = _integers(itertools.chain.from_iterable(given), int(begins[-1]))
+    before = numpy.array([BEFORE.get(name, 0) for name in names], dtype=numpy.int64)
+    of_steps = numpy.arange(len(arguments)) >= numpy.repeat(begins[:-1] + before[kinds], lengths)
+    place = numpy.empty(len(graph.operations), dtype=numpy.int64)
+    place[order] = numpy.arange(len(order))
+    arguments[of_steps] = place[arguments[of_steps]]
+
+    values: list[Any] = [graph.values[order[step]] for step in scalars]
     constants = numpy.concatenate(
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
-    results = [Result(r.argument, r.row, place[r.node]) for r in wanted]
-    return Program(steps, constants, results, [(graph.groups[node], node) for node in order])
+    results = [Result(r.argument, r.row, int(place[r.node])) for r in wanted]
+    logical = numpy.array(list(map(graph.logical.__getitem__, order)), dtype=bool)
+    steps = Steps(names, kinds, begins, arguments, logical)
+    groups = _integers(map(graph.groups.__getitem__, order), len(order))
+    origins = numpy.column_stack([groups, _integers(order, len(order))])
+    return Program(steps, constants, results, origins, graph.callers or {})
+
+
+def _integers(numbers: Iterable[int], count: int) -> numpy.ndarray:
+    return numpy.fromiter(numbers, dtype=numpy.int64, count=count)

@@ -53,6 +53,8 @@ class Statement(NamedTuple):
     """Of ``take``: where its table begins in the constants, and its length."""
     kept: tuple[Operand, ...]
     """Where its members go beside the turn itself."""
+    origin: int
+    """Number of the array operation that it is of; of what is copied none."""
 
 
 class Loop(NamedTuple):
@@ -70,6 +72,17 @@ class Rolled(NamedTuple):
     """Loops that stand before the pause."""
     scratch: int
     """Numbers in the scratch array."""
+
+
+class _Read(NamedTuple):
+    """Where a whole operand comes from."""
+
+    source: int | None
+    """The argument, or the constants; None: the scratch array, or the turn."""
+    turn: int | None
+    """The statement whose members it is, one by one."""
+    statements: set[int]
+    """Those whose members it has."""
 
 
 class _Draft:
@@ -90,6 +103,7 @@ class _Draft:
         self.group = 0
         self.loop = -1
         self.results: list[Operand] = []
+        self.reads: list[_Read] = []
 
 
 class _Roller:
@@ -99,16 +113,15 @@ class _Roller:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
         self.drafts: list[_Draft] = []
-        self.group, self.order = numpy.array(program.origins, dtype=numpy.int64).reshape(-1, 2).T
-        self.logical = numpy.array([logical for _, _, logical in self.steps], dtype=bool)
+        self.group, self.order = program.origins.T
+        self.logical = self.steps.logical
         # Where a free step's number is found, and at which place there; what others are made of, -1 where of less.
         self.source, self.place = numpy.full((2, len(self.steps)), COMPUTED)
         self.parts = numpy.full((len(self.steps), 3), -1)
         self._read_steps()
         # Statement of a step, and which member it is there.
         self.statement, self.member = numpy.full((2, len(self.steps)), -1)
-        for members in self._alike():
-            self._compute(members)
+        self._compute(list(self._alike()))
         early = program.results[:results]
         for late, some in ((False, early), (True, program.results[results:])):
             rows: dict[int, dict[int, int]] = {}
@@ -117,26 +130,26 @@ class _Roller:
             for argument, nodes in rows.items():
                 self._write(argument, nodes, late)
         self._copy_what_is_mixed()
+        reads = self._find_sources()
+        for draft in self.drafts:
+            draft.reads = [next(reads) for _ in draft.columns]
 
     def _read_steps(self) -> None:
-        """Put steps into arrays, operation by operation."""
-        operations = [operation for operation, _, _ in self.steps]
-        arguments = [given for _, given, _ in self.steps]
-        self.names = sorted(set(operations))
-        numbers = {name: number for number, name in enumerate(self.names)}
-        self.kinds = numpy.array([numbers[name] for name in operations], dtype=numpy.int64)
-        self.tables = numpy.zeros(len(self.steps), dtype=numpy.int64)
-        for name, number in numbers.items():
-            there = numpy.flatnonzero(self.kinds == number)
-            given = numpy.array([arguments[index] for index in there.tolist()], dtype=numpy.int64)
+        """Put what steps are made of into arrays, operation by operation."""
+        steps = self.steps
+        self.tables = numpy.zeros(len(steps), dtype=numpy.int64)
+        for kind, name in enumerate(steps.names):
+            there = numpy.flatnonzero(steps.kinds == kind)
+            first = steps.begins[there]
             if name == "constant":
-                self.source[there], self.place[there] = CONSTANTS, given[:, 0]
+                self.source[there], self.place[there] = CONSTANTS, steps.arguments[first]
             elif name == "input":
-                self.source[there], self.place[there] = given.T
+                self.source[there], self.place[there] = steps.arguments[first], steps.arguments[first + 1]
             elif name == "take":
-                self.tables[there], self.parts[there, 0] = given[:, 0], given[:, 2]
+                self.tables[there], self.parts[there, 0] = steps.arguments[first], steps.arguments[first + 2]
             else:
-                self.parts[there, : given.shape[1]] = given
+                for i in range(int((steps.begins[there + 1] - first).max(initial=0))):
+                    self.parts[there, i] = steps.arguments[first + i]
 
     def _add(self, draft: _Draft) -> None:
         if len(draft.members):
@@ -152,16 +165,14 @@ class _Roller:
         computed = numpy.flatnonzero(self.source == COMPUTED)
         if not len(computed):
             return
-        own_kinds = self.kinds[computed]
-        extremes = [number for number, kind in enumerate(self.names) if kind in ("maximum", "minimum")]
-        extreme = numpy.isin(own_kinds, extremes)
+        extreme = self.steps.which("maximum", "minimum")[computed]
         own = parts[computed]
         known = (self.source[own] == CONSTANTS) & extreme[:, None] & (own >= 0)
         flags = numpy.column_stack([known, self.logical[own] & (own >= 0), self.logical[computed]])
         form = flags @ (1 << numpy.arange(flags.shape[1]))
         keys = numpy.stack(
             [
-                own_kinds,
+                self.steps.kinds[computed],
                 self.tables[computed],
                 form,
                 self._levels()[computed],
@@ -172,11 +183,12 @@ class _Roller:
         order = numpy.lexsort([self.order[computed], *keys])
         sorted_keys = keys[:, order]
         cuts = numpy.flatnonzero((sorted_keys[:, 1:] != sorted_keys[:, :-1]).any(axis=0)) + 1
-        for members in numpy.split(computed[order], cuts):
-            if len(members) < LEAST:
-                yield from numpy.split(members, len(members))
+        steps = computed[order]
+        for start, end in pairwise([0, *cuts.tolist(), len(steps)]):
+            if end - start < LEAST:
+                yield from (steps[place : place + 1] for place in range(start, end))
             else:
-                yield members
+                yield steps[start:end]
 
     def _levels(self) -> numpy.ndarray:
         """Of what one operation makes in several steps: how many come before."""
@@ -187,14 +199,22 @@ class _Roller:
             levels[index] = levels[self.parts[index][inside[index]]].max() + 1
         return levels
 
-    def _compute(self, members: numpy.ndarray) -> None:
-        first = self.steps[members[0]]
-        columns = list(self.parts[members].T[: len(first.parts)])
-        draft = _Draft(first.operation, members, columns, bool(members[0] >= self.pause), first.logical)
-        if first.operation == "take":
-            draft.table = first.arguments[0], first.arguments[1]
-        draft.group = int(self.group[members[0]])
-        self._add(draft)
+    def _compute(self, groups: Sequence[numpy.ndarray]) -> None:
+        """Statements of steps that are alike."""
+        heads = numpy.array([members[0] for members in groups], dtype=numpy.int64)
+        kinds, logical, number = (
+            column[heads].tolist() for column in (self.steps.kinds, self.logical, self.group)
+        )
+        operands = (self.parts[heads] >= 0).sum(axis=1).tolist()
+        for i, members in enumerate(groups):
+            name = self.steps.names[kinds[i]]
+            columns = [self.parts[members, k] for k in range(operands[i])]
+            draft = _Draft(name, members, columns, bool(heads[i] >= self.pause), logical[i])
+            if name == "take":
+                start, length, _ = self.steps[int(heads[i])].arguments
+                draft.table = start, length
+            draft.group = number[i]
+            self._add(draft)
 
     def _write(self, argument: int, nodes: dict[int, int], late: bool) -> None:
         """Statements that write results: those of a whole statement with it, the others together."""
@@ -220,18 +240,23 @@ class _Roller:
         draft.results.append(Operand(argument, tuple(rows), draft.logical))
         self._add(draft)
 
-    def _source(self, column: numpy.ndarray) -> int | None:
-        """Argument or constants that a whole operand is read from; None: the scratch array."""
-        source = int(self.source[column[0]])
-        if source == COMPUTED or (len(column) > 1 and (self.source[column] != source).any()):
-            return None
-        return source
+    def _sources(self, columns: Sequence[numpy.ndarray]) -> list[int | None]:
+        """For each operand the argument or the constants that all of it is read from; None: the scratch array."""
+        steps, starts, lengths = _joined(columns)
+        sources = self.source[steps]
+        own = sources[starts]
+        alike = numpy.logical_and.reduceat(sources == numpy.repeat(own, lengths), starts)
+        return [
+            source if same and source != COMPUTED else None
+            for source, same in zip(own.tolist(), alike.tolist(), strict=True)
+        ]
 
     def _copy_what_is_mixed(self) -> None:
         """Inputs and constants that stand beside other values in an operand are copied to the scratch array, once."""
         for late in (False, True):
             columns = [column for draft in self.drafts if draft.late == late for column in draft.columns]
-            mixed = [column[self.statement[column] < 0] for column in columns if self._source(column) is None]
+            pairs = zip(columns, self._sources(columns), strict=True)
+            mixed = [column[self.statement[column] < 0] for column, source in pairs if source is None]
             free = numpy.unique(numpy.concatenate(mixed)) if mixed else numpy.zeros(0, dtype=numpy.int64)
             for source in numpy.unique(self.source[free]):
                 inputs = free[self.source[free] == source]
@@ -242,24 +267,32 @@ class _Roller:
 
     # --- in which order
 
+    def _find_sources(self) -> Iterator[_Read]:
+        """Where all operands of all statements come from."""
+        columns = [column for draft in self.drafts for column in draft.columns]
+        counts = numpy.array([draft.count for draft in self.drafts])
+        steps, starts, lengths = _joined(columns)
+        first = numpy.repeat(steps[starts], lengths)
+        members = numpy.arange(len(steps)) - numpy.repeat(starts, lengths)
+        numbers = self.statement[steps]
+        of_one = numpy.logical_and.reduceat(numbers == self.statement[first], starts)
+        in_order = numpy.logical_and.reduceat(self.member[steps] == members, starts)
+        of_all = of_one & in_order & (counts[numbers[starts]] == lengths)
+        of_one, of_all, number = of_one.tolist(), of_all.tolist(), numbers[starts].tolist()
+        for i, source in enumerate(self._sources(columns)):
+            if source is not None:
+                yield _Read(source, None, set())
+            else:
+                statements = {number[i]} if of_one[i] else set(self.statement[columns[i]].tolist())
+                yield _Read(None, number[i] if of_all[i] else None, statements)
+
     def _needs(self, draft: _Draft) -> dict[int, bool]:
         """Statements that one takes members of, and whether the same turn of a loop will do."""
         needs: dict[int, bool] = {}
-        for column in draft.columns:
-            if self._source(column) is None:
-                turn = self._same_turn(column)
-                for number in self._statements(column):
-                    needs[number] = needs.get(number, True) and number == turn
+        for _, turn, statements in draft.reads:
+            for number in statements:
+                needs[number] = needs.get(number, True) and number == turn
         return needs
-
-    def _statements(self, column: numpy.ndarray) -> set[int]:
-        """Statements whose members these are."""
-        return set(self.statement[column].tolist())
-
-    def _same_turn(self, column: numpy.ndarray) -> int | None:
-        """Statement whose members these are, one by one."""
-        number = int(self.statement[column[0]])
-        return number if numpy.array_equal(column, self.drafts[number].members) else None
 
     def schedule(self) -> list[list[int]]:
         """Put every statement into a loop with others of its count, as early as what it takes allows."""
@@ -310,14 +343,11 @@ class _Roller:
         last: dict[int, int] = {}
         kept: set[int] = set()
         for number, draft in enumerate(drafts):
-            for i, column in enumerate(draft.columns):
-                if self._source(column) is not None:
-                    continue
-                turn = self._same_turn(column)
+            for i, (_, turn, statements) in enumerate(draft.reads):
                 if turn is not None and drafts[turn].loop == draft.loop:
                     turns[number, i] = turn
                     continue
-                for other in self._statements(column):
+                for other in statements:
                     kept.add(other)
                     group = drafts[other].group
                     last[group] = max(last.get(group, 0), draft.loop)
@@ -332,7 +362,7 @@ class _Roller:
             logical = drafts[number].logical if copied else bool(self.logical[column[0]])
             if (number, i) in turns:
                 return Operand(TURN, (turns[number, i],), logical)
-            source = self._source(column)
+            source = drafts[number].reads[i].source
             places = own_places if source is None else self.place
             return Operand(SCRATCH if source is None else source, tuple(places[column].tolist()), logical)
 
@@ -342,7 +372,7 @@ class _Roller:
             to = list(draft.results)
             if number in kept:
                 to.append(Operand(SCRATCH, tuple(range(at[number], at[number] + draft.count)), draft.logical))
-            return Statement(number, draft.operation, own, draft.logical, draft.table, tuple(to))
+            return Statement(number, draft.operation, own, draft.logical, draft.table, tuple(to), draft.group)
 
         made = [Loop(drafts[body[0]].count, [statement(number) for number in body]) for body in loops]
         before = sum(not drafts[body[0]].late for body in loops)
@@ -375,6 +405,13 @@ class _Roller:
         return {number: base[self.drafts[number].group] + k for number, k in inside.items()}, top
 
 
+def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
+    """Columns one after the other, where each begins, and how long it is."""
+    lengths = numpy.array([len(column) for column in columns], dtype=numpy.int64)
+    steps = numpy.concatenate([*columns, numpy.zeros(0, dtype=numpy.int64)])
+    return steps, numpy.cumsum(lengths) - lengths, lengths
+
+
 @without_collection()
 def roll(program: Program, results: int = 0) -> Rolled:
     """Roll a program up.
@@ -393,9 +430,9 @@ def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
         program: with origins.
         results: as :func:`roll` has it.
     """
-    if any(step.operation == "product" for step in program.steps):
+    if "product" in program.steps.operations:
         return None
-    operations = sum(step.operation not in FREE for step in program.steps)
+    operations = numpy.count_nonzero(~program.steps.which(*FREE))
     rolled = roll(program, results)
     statements = sum(len(loop.body) for loop in rolled.loops)
     return rolled if SHORTER * statements < operations + len(program.results) else None

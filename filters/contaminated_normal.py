@@ -57,7 +57,8 @@ def update_position(
         weighted.append(math.log(prior) - math.log(2.0 * math.pi) - 0.5 * (distance + xp.log(determinant)))
     (information, scaled), squared, log_likelihood = inverses[0], distances[0], weighted[0]
     if probability > 0.0:
-        odds = xp.exp(xp.clip(weighted[1] - weighted[0], -700.0, 700.0))
+        # From e^40 on the outlier is certain in double precision, and up to e^80 the odds are a number in single.
+        odds = xp.exp(xp.clip(weighted[1] - weighted[0], -700.0, 80.0))
         outlier = odds / (1.0 + odds)
         log_likelihood = imm.log_sum(xp.stack(weighted))
         difference = scaled - inverses[1][1]

@@ -65,17 +65,15 @@ def cholesky(A: Array) -> list[list[Array]]:
         Rows of L below and on the diagonal, each entry ``(...)``: ``L[i][j]`` with ``j <= i``.
     """
     xp = namespace(A)
-    rows: list[list[Array]] = []
-    for i in range(A.shape[0]):
-        row: list[Array] = []
-        for j in range(i + 1):
-            entry = A[i, j]
-            other = row if i == j else rows[j]
-            for k in range(j):
-                entry = entry - row[k] * other[k]
-            row.append(xp.sqrt(entry) if i == j else entry / rows[j][j])
-        rows.append(row)
-    return rows
+    columns: list[Array] = []
+    # Column by column: every entry loses its products in the same order as in a loop over rows.
+    while A.shape[0] > 1:
+        pivot = xp.sqrt(A[0, 0])
+        below = A[1:, 0] / pivot
+        columns.append(xp.concat([pivot[None], below]))
+        A = A[1:, 1:] - outer(below, below)
+    columns.append(xp.sqrt(A[0]))
+    return [[columns[j][i - j] for j in range(i + 1)] for i in range(len(columns))]
 
 
 def solve_lower(L: list[list[Array]], b: Array) -> list[Array]:

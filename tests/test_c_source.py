@@ -20,6 +20,7 @@ from filtergym.compiler.c_text import (
     identifier,
     literal,
 )
+from filtergym.compiler.interpretation import interpret
 from filtergym.compiler.library import BINARY
 from filtergym.compiler.program import COMPARISONS, FUNCTIONS, LOGICAL, OPERATIONS, Graph, Result, program
 
@@ -280,3 +281,24 @@ def test_the_same_text_is_a_kernel_of_cuda():
         machine_text = ctypes.create_string_buffer(size.value)
         nvrtc.nvrtcGetPTX(handle, machine_text)
         assert b".entry kernel" in machine_text.value
+
+
+@pytest.mark.parametrize("seed", SEEDS[:4])
+def test_a_kernel_of_cuda_has_the_bits_of_the_straight_line(seed):
+    cupy = pytest.importorskip("cupy")
+    if not cupy.cuda.is_available():
+        pytest.skip("no GPU here")
+    code, N = random_program(seed, 120 if seed % 4 else 700), 300  # the last block is not full
+    given = np.random.default_rng(seed).choice(SPECIAL, (4, N))
+    given[:, : N // 2] = np.random.default_rng(seed).normal(scale=3.0, size=(4, N // 2))
+    arrays = [cupy.asarray(given), cupy.full((len(code.results), N), cupy.nan)]
+    table = cupy.asarray([array.data.ptr for array in arrays], dtype=cupy.uint64)
+    strides = cupy.full(2, N, dtype=cupy.int64)
+    # A product and a sum that are rounded together have other bits.
+    text = write_lanes(code, "kernel", [False, False], cuda=True)
+    kernel = cupy.RawModule(code=text, options=("--fmad=false",)).get_function("kernel")
+    kernel((3,), (128,), (table, strides, np.int64(N)))
+    with np.errstate(all="ignore"):
+        expected = interpret(code, lambda _, row: given[row])
+    for result, row in zip(cupy.asnumpy(arrays[1]), expected, strict=True):
+        np.testing.assert_array_equal(result, np.broadcast_to(row, (N,)))

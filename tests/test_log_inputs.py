@@ -206,6 +206,22 @@ def test_of_several_altitudes_one_is_taken(tmp_path):
     assert again.notes[0] == "not read: columns lat, baroaltitude"
 
 
+def test_places_without_deviations_scatter_as_x_and_y_do(tmp_path):
+    log = untold(sigma_x=None, sigma_y=None)
+    plane = read(log, tmp_path)
+    places = read(log[["time"]].assign(**geodetic(log["x"], log["y"])), tmp_path)
+    sigma, expected = (read.deviations["sigma_x"] for read in (places, plane))
+    assert 30.0 < expected < 50.0  # 40 m, by the scatter of some forty plots
+    assert sigma == pytest.approx(expected, rel=0.02)  # a plane that touches elsewhere, and three digits
+    assert places.deviations_from == plane.deviations_from
+    assert (places.measurements["variance"] == sigma**2).all()
+    for recording in (places, plane):  # whoever evaluates filters on it reads what was assumed
+        assert (
+            f"assumed as positions scatter about their neighbours: sigma_x {recording.deviations['sigma_x']:.3g} m"
+            in str(recording.notes)
+        )
+
+
 def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
     aircraft().to_csv(tmp_path / "a.csv", index=False)
     aircraft(truth_velocity_x=None, truth_velocity_y=None).to_csv(tmp_path / "b.csv", index=False)
@@ -219,7 +235,6 @@ def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"sigma_x": None, "sigma_y": None}, "nothing says how large the errors of latitude and longitude are"),
         ({"lon": None}, "lacks the column longitude, which belongs to latitude and longitude"),
         ({"lat": np.full(COUNT, 4870.0)}, "latitude reaches 4870, and degrees from -90 to 90"),
         ({"lat": None, "lon": np.full(COUNT, np.nan), "latitude": np.full(COUNT, np.nan)}, "no row has latitude"),

@@ -20,6 +20,8 @@ import filtergym
 STATIC = Path(__file__).parent.parent / "docs" / "_static"
 WAIT = 60.0
 """Seconds that nobody should need."""
+WIDTH = 16_000.0
+"""Of the map, m."""
 in_browser = pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())
 with_wasmtime = pytest.mark.skipif(
     importlib.util.find_spec("wasmtime") is None, reason="wasmtime is not installed"
@@ -215,13 +217,13 @@ def test_the_pointer_is_the_target(driver):
     for angle in np.linspace(0.0, 2.0 * np.pi, 12):
         moves.move_to_element_with_offset(map, int(300 * np.cos(angle)), int(120 * np.sin(angle)))
     moves.perform()
-    goal = 6000.0 * (1.0 + 300 / (box["width"] / 2)), 6000.0 * box["height"] / box["width"]
+    goal = WIDTH * (0.5 + 300 / box["width"]), 0.5 * WIDTH * box["height"] / box["width"]
     wait(
         driver, "const t = playground.target; return Math.hypot(t.x - t.pointer.x, t.y - t.pointer.y) < 1e-6"
     )
     wait(driver, "return playground.track.steps.length > 150")
     target = driver.execute_script("return [playground.target.x, playground.target.y]")
-    np.testing.assert_allclose(target, goal, atol=2.0 * 12000.0 / box["width"])  # a pixel is that large
+    np.testing.assert_allclose(target, goal, atol=2.0 * WIDTH / box["width"])  # a pixel is that large
     shown = assert_shows_what_python_says(driver)
     assert {step["sigma_x"] for step in shown} == {50}
     np.testing.assert_allclose(np.diff([step["time"] for step in shown]), 2.0, rtol=1e-9)
@@ -260,7 +262,7 @@ def test_keys_and_touch_steer_the_target(driver):
     touch = {"x": box["x"] + 30, "y": box["y"] + 40}
     driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [touch]})
     pointer = driver.execute_script("return playground.target.pointer")
-    scale = 12000.0 / box["width"]
+    scale = WIDTH / box["width"]
     assert pointer["x"] == pytest.approx(30 * scale, abs=2 * scale)
     assert pointer["y"] == pytest.approx((box["height"] - 40) * scale, abs=2 * scale)
     driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
@@ -300,6 +302,18 @@ def test_a_table_is_run_as_python_runs_it(driver):
     ):
         driver.execute_script(DROP, broken)
         wait(driver, f"return {STATUS}.includes('{complaint}')")
+
+
+@pytest.mark.slow
+@in_browser
+def test_the_target_stays_on_the_map_however_slow_the_page_is(driver):
+    """At the border itself it would be held, and slide along it."""
+    shares = driver.execute_script(
+        "playground.advance(3000);"
+        "const truths = playground.track.steps.map((s) => s.truth_y / playground.target.height);"
+        "return [Math.min(...truths), Math.max(...truths)]"
+    )
+    assert 0.0 < shares[0] < shares[1] < 1.0
 
 
 @pytest.mark.slow

@@ -246,8 +246,8 @@ def test_sentences_without_a_date(pynmea2, tmp_path):
 
 def test_no_deviation_is_made_of_hdop(pynmea2, tmp_path):
     path = nmea(tmp_path / "walk.nmea", deviations=False)
-    with pytest.raises(ValueError, match=r"nothing says how large the errors .* of NMEA the sentences GST"):
-        read_recording(path, TARGET)
+    deviation = read_recording(path, TARGET).deviations["sigma_x"]
+    assert deviation < 0.1  # the sentences are written without noise: they scatter by their turn alone
     recording = read_recording(path, TARGET, range_sigma=2.5)
     assert (recording.measurements["variance"] == 6.25).all()
     assert recording.notes[0].startswith("no GST sentence says how large errors are: HDOP tells how")
@@ -507,8 +507,8 @@ def test_messages_of_a_bag(compression, tmp_path):
 
 
 def test_a_bag_without_deviations_or_positions(tmp_path):
-    with pytest.raises(ValueError, match="nothing says how large the errors"):
-        read_recording(bag(tmp_path / "drive.bag", covariance_type=0), TARGET)
+    unknown = read_recording(bag(tmp_path / "drive.bag", covariance_type=0), TARGET)
+    assert "scatter" in unknown.deviations_from
     with pytest.raises(
         ValueError,
         match=r"it holds no sensor_msgs/msg/NavSatFix and no positions; it holds .*std_msgs/msg/String",
@@ -548,7 +548,7 @@ def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
     whole = make(tmp_path / f"whole{suffix}").read_bytes()
     path, rng, sentences = tmp_path / f"log{suffix}", np.random.default_rng(0), []
     # Text is read at once; what takes a library takes longer, and `make fuzz` goes on for hours.
-    for _ in range(40 if suffix in (".pos", ".nmea") else 12):
+    for _ in range(40 if suffix in (".pos", ".nmea") else 6):
         content = bytearray(whole)
         for place in rng.integers(0, len(whole), int(rng.choice([1, 5, 50]))):
             content[place] = int(rng.choice([0, 255, rng.integers(0, 256)]))

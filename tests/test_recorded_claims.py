@@ -1,6 +1,7 @@
 """What the pages say of results, read from the records of the benchmark that the pages show."""
 
 import pytest
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
 from records import read_record
@@ -54,3 +55,11 @@ def test_tuned_estimators_of_maneuvering_targets_come_in_their_order():
     assert turning < min(costs.values())
     for name, cost in costs.items():
         assert cost <= competitors[name.removesuffix("-tuned")]["metrics"]["cost"][0], name
+
+
+def test_the_crash_test_has_a_row_of_everybody_who_is_shipped(env_id):
+    problem = problem_of(env_id)
+    known = problem.baselines
+    shipped = [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(env_id)]
+    rows = [row[0] for row in read_record(f"stress/{bare_name(env_id)}").data["rows"]]
+    assert sorted(rows) == sorted(shipped)

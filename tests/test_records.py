@@ -45,13 +45,11 @@ ROLE = re.compile(r"\{(number|value|record)\}`([^`]+)`")
 MEASURED = re.compile(r"(?<![\w.])\d[\d,.]*\s?(?:%|ns\b|µs\b|\[[-+\d., ]+\])")
 NAMED = re.compile(r"\{record\}`|docs/records/")
 """How a section says where its numbers are from; README, which nobody renders, by a link."""
-COMMAND = re.compile(r"`(filtergym|python) [^`]+`")
-"""How a section of an appendix says so too: its measurements were made once, and stand in no record."""
 MOST_BYTES = 400_000
 
 
-def unnamed_numbers(text: str, appendix: bool = False) -> list[str]:
-    """Return the measured numbers of a page in sections that name no record, or in an appendix no command either.
+def unnamed_numbers(text: str) -> list[str]:
+    """Return the measured numbers of a page in sections that name no record.
 
     Measured is what is per cent, in ns or µs, or has an interval. What stands in code is none, and 95 % is the
     confidence of every interval.
@@ -59,7 +57,7 @@ def unnamed_numbers(text: str, appendix: bool = False) -> list[str]:
     text = re.sub(r"^( *)(```+).*?^\1\2$", "", text, flags=re.M | re.S)
     found = []
     for section in re.split(r"^#+ .*$", text, flags=re.M):
-        if not NAMED.search(section) and not (appendix and COMMAND.search(section)):
+        if not NAMED.search(section):
             plain = re.sub(r"`[^`]*`", "", ROLE.sub("", section))
             found += [number for number in MEASURED.findall(plain) if number != "95 %"]
     return found
@@ -81,18 +79,12 @@ def test_numbers_are_found(text, expected):
     assert unnamed_numbers(text) == expected
 
 
-def test_numbers_of_an_appendix_name_a_command():
-    text = "# A\n\nIt costs 4 % by `filtergym evaluate ID`.\n\n# B\n\nIt costs 5 % with `python`."
-    assert unnamed_numbers(text, appendix=True) == ["5 %"]
-    assert unnamed_numbers(text) == ["4 %", "5 %"]
-
-
 def test_pages():
     assert_properties(list(PAGES), (names_the_record_of_every_number, names_what_is_there))
 
 
 def names_the_record_of_every_number(page):
-    assert unnamed_numbers(PAGES[page], appendix=page.startswith("docs/appendix/")) == []
+    assert unnamed_numbers(PAGES[page]) == []
 
 
 def names_what_is_there(page):

@@ -10,7 +10,8 @@ from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine import reward
-from filtergym.envs.maneuvering_target.kalman_net import LARGEST_ACCELERATION, LEAST_SPEED
+from filtergym.envs.maneuvering_target.kalman_net import LEAST_SPEED, STANDING
+from filtergym.envs.maneuvering_target.student import ACCELERATION_REACH
 from models import Asked, make_model
 from test_kalman_net import AIRCRAFT, RADAR, episodes, network
 
@@ -22,7 +23,7 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
     model, initial, measurements = episodes(RADAR, 16, 3, NAME, undisturbed=0.0)
     rng, bank = np.random.default_rng(0), model.filter
     state, before_motion = bank.start(initial), np.zeros((2, 16))
-    gain_0 = np.array([[0.5, 0.0], [0.0, 0.5], [0.25, 0.0], [0.0, 0.25]])
+    logits = np.log([1.0, 1.0, 1.0 / 3.0, 1.0 / 3.0])
     for measurement in measurements:
         before, predicted = state, bank.predict(state, measurement)
         action = rng.uniform(-1.2, 1.2, (bank.action_space.shape[0], 16))
@@ -30,7 +31,7 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
         assert len(action) == 8 + 4 + 4 + 6 + 2
         for i, a in enumerate(np.clip(action, -1.0, 1.0).T):
             T, v = measurement.interval[i], before.mean[2:, i]
-            along, across = LARGEST_ACCELERATION * before_motion[:, i] / np.hypot(np.hypot(*v), LEAST_SPEED)
+            along, across = ACCELERATION_REACH * before_motion[:, i] / np.hypot(np.hypot(*v), LEAST_SPEED)
             # A turn at constant rate, integrated by its closed form about the centre of the circle.
             heading = np.arctan2(v[1], v[0])
             moved = (
@@ -47,24 +48,27 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
             )
             turned = np.hypot(*v) * np.array([np.cos(heading + across * T), np.sin(heading + across * T)])
             x = np.append(before.mean[:2, i] + (1.0 + 0.5 * along * T) * moved, (1.0 + along * T) * turned)
-            c, s = x[2:] / np.hypot(*x[2:])
+            c, s = x[2:] / np.hypot(np.hypot(*x[2:]), STANDING)
             turn = np.array([[c, s], [-s, c]])
             U = np.kron(np.eye(2), turn)
             sigma = np.sqrt(np.diag(turn @ np.diag(measurement.variance[:, i]) @ turn.T))
             unit = np.append(sigma, sigma / model.task.parameters.sampling_interval)
             nu = measurement.available[i] * turn @ (measurement.position[:, i] - x[:2]) / sigma
-            G = gain_0 + (1.0 - gain_0) * a[:8].reshape(4, 2)
-            mean = x + U.T @ (unit * (G @ nu + student.OFFSET_REACH * a[8:12]))
+            G = 1.0 / (1.0 + np.exp(-logits - student.GAIN_REACH * a[[0, 3, 4, 7]]))
+            coupled = np.array(
+                [nu[0] + a[1] * nu[1], nu[1] + a[2] * nu[0], nu[0] + a[5] * nu[1], nu[1] + a[6] * nu[0]]
+            )
+            mean = x + U.T @ (unit * G * (coupled + student.OFFSET_REACH * a[8:12]))
             L = np.diag(student.DEVIATION_RANGE ** a[12:16])
             L[np.tril_indices(4, -1)] = student.COUPLING_REACH * a[16:22]
             L[np.tril_indices(4, -1)] *= np.diag(L)[np.tril_indices(4, -1)[0]]
             factor = U.T @ np.diag(unit) @ L
             P = factor @ factor.T
-            np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-7, atol=1e-5)
+            np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-9, atol=1e-7)
             scale = np.sqrt(np.outer(np.diag(P), np.diag(P)))
-            np.testing.assert_allclose(state.covariance[:, :, i] / scale, P / scale, atol=1e-7)
-            before_motion[:, i] = a[22:]
-        np.testing.assert_array_equal(state.motion, np.clip(action[22:], -1.0, 1.0))
+            np.testing.assert_allclose(state.covariance[:, :, i] / scale, P / scale, atol=1e-9)
+            before_motion[:, i] = G[2:] * a[22:]
+            np.testing.assert_allclose(state.motion[:, i], before_motion[:, i], rtol=1e-12)
 
 
 def tame(model):
@@ -212,3 +216,21 @@ def test_who_cannot_teach_is_refused(id, overrides, message):
     run = new_run(problem_of(id), RunOptions(algorithm, envs=2, overrides=overrides))
     with pytest.raises(ValueError, match=message):
         Descent(run).flight()
+
+
+def test_units_of_a_memory_forget_over_one_to_the_longest_number_of_decisions():
+    """What is left after a decision in which nothing is shown, of a memory whose weights are zero."""
+    torch = pytest.importorskip("torch")
+    from filtergym.agents.bptt import NetworkPolicy
+
+    space = make_model(RADAR, NAME).action_space
+    policy = NetworkPolicy(3, space, 5, longest_memory=16.0)
+    with torch.no_grad():
+        for each in (policy.gru.weight_ih, policy.gru.weight_hh, policy.gru.bias_hh):
+            each.zero_()
+        policy.gru.bias_ih[10:] = 0.0
+        left = policy.forward(torch.zeros(1, 3), torch.ones(1, 5))[1][0].numpy()
+    over = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    np.testing.assert_allclose(left, over / (1.0 + over), rtol=1e-6)
+    with pytest.raises(ValueError, match="longest_memory"):
+        NetworkPolicy(3, space, 5, longest_memory=1.0)

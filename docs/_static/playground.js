@@ -3,7 +3,7 @@
    base 64. Lengths are in metres and times in seconds, as in the environment. Nothing is fetched. */
 "use strict";
 
-const WIDTH = 12000;           // of the map, m
+const WIDTH = 16000;           // of the map, m
 const HASTE = 30;              // seconds of the target in one of the reader
 const FASTEST = 300;           // speed at which the target reaches the pointer, m/s
 const IN_VIEW = 1000;          // steps that are kept and drawn
@@ -140,7 +140,8 @@ class Target {
     this.left -= seconds;
     const [east, north] = [WIDTH / 2 - this.x, this.height / 2 - this.y];
     if (Math.abs(east) > 0.36 * WIDTH || Math.abs(north) > 0.22 * this.height) {
-      const off = (Math.atan2(east, north) * 180) / Math.PI - this.heading;
+      // On a wide map the middle is mostly to the side: the course to it counts the sides as if the map were a square.
+      const off = (Math.atan2((east * this.height) / WIDTH, north) * 180) / Math.PI - this.heading;
       const nearer = off - 360 * Math.round(off / 360);
       if (Math.abs(nearer) > 30) [this.turn, this.left] = [Math.sign(nearer) * 4, 15];
     } else if (this.left <= 0) {
@@ -458,14 +459,15 @@ class Playground {
     if (live) this.above.line(target, this.above.colour("text"), { width: 9 });
   }
 
-  /* Let the target move; whenever a scan is due, the filters get what it says. */
+  /* Let the target move, a second at most at a time, so that it turns back before the border however slow the page is;
+     whenever a scan is due, the filters get what it says. */
   advance(seconds) {
     const end = this.time + seconds;
     while (this.time < end) {
-      const time = Math.min(this.next, end);
+      const time = Math.min(this.time + 1, this.next, end);
       this.target.move(time - this.time);
       this.time = time;
-      if (time < this.next) return;
+      if (time < this.next) continue;
       this.track.add(measure(this.target, time, this.settings));
       this.next += this.settings.period;
       this.stale = true;

@@ -5,12 +5,16 @@ the rest is the same everywhere. With U the rotation into the frame, s the unit 
 answered of the motion and nu the innovation over the sensor's sigma, zero where nothing was received,
 
     predict   x' = f(x, m)
-    update    x = x' + U^T diag(s) (G nu + g),  G = G0 + (1 - |G0|) a_G,  g = offset_reach a_g
-    report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_i,  L_ij = coupling_reach L_ii a_ij  (j < i)
+    update    x = x' + U^T diag(s) c,  c_i = G_i (nu_j + sum_k a_ik nu_k + offset_reach a_i),  k other than j
+    motion    m_l = G_i a_l
+    report    P = U^T diag(s) L L^T diag(s) U,  L_ii = deviation_range^a_ii,  L_ij = coupling_reach L_ii a_ij  (j < i)
 
-where a in [-1, 1] are the network's answers. All zero is a filter with the fixed gain G0. Because everything that is
-shown and answered is relative to the frame, the estimator is as symmetric as the frame is. Nothing makes it stable: a
-Kalman filter's gain follows from a covariance, and this one loses the track where its network answers wrongly.
+with a in [-1, 1] the network's answers, j the axis that corrects component i, G_i = logistic(logit G0_i + gain_reach a)
+and i in m_l the component that is moved. All zero is a filter with the fixed gain G0. Gains are answered as logits, and
+whatever else moves a component is in units of its gain: on straight flight the best gains are some thousandths, and
+what is not as small drives the estimate away. Because everything that is shown and answered is relative to the frame,
+the estimator is as symmetric as the frame is. Nothing makes it stable: a Kalman filter's gain follows from a
+covariance, and this one loses the track where its network answers wrongly.
 
 A network that is trained through its own recursive estimate is that of Haarnoja and others, "Backprop KF: Learning
 Discriminative Deterministic State Estimators" (NeurIPS 2016); theirs answers with the measurement of a Kalman filter.
@@ -29,8 +33,10 @@ from ...filters.small_matrices import apply, outer, product, transpose
 from .filter import Bank, Initial, Measurement, TaskT
 from .observation import SIGNED_LOG, Array, Block
 
+GAIN_REACH = 5.0
+"""Logits by which an answer of one moves a gain: from a half to 0.007 or 0.993."""
 OFFSET_REACH = 2.0
-"""Largest correction that does not depend on the innovation, in units of the component."""
+"""Innovation, in sigmas, that a correction without one counts for at most."""
 DEVIATION_RANGE = 50.0
 """Largest factor and divisor of a reported deviation, likewise; before what it shares with the components above."""
 COUPLING_REACH = 4.0
@@ -58,7 +64,7 @@ class Track(NamedTuple):
     covariance: Array
     """As it was reported last, ``(C, C, N)``."""
     motion: Array
-    """Answered last of the motion, in [-1, 1], ``(k, N)``; one row of zeros where nothing is."""
+    """Answered last of the motion, between -1 and 1, ``(k, N)``; one row of zeros where nothing is."""
     view: View
     """Of the measurement at hand."""
 
@@ -70,19 +76,17 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
     else is shown (:attr:`features`).
     """
 
-    gain: ClassVar[Sequence[Sequence[float]]]
-    """G0, ``(C, m)``: what a network without training corrects by."""
+    gain: ClassVar[Sequence[tuple[int, float]]]
+    """For each component the axis of the innovation that corrects it, and G0 in (0, 1): what a network without training
+    corrects by."""
     axes: ClassVar[Sequence[str]]
     """Names of the numbers of an innovation, ``(m,)``."""
-    motions: ClassVar[Sequence[str]] = ()
-    """Names of the numbers that are answered of the motion."""
+    motions: ClassVar[Sequence[int]] = ()
+    """For each number that is answered of the motion the component that it moves."""
 
     def __init__(self, task: TaskT, control: str) -> None:
         super().__init__(task, control)
-        gain = numpy.array(self.gain, dtype=float)
-        self.size, self.measured = gain.shape
-        constant = task.constant  # type: ignore[attr-defined]
-        self.fixed_gain, self.reach = (constant(each[..., None]) for each in (gain, 1.0 - abs(gain)))
+        self.size, self.measured = len(self.gain), len(self.axes)
 
     @abstractmethod
     def rotate(self, mean: Array) -> Array:
@@ -145,12 +149,11 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
         xp, C, m = self.xp, self.size, self.measured
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         ends = numpy.cumsum([0, C * m, C, C, C * (C - 1) // 2, len(self.motions)])
-        by_gain, offset, diagonal, coupling, motion = (
+        by_gain, offset, diagonal, coupling, by_motion = (
             a[first:last] for first, last in itertools.pairwise(ends)
         )
         inverse, unit = transpose(state.view.frame), state.view.unit
-        gain = self.fixed_gain + self.reach * xp.reshape(by_gain, (C, m, -1))
-        correction = apply(gain, state.view.innovation) + OFFSET_REACH * offset
+        gains, corrections = self._correct(xp.reshape(by_gain, (C, m, -1)), offset, state.view.innovation)
         deviation = unit * xp.exp(math.log(DEVIATION_RANGE) * diagonal)
         factor, entry = [], iter(range(C * (C - 1) // 2))
         for i in range(C):
@@ -161,7 +164,22 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
         for column in range(1, C):
             covariance = covariance + outer(rotated[:, column], rotated[:, column])
         return state._replace(
-            mean=state.mean + apply(inverse, unit * correction),
+            mean=state.mean + apply(inverse, unit * corrections),
             covariance=covariance,
-            motion=motion if self.motions else state.motion,
+            motion=xp.stack([gains[i] * answer for i, answer in zip(self.motions, by_motion, strict=True)])
+            if self.motions
+            else state.motion,
         )
+
+    def _correct(self, by_gain: Array, offset: Array, innovation: Array) -> tuple[list[Array], Array]:
+        """Return G of each component, and c, ``(C, N)``."""
+        gains, corrections = [], []
+        for row, beyond, (axis, first) in zip(by_gain, offset, self.gain, strict=True):
+            gain = 1.0 / (1.0 + (1.0 / first - 1.0) * self.xp.exp(-GAIN_REACH * row[axis]))
+            moved_by = innovation[axis] + OFFSET_REACH * beyond
+            for other in range(self.measured):
+                if other != axis:
+                    moved_by = moved_by + row[other] * innovation[other]
+            gains.append(gain)
+            corrections.append(gain * moved_by)
+        return gains, self.xp.stack(corrections)

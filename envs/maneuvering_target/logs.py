@@ -107,7 +107,11 @@ def read_log(columns: Columns) -> TrackLog:
         parameters,
         float(columns.time[first]),
         time,
-        (*_stale_notes(stale), *_gap_notes(rows)),
+        (
+            *_assumption_notes(columns, said_deviations, deviations_from),
+            *_stale_notes(stale),
+            *_gap_notes(rows),
+        ),
         {"range_sigma": said_deviations["sigma_x"]} if assumed else _typical_sigma(columns, there),
         said_deviations,
         deviations_from,
@@ -262,12 +266,7 @@ def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.nda
         position: of its plots, m, ``(n, 2)``.
         time: s, likewise.
     """
-    if (
-        not columns.has("x")
-        or columns.origin is not None
-        or columns.has("sigma_x")
-        or columns.has("range_sigma")
-    ):
+    if not columns.has("x") or columns.has("sigma_x") or columns.has("range_sigma"):
         return 0.0
     if "range_sigma" in columns.given:
         return float(columns.given["range_sigma"])
@@ -281,8 +280,6 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
         if columns.has(*pair):
             medians = {name: float(f"{numpy.nanmedian(columns[name][there]):.6g}") for name in pair}
             return medians, f"columns {pair[0]} and {pair[1]}"
-    if columns.origin is not None:
-        assumed = float(columns.given["range_sigma"])
     if assumed:
         named = "range_sigma" in columns.given
         who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
@@ -295,6 +292,15 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
     return values, "no column states deviations, assumed as of the environment's radar"
 
 
+def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
+    """Say which deviations are assumed where neither a column nor the user states one."""
+    if "no column" not in source or "range_sigma" in columns.given:
+        return []
+    units = {"azimuth_sigma": "degrees"}
+    listed = ", ".join(f"{name} {value:.3g} {units.get(name, 'm')}" for name, value in deviations.items())
+    return [f"{source}: {listed}"]
+
+
 def _variances(
     columns: Columns, position: numpy.ndarray, there: numpy.ndarray, assumed: float = 0.0
 ) -> numpy.ndarray:
@@ -305,15 +311,6 @@ def _variances(
         return variance
     if assumed:
         variance[there] = assumed**2
-        return variance
-    if columns.origin is not None:
-        # No radar stands at the first position, by whose distance errors could be told.
-        if "range_sigma" not in columns.given:
-            raise ValueError(
-                "nothing says how large the errors of latitude and longitude are: add the columns sigma_x and sigma_y "
-                "(m, east and north; of NMEA the sentences GST), or name one deviation of both, --set range_sigma=3"
-            )
-        variance[there] = float(columns.given["range_sigma"]) ** 2
         return variance
     if columns.has("range_sigma", "azimuth_sigma"):
         sigmas = columns.only(there).sigmas("range_sigma", "azimuth_sigma").T

@@ -2,8 +2,8 @@
 
 The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
 unit of a position is the measurement's sigma there, that of a velocity what such an error makes of it in a scan period.
-Of the motion the network answers with the acceleration until the next scan, along and across, as in ``kalman-net``.
-Turning or moving the whole problem turns and moves the estimates.
+Of the motion the network answers with the acceleration until the next scan, along and across. Turning or moving the
+whole problem turns and moves the estimates.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,6 @@ from ..contract.observation import Array, Block
 from ..contract.student import StudentBank, Track, View
 from .kalman_net import (
     FRAME,
-    LARGEST_ACCELERATION,
     advance,
     clock_blocks,
     frame_of,
@@ -23,14 +22,17 @@ from .kalman_net import (
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
+ACCELERATION_REACH = 32.0
+"""Acceleration answered at a gain of the velocity of one, m/s^2: 8 at that of a network without training."""
+
 
 class RadarStudentBank(StudentBank[object, Measurement]):
     """Position and velocity of an aircraft, corrected in the frame of its velocity."""
 
     parameters: ManeuveringTargetParameters
     # An alpha-beta filter without training: a half, and a quarter of the innovation over the scan period.
-    gain = ((0.5, 0.0), (0.0, 0.5), (0.25, 0.0), (0.0, 0.25))
-    axes = motions = FRAME
+    gain = ((0, 0.5), (1, 0.5), (0, 0.25), (1, 0.25))
+    axes, motions = FRAME, (2, 3)
 
     def rotate(self, mean: Array) -> Array:
         """Turn positions and velocities alike, ``(4, 4, N)``."""
@@ -42,7 +44,7 @@ class RadarStudentBank(StudentBank[object, Measurement]):
     def look(self, mean: Array, motion: Array, measurement: Measurement) -> View:
         """Predict by the acceleration that was answered."""
         xp = self.xp
-        mean, _ = advance(mean, LARGEST_ACCELERATION * motion, measurement.interval)
+        mean, _ = advance(mean, ACCELERATION_REACH * motion, measurement.interval)
         frame = self.rotate(mean)
         turn = frame[:2, :2]
         R = self.turned_covariance(turn, measurement)

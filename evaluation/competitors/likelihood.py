@@ -16,6 +16,7 @@ from ...compiler import namespace
 from ...compiler.functions import Function, empty_lanes, leaves, map_arrays, round_up_lanes
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
+from ...compiler.sequence import CallSequence, moving_array
 from ...envs.contract.filter import Filter, Input
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
@@ -182,7 +183,7 @@ class WindowLikelihood:
             update = functools.partial(_update, traced, self.names, apply)
             self._compiled = Function(update, graph, unchanged=0)
         self._counts = windows.counts
-        self._tiles: dict[int, tuple[Any, list[Any]]] = {}
+        self._tiles: dict[int, tuple[Any, list[numpy.ndarray]]] = {}
         first = self._by_measurement(numpy.array([[value] for value in start.values()], dtype=float))[:, :, 0]
         if numpy.isnan(first).all():
             raise ValueError("the estimator does not say how likely measurements were: return it from update")
@@ -227,10 +228,12 @@ class WindowLikelihood:
             found = self._run(numpy.ascontiguousarray(values[:, lanes]), initial, measurements)
         return numpy.moveaxis(found[:, : count * W].reshape(len(found), count, W), 1, 2)
 
-    def _run(self, values: numpy.ndarray, initial: Any, measurements: list[Any]) -> numpy.ndarray:
+    def _run(
+        self, values: numpy.ndarray, initial: Any, measurements: Sequence[numpy.ndarray]
+    ) -> numpy.ndarray:
         """Run all lanes, ``(T, lanes)``."""
-        lanes = initial.mean.shape[-1]
-        found = numpy.empty((len(measurements), lanes))
+        lanes, length = initial.mean.shape[-1], len(self._counts)
+        found = numpy.empty((length, lanes))
         given = values if self.in_lanes else values[:, 0]
         own = as_filter(
             self.task, self.apply({name: given[i] for i, name in enumerate(self.names)})[1](self.task)
@@ -243,42 +246,55 @@ class WindowLikelihood:
             except NotTraceable as error:
                 warn_of(type(own).__name__, error)
                 self._compiled, memory = None, own.start(initial)
-        for k, measurement in enumerate(measurements):
-            memory, told = _step(own, measurement, memory)
+        for k in range(length):
+            memory, told = _step(own, self._measurement(measurements, k), memory)
             found[k] = numpy.nan if told is None else told
         return found
 
-    @staticmethod
     def _run_compiled(
-        function: Function, values: numpy.ndarray, measurements: list[Any], memory: Any, found: numpy.ndarray
+        self,
+        function: Function,
+        values: numpy.ndarray,
+        measurements: Sequence[numpy.ndarray],
+        memory: Any,
+        found: numpy.ndarray,
     ) -> None:
         """Run all lanes through code that is bound to two memories, to and fro, and write what was found."""
-        program = function.specialise(values, measurements[0], memory)
+        program = function.specialise(values, self._measurement(measurements, 0), memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
         memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
         for place, array in zip(memories[0], leaves(memory), strict=True):
             place[...] = array
-        first = leaves(measurements[0])
+        first = [array[0] for array in measurements]
         calls = [
             program.bound([values, *first, *before], [*after, found[0]])
             for before, after in (memories, memories[::-1])
         ]
         last = len(calls[0].arrays) - 1
-        for k, measurement in enumerate(measurements):
-            call = calls[k % 2]
-            for i, array in enumerate(leaves(measurement), 1):
-                call.replace(i, array)
-            call.replace(last, found[k])
-            call(0, lanes)
+        moving = [
+            moving_array(call, place, arrays)
+            for call in calls
+            for place, arrays in (*enumerate(measurements, 1), (last, found))
+        ]
+        CallSequence(calls[:1], calls[1:], moving).run(len(found), lanes)
 
-    def _tile_windows(self, count: int) -> tuple[Any, list[Any]]:
-        """Initial estimates and measurements of so many candidates, one after another."""
+    def _measurement(self, measurements: Sequence[numpy.ndarray], k: int) -> Any:
+        """Measurement k, put together from the arrays of all of them."""
+        arrays = iter(measurements)
+        return map_arrays(lambda _: next(arrays)[k], self.windows.measurements[0])
+
+    def _tile_windows(self, count: int) -> tuple[Any, list[numpy.ndarray]]:
+        """Initial estimates of so many candidates, one after another, and of each array of a measurement those of all
+        T measurements, ``(T, ..., lanes)``.
+        """
         if count not in self._tiles:
             W = self._counts.shape[1]
             windows = numpy.arange(round_up_lanes(count * W)) % W
 
-            def tile(part: Any) -> Any:
-                return map_arrays(lambda array: numpy.ascontiguousarray(array[..., windows]), part)
+            def tile(array: numpy.ndarray) -> numpy.ndarray:
+                return numpy.ascontiguousarray(array[..., windows])
 
-            self._tiles = {count: (tile(self.windows.initial), [tile(m) for m in self.windows.measurements])}
+            arrays = zip(*(leaves(measurement) for measurement in self.windows.measurements), strict=True)
+            stacked = [tile(numpy.stack(each)) for each in arrays]
+            self._tiles = {count: (map_arrays(tile, self.windows.initial), stacked)}
         return self._tiles[count]

@@ -4,18 +4,29 @@ Matrix products of many small matrices are slower on several threads than on one
 cores; and how a library shares a product out may change the last bit of it.
 """
 
+import functools
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries read when they are loaded."""
 _INSIDE = ContextVar("inside", default=False)
 """Whether whoever runs has one thread already."""
+
+
+@functools.lru_cache(1)
+def _controller(modules: int) -> ThreadpoolController:
+    """Return the libraries with threads of their own; a search takes 1.5 ms, so again only where modules were imported.
+
+    Args:
+        modules: how many are imported.
+    """
+    return ThreadpoolController()
 
 
 @contextmanager
@@ -30,7 +41,7 @@ def one_thread() -> Iterator[None]:
     os.environ.update(dict.fromkeys(SETTINGS, "1"))
     token = _INSIDE.set(True)
     try:
-        with threadpool_limits(1):
+        with _controller(len(sys.modules)).limit(limits=1):
             if torch is not None and threads != 1:
                 torch.set_num_threads(1)
             yield

@@ -1,13 +1,13 @@
 """The command that advises which filter to take for a log."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ..agents.named_policies import pretrained_agents
-from ..baselines.advice import advise, fit_all
+from ..baselines.advice import FittedLog, advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
@@ -52,6 +52,19 @@ def price_words(price: Mapping[str, int] | None) -> str:
     )
 
 
+def update_prices(problem: Problem, recording: Recording) -> Callable[[str, Any], Mapping[str, int] | None]:
+    """Return what says what an update of a competitor costs in C, by its name and what makes it."""
+    parameters = setup_of(problem, recording).parameters
+
+    def price(name: str, maker: Any) -> Mapping[str, int] | None:
+        from ..exports.c_source import price_of
+        from ..exports.request import ExportRequest
+
+        return price_of(ExportRequest(problem, name, maker, keywords=parameters))
+
+    return price
+
+
 def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
     """Fit one filter to all of a recording, say its parameters, and write them.
 
@@ -69,7 +82,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
     if name in families:
         writable_file(out)
-    tunable, fitted, intervals = fit_all(problem, found, family, seed=seed)
+    tunable, fitted, intervals = fit_all(FittedLog(problem, found, seed=seed), family)
     likelihood = fitted.log_likelihood / fitted.measurements
     console.print(
         f"{name}, fitted to {fitted.measurements:,} measurements, {likelihood:.3f} nats per measurement:",
@@ -162,25 +175,8 @@ def advise_on_log(
             bar.update(line, completed=share)
             bar.say(what)
 
-        parameters = setup_of(problem, found).parameters
-
-        def price(name: str, maker: Any) -> dict[str, int] | None:
-            from ..exports.c_source import price_of
-            from ..exports.request import ExportRequest
-
-            return price_of(ExportRequest(problem, name, maker, keywords=parameters))
-
-        advice = advise(
-            problem,
-            found,
-            shipped,
-            own,
-            noise=noise,
-            seed=seed,
-            progress=progress,
-            price_of=price,
-            **keywords,
-        )
+        prices = update_prices(problem, found)
+        advice = advise(FittedLog(problem, found, noise, seed, keywords), shipped, own, progress, prices)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:

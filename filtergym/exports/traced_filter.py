@@ -20,7 +20,7 @@ from ..agents.residual import ResidualPolicy
 from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
-from ..compiler.program import Graph, Program, Result, program
+from ..compiler.program import Graph, Program, Result, Steps, program
 from ..envs.contract.filter import Filter, Input
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task, field_words
@@ -347,7 +347,7 @@ def trace_filter(
         ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    graph = Graph()
+    graph = Graph(callers=True)
     try:
         with namespace.tracing(graph):
             return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
@@ -426,10 +426,9 @@ def _live_members(
 
 def _renumbered(code: Program, place: dict[int, int]) -> Program:
     """The program with the rows of the state that are kept."""
-    steps = [
-        step._replace(arguments=(STATE, place[step.arguments[1]]))
-        if step.operation == "input" and step.arguments[0] == STATE
-        else step
-        for step in code.steps
-    ]
-    return code._replace(steps=steps)
+    steps, arguments = code.steps, code.steps.arguments.copy()
+    inputs = steps.begins[:-1][steps.which("input")]
+    rows = 1 + inputs[arguments[inputs] == STATE]
+    arguments[rows] = [place[row] for row in arguments[rows].tolist()]
+    renumbered = Steps(steps.names, steps.kinds, steps.begins, arguments, steps.logical)
+    return code._replace(steps=renumbered)
