@@ -133,10 +133,12 @@ $(DONE)/harm-%: $(DONE)/ship-%
 	  --command "python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*)"
 	$(finish)
 
+cross = arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
+
 $(DONE)/exported: $(shipped)
-	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
+	$(BIN)/python benchmarks/exported.py --cross "$(cross)" --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
-	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
+	  --command "python benchmarks/exported.py --cross '$(cross)' --out docs/data/exported.csv"
 	$(finish)
 
 $(DONE)/budgets: $(ENVIRONMENTS:%=$(DONE)/tune-%)
