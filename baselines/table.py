@@ -168,6 +168,8 @@ class Baselines:
     log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None
     """Estimators that are fitted to a recording, with limits that suit it (None: any recording); without this function
     those of ``tunable``."""
+    best_constant: str = ""
+    """The tunable policy that stands for the best constant action in the room table."""
     metrics: "OwnMetrics | None" = None
     """The environment's own."""
 

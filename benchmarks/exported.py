@@ -4,7 +4,8 @@ A line for each: operations and bytes of state in double; bytes of the source, o
 them of it, and of the largest stack of a function; the largest difference to the replay in double and in float, in the
 standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that LLVM
 makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written says why.
-Times are of processor time, the least of several runs.
+Times are of processor time, the least of several runs. ``--cross`` names a compiler of another processor, with which
+the files are compiled only, in double and in float.
 
 Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
 """
@@ -54,7 +55,8 @@ from filtergym.names import find_competitor
 
 COLUMNS = (
     "environment", "competitor", "operations", "state_bytes", "weight_bytes", "source_bytes", "code_bytes",
-    "stack_bytes", "double_sigmas", "float_sigmas", "double_ns", "float_ns", "llvm_ns", "numpy_ns", "refusal",
+    "stack_bytes", "cross_bytes", "cross_float_bytes", "double_sigmas", "float_sigmas", "double_ns", "float_ns",
+    "llvm_ns", "numpy_ns", "refusal",
 )  # fmt: skip
 LANES = 512
 BATCH = """#include <math.h>
@@ -104,21 +106,39 @@ class Size(NamedTuple):
     """With constants."""
     stack: int
     """Of the function that takes most."""
+    cross: int | None
+    """Of code and constants for another processor."""
 
 
-def size_of(file: Path, compiler: str) -> Size:
+class Compilers(NamedTuple):
+    """What compiles the files."""
+
+    own: str
+    cross: list[str]
+    """A compiler of another processor with its options, or nothing."""
+
+
+def size_of(file: Path, compilers: Compilers) -> Size:
     """Size of an exported filter, compiled to be small by gcc."""
-    folder, made = file.parent, file.with_suffix(".small.o")
-    command = [compiler, *FLAGS, "-Os", "-fstack-usage", "-c", file.name, "-o", made.name]
-    subprocess.run(command, cwd=folder, check=True)
-    told = subprocess.run(["size", made.name], cwd=folder, check=True, capture_output=True, text=True).stdout
-    usage = made.with_suffix(".su").read_text(encoding="utf-8").splitlines()
+    code = _code_bytes(file, [compilers.own, "-fstack-usage"])
+    usage = file.with_suffix(".small.su").read_text(encoding="utf-8").splitlines()
     stack = max(int(line.split("\t")[1]) for line in usage)
-    return Size(file.stat().st_size, int(told.splitlines()[1].split()[0]), stack)
+    cross = _code_bytes(file, compilers.cross) if compilers.cross else None
+    return Size(file.stat().st_size, code, stack, cross)
+
+
+def _code_bytes(file: Path, compiler: list[str]) -> int:
+    """Bytes of code and constants."""
+    made = file.with_suffix(".small.o").name
+    subprocess.run([*compiler, *FLAGS, "-Os", "-c", file.name, "-o", made], cwd=file.parent, check=True)
+    # The one beside it: arm-none-eabi-size of arm-none-eabi-gcc.
+    tool = f"{compiler[0].removesuffix('gcc')}size" if compiler[0].endswith("gcc") else "size"
+    told = subprocess.run([tool, made], cwd=file.parent, check=True, capture_output=True, text=True).stdout
+    return int(told.splitlines()[1].split()[0])
 
 
 def run_in_c(
-    name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compiler: str
+    name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compilers: Compilers
 ) -> tuple[float, float, Writer, Size]:
     """Largest difference, in standard deviations, nanoseconds an update, what wrote the files, and their size."""
     writer = Writer(name, traced, scalar, given.components)
@@ -138,7 +158,9 @@ def run_in_c(
             given.initial.T.tobytes() + numpy.moveaxis(given.measurements, -1, 0).astype(float).tobytes()
         )
         subprocess.run(
-            [compiler, *FLAGS, "batch.c", f"{writer.name}.c", "-lm", "-o", "batch"], cwd=folder, check=True
+            [compilers.own, *FLAGS, "batch.c", f"{writer.name}.c", "-lm", "-o", "batch"],
+            cwd=folder,
+            check=True,
         )
         done = subprocess.run(
             [folder / "batch", "in", "out", str(E), str(T)],
@@ -147,7 +169,7 @@ def run_in_c(
             capture_output=True,
             text=True,
         )
-        size = size_of(folder / f"{writer.name}.c", compiler)
+        size = size_of(folder / f"{writer.name}.c", compilers)
         means = numpy.frombuffer((folder / "out").read_bytes()).reshape(E, T, -1)
     return given.largest_difference(numpy.moveaxis(means, 0, -1)), float(done.stdout), writer, size
 
@@ -211,7 +233,7 @@ def ranked(problem: Problem) -> list[str]:
 
 
 def lines(
-    problem: Problem, names: list[str], episodes: int, measurements: int, compiler: str
+    problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
     """A line for each competitor."""
     for name in names:
@@ -222,9 +244,10 @@ def lines(
         except ValueError as error:
             yield {**line, "refusal": str(error)}
             continue
-        double, double_ns, writer, size = run_in_c(name, traced, given, DOUBLE, compiler)
+        double, double_ns, writer, size = run_in_c(name, traced, given, DOUBLE, compilers)
         line |= {"double_sigmas": double, "double_ns": double_ns}
         line |= {"source_bytes": size.source, "code_bytes": size.code, "stack_bytes": size.stack}
+        line["cross_bytes"] = size.cross
         operations, state, weights, _ = writer.sizes
         line |= {"operations": operations, "state_bytes": state, "weight_bytes": weights}
         if operations > 10_000:
@@ -233,7 +256,8 @@ def lines(
                 run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
             )
         else:
-            line["float_sigmas"], line["float_ns"], *_ = run_in_c(name, traced, given, FLOAT, compiler)
+            line["float_sigmas"], line["float_ns"], _, size = run_in_c(name, traced, given, FLOAT, compilers)
+            line["cross_float_bytes"] = size.cross
         with numpy.errstate(all="ignore"):
             line |= {
                 "llvm_ns": llvm_nanoseconds(traced, given),
@@ -249,6 +273,8 @@ COST = (
     "state, bytes",
     "code, kB",
     "stack, kB",
+    "code of --cross, kB",
+    "in float",
     "ns in C",
     "NumPy / C",
     "C / LLVM",
@@ -262,7 +288,7 @@ def summary(found: list[dict[str, Any]]) -> str:
         own = [line for line in found if line["environment"] == environment]
         there = [line for line in own if line.get("double_ns")]
         numbers = {
-            key: numpy.array([float(line[key] or "nan") for line in there])
+            key: numpy.array([float(line.get(key) or "nan") for line in there])
             for key in COLUMNS[2:-1]
             if key != "float_ns"
         }
@@ -275,7 +301,8 @@ def summary(found: list[dict[str, Any]]) -> str:
             cells += [f"{numpy.median(numbers[key]):.0e}", f"{numbers[key].max():.0e}"]
         accuracy.append(f"| {' | '.join(cells)} |")
         cells = [name, *(_range(numbers[key]) for key in ("operations", "state_bytes"))]
-        cells += [_range(numbers[key] / 1000.0) for key in ("code_bytes", "stack_bytes")]
+        sizes = ("code_bytes", "stack_bytes", "cross_bytes", "cross_float_bytes")
+        cells += [_range(numbers[key] / 1000.0) for key in sizes]
         cells += [_range(numbers["double_ns"])]
         cells += [_range(numbers["numpy_ns"] / ns), f"{numpy.median(faster):.1f}" if len(faster) else ""]
         cost.append(f"| {' | '.join(cells)} |")
@@ -283,7 +310,8 @@ def summary(found: list[dict[str, Any]]) -> str:
 
 
 def _range(values: numpy.ndarray) -> str:
-    return f"{numpy.median(values):,.0f} ({values.min():,.0f} to {values.max():,.0f})"
+    values = values[numpy.isfinite(values)]
+    return f"{numpy.median(values):,.0f} ({values.min():,.0f} to {values.max():,.0f})" if len(values) else ""
 
 
 def main() -> None:
@@ -295,6 +323,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--measurements", type=int, default=200)
     parser.add_argument("--compiler", default=shutil.which("cc"))
+    parser.add_argument("--cross", default="", help='such as "arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb"')
     parser.add_argument("--out", type=Path)
     parser.add_argument("--read", type=Path, help="summarise what --out has written, and run nothing")
     asked = parser.parse_args()
@@ -307,9 +336,8 @@ def main() -> None:
     found: list[dict[str, Any]] = []
     for id in asked.environment or list(catalogue()):
         problem = problem_of(id)
-        for line in lines(
-            problem, asked.policy or ranked(problem), asked.episodes, asked.measurements, asked.compiler
-        ):
+        names, compilers = asked.policy or ranked(problem), Compilers(asked.compiler, asked.cross.split())
+        for line in lines(problem, names, asked.episodes, asked.measurements, compilers):
             found.append(line)
             print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)
     if asked.out is not None:

@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from .c_text import WIDTH, Scalar, array_text, expression, literal
+from .c_text import WIDTH, Scalar, array_text, comment, expression, literal
 from .program import Program
 from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, steady
 
+MOST = 4
+"""Functions that the comment before a loop names."""
 SAVED = 40
 """Bytes of tables that a second loop must save, and again for each place that it goes on from."""
 
@@ -61,17 +63,32 @@ class Loops:
         self.program, self.name, self.read, self.write, self.arrays = program, name, read, write, arrays
         self.scalar, self.tables, self.qualifier = scalar, tables, qualifier
         self.defined: list[str] = []
+        self._last_words = ""
         self._found: dict[tuple[Any, ...], str] = {}
         self._columns, self._runs = 1, [0]
         self._starts: dict[tuple[int, ...], str] = {}
 
     def loop(self, loop: Loop) -> list[str]:
+        """Return the lines of a loop. Before the first stands a comment, unless the loop before has the same: which
+        functions its operations are of.
+        """
+        first, *rest = self._lines(loop)
+        callers = dict.fromkeys(self.program.callers.get(statement.origin, "") for statement in loop.body)
+        names = [caller for caller in callers if caller]
+        others = [f"and {len(names) - MOST} others"] * (len(names) > MOST)
+        words = "; ".join([*names[:MOST], *others])
+        if words and words != self._last_words:
+            self._last_words = words
+            first = f"{comment(words, indent='    ').lstrip()}\n    {first}"
+        return [first, *rest]
+
+    def _lines(self, loop: Loop) -> list[str]:
         """Return the lines of a loop, or of two where rows and columns, or runs of members whose places are steadily
         apart, take shorter tables than all members.
         """
         self._choose_form(loop)
         lines = []
-        for number, operation, operands, logical, table, kept in loop.body:
+        for number, operation, operands, logical, table, kept, _ in loop.body:
             values = [self._value(operand) for operand in operands]
             known = [operand.array == CONSTANTS for operand in operands]
             taken = (self.tables[table[0]], table[1]) if operation == "take" else None

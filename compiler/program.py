@@ -8,9 +8,12 @@ import functools
 import gc
 import itertools
 import os
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import numpy
@@ -106,10 +109,12 @@ class Graph:
         groups: number of the array operation that made an expression: those of one do not depend on one another.
         tables: what ``take`` and ``product`` read, ``(length,)`` each.
         loops: whether products with large matrices of constants may be kept whole, for code that has loops.
+        callers: functions that asked for each array operation, by its number; None: nobody wants to know.
     """
 
-    def __init__(self, loops: bool = False) -> None:
+    def __init__(self, loops: bool = False, callers: bool = False) -> None:
         self.loops = loops
+        self.callers: dict[int, str] | None = {} if callers else None
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
@@ -135,6 +140,8 @@ class Graph:
     def begin_group(self) -> None:
         """Say that what is made from now on is another array operation."""
         self.group += 1
+        if self.callers is not None:
+            self.callers[self.group] = _callers()
 
     def input(self, argument: int, row: int) -> int:
         """Number in a row of an argument."""
@@ -368,6 +375,18 @@ class Graph:
         return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
 
+def _callers() -> str:
+    """The nearest function outside of this package, and the nearest of another file that has called it."""
+    found: dict[str, str] = {}
+    frame: types.FrameType | None = sys._getframe(2)
+    while frame is not None and len(found) < 2:
+        place, name = Path(frame.f_code.co_filename), frame.f_code.co_name
+        if place.parent != Path(__file__).parent and not name.startswith("<"):
+            found.setdefault(place.stem, name)
+        frame = frame.f_back
+    return " of ".join(f"{file}.{name}" for file, name in found.items())
+
+
 class Result(NamedTuple):
     """Where a program writes an expression."""
 
@@ -478,16 +497,16 @@ class Program(NamedTuple):
     origins: numpy.ndarray
     """``(n, 2)``: for each step the number of the array operation that made it, and one that grows from member to
     member."""
+    callers: Mapping[int, str] = types.MappingProxyType({})
+    """Functions that asked for an array operation, where the graph knows them."""
 
 
 @without_collection()
 def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
-    operations, given, logical, groups = (
-        list(map(column.__getitem__, order))
-        for column in (graph.operations, graph.arguments, graph.logical, graph.groups)
-    )
+    operations = list(map(graph.operations.__getitem__, order))
+    given = list(map(graph.arguments.__getitem__, order))
     names = sorted(set(operations))
     number = {name: kind for kind, name in enumerate(names)}
     kinds = _integers(map(number.__getitem__, operations), len(order))
@@ -520,8 +539,11 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
     results = [Result(r.argument, r.row, int(place[r.node])) for r in wanted]
-    steps = Steps(names, kinds, begins, arguments, numpy.array(logical, dtype=bool))
-    return Program(steps, constants, results, numpy.column_stack([groups, order]))
+    logical = numpy.array(list(map(graph.logical.__getitem__, order)), dtype=bool)
+    steps = Steps(names, kinds, begins, arguments, logical)
+    groups = _integers(map(graph.groups.__getitem__, order), len(order))
+    origins = numpy.column_stack([groups, _integers(order, len(order))])
+    return Program(steps, constants, results, origins, graph.callers or {})
 
 
 def _integers(numbers: Iterable[int], count: int) -> numpy.ndarray:

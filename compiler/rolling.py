@@ -53,6 +53,8 @@ class Statement(NamedTuple):
     """Of ``take``: where its table begins in the constants, and its length."""
     kept: tuple[Operand, ...]
     """Where its members go beside the turn itself."""
+    origin: int
+    """Number of the array operation that it is of; of what is copied none."""
 
 
 class Loop(NamedTuple):
@@ -370,7 +372,7 @@ class _Roller:
             to = list(draft.results)
             if number in kept:
                 to.append(Operand(SCRATCH, tuple(range(at[number], at[number] + draft.count)), draft.logical))
-            return Statement(number, draft.operation, own, draft.logical, draft.table, tuple(to))
+            return Statement(number, draft.operation, own, draft.logical, draft.table, tuple(to), draft.group)
 
         made = [Loop(drafts[body[0]].count, [statement(number) for number in body]) for body in loops]
         before = sum(not drafts[body[0]].late for body in loops)

@@ -12,7 +12,7 @@ import browser
 import numpy as np
 import pytest
 from filtergym.baselines import advice as advice_module
-from filtergym.baselines.advice import advise
+from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
@@ -47,7 +47,7 @@ def advice(tmp_path_factory):
         patch.setattr(
             advice_module, "families_of", lambda _, log: {n: log_families(log)[n] for n in FAMILIES}
         )
-        return advise(PROBLEM, read_recording(path, PROBLEM.id), shipped)
+        return advise(FittedLog(PROBLEM, read_recording(path, PROBLEM.id)), shipped)
 
 
 def page_of(advice):

@@ -59,6 +59,13 @@ def test_published_protocols_are_frozen():
     assert {name: read_protocol(name)[1] for name in protocols.protocol_names()} == FROZEN
 
 
+def test_the_newest_protocol_has_the_highest_number(tmp_path, monkeypatch):
+    for name in ("filtergym-10.toml", "filtergym-2.toml", "filtergym-9.toml", "__init__.py"):
+        (tmp_path / name).touch()
+    monkeypatch.setattr(protocols, "FOLDER", tmp_path)
+    assert protocols.protocol_names() == ["filtergym-2", "filtergym-9", "filtergym-10"]
+
+
 def test_filtergym_1_is_of_all_five_environments_and_all_their_scenarios():
     protocol, _ = read_protocol("filtergym-1")
     shipped = {id: task for id, task in catalogue().items() if id.startswith("filtergym/")}

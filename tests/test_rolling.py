@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -179,6 +180,23 @@ def test_loops_in_c_have_the_bits_of_the_straight_line(tmp_path):
             addresses = (given[lane].ctypes.data, found[name][lane].ctypes.data)
             getattr(library, name)(*map(ctypes.c_void_p, addresses))
     assert_same_bits(found["rolled"], found["straight"])
+
+
+def test_a_loop_in_c_says_whose_operations_it_has():
+    graph = Graph(callers=True)
+    with namespace.tracing(graph):
+        given = Traced(np.array([graph.input(0, row) for row in range(16)]), np.float64)
+        nodes = np.concatenate([array.nodes.ravel() for array in arrays_of(given)]).tolist()
+    code = program(graph, [Result(1, row, node) for row, node in enumerate(nodes)])
+    arrays = Arrays({0: Rows("a", range(16))}, {1: Rows("b", range(len(nodes)))})
+    texts = []
+    for each in (code, code._replace(callers={})):
+        source = write_program(
+            each, "f", [], lambda _, row: f"a[{row}]", lambda _, row: f"b[{row}]", arrays=arrays
+        )
+        texts.append("\n".join([source.functions, *source.body]))
+    assert "/* test_rolling.arrays_of" in texts[0]
+    assert re.sub(r"/\*.*?\*/\s*", "", texts[0], flags=re.DOTALL) == texts[1]
 
 
 def test_a_short_program_stays_a_straight_line():

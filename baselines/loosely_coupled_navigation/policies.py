@@ -298,6 +298,7 @@ BASELINES = Baselines(
     score_reference="matched",
     tunable=TUNABLE,
     alarm=FusionAlarm,
+    best_constant="best-constant",
     compared=("augmented",),
     benchmark=(
         "plain-reduced",

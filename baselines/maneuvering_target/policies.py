@@ -221,6 +221,7 @@ BASELINES = Baselines(
     fallback="semi-markov-vague-pda",
     alarm=RadarAlarm,
     metrics=METRICS,
+    best_constant="fixed-best",
     benchmark=(
         "imm",
         "imm-steady-state",

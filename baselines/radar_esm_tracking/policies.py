@@ -282,6 +282,7 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="exact-bayes-vague",
     alarm=ClassAlarm,
+    best_constant="fixed-weights",
     physical=("rmse", "acceleration"),
     benchmark=(
         "quasi-optimal",

@@ -275,6 +275,7 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="stuck-exclusion",
     alarm=SensorAlarm,
+    best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
     benchmark=(
         "multi-hypothesis",

@@ -196,6 +196,7 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="level-bank-vague",
     alarm=AutopilotAlarm,
+    best_constant="fixed-best",
     physical=("tracking_rmse", ""),
     benchmark=(
         "kalman",

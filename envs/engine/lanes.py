@@ -117,10 +117,11 @@ class ModelStepper:
         """Go on to the next measurement, see :meth:`.Stepper.arrive`."""
         self.load(self.model.measure(self._episode, noise.row))
 
-    def step(self, noise: EpisodeNoise) -> None:
-        """Answer and go on to the next measurement."""
-        self.answer()
-        self.arrive(noise)
+    def step(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
+        """Answer and go on to the next measurement, and let others do so after it."""
+        for each in (self, *others):
+            each.answer()
+            each.arrive(noise)
 
     @property
     def filter_state(self) -> Any:
@@ -286,8 +287,7 @@ class Lanes:
         total: Any = 0.0
         for _ in range(self.task.decision_interval):
             self.noise.advance()
-            for stepper in steppers:
-                stepper.step(self.noise)
+            own.step(self.noise, steppers[1:])
             answers.append((own.report(), steppers[1].report() if self.beside else None))
             if self._means.columns:
                 total = self._means.add(total, own.observation_by_field())

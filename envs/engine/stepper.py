@@ -213,25 +213,40 @@ class Stepper:
             memory[...] = values
         self._is_put = True
 
-    def step(self, noise: EpisodeNoise) -> None:
-        """Answer and go on to the next measurement, some lanes after the others through both."""
+    def step(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
+        """Answer and go on to the next measurement, and let others do so after it: some lanes after the others through
+        all of it.
+        """
+        calls = self._calls_of_step(noise)
+        for each in others:
+            calls += each._calls_of_step(noise)
+        self._run_calls(calls)
+
+    def _calls_of_step(self, noise: EpisodeNoise) -> tuple[Call, ...]:
         self._stepped += self.width
         if self._stepped > UNCOUNTED:
             for call in itertools.chain(*self._calls):
                 call.expect(self._stepped // 2)
             self._stepped = 0
-        self._run(self._calls[self._now], noise)
+        return self._go_on(self._calls[self._now], noise)
 
     def _run(self, calls: Sequence[Call], noise: Any) -> None:
+        self._run_calls(self._go_on(calls, noise))
+
+    def _go_on(self, calls: Sequence[Call], noise: Any) -> tuple[Call, ...]:
+        """What is to be called for the next measurement, whose numbers come first; the other copy is then of now."""
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         if self._world_of is None:
             calls[-2].table[self._row_entry] = noise.address
-        calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
-        if calls not in self._lists:
-            self._lists[calls] = CallList(calls)
-        run_over(self._lists[calls], self.width, self._threads)
+        return (*noise.calls(), *calls)
+
+    def _run_calls(self, calls: tuple[Call, ...]) -> None:
+        found = self._lists.get(calls)
+        if found is None:
+            found = self._lists[calls] = CallList(calls)
+        run_over(found, self.width, self._threads)
 
     def run(self, noise: EpisodeNoise, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.

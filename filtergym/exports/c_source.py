@@ -308,6 +308,7 @@ class Writer:
             comment(
                 "See the header. A loop goes over the members of array operations, k is the member; where they lie is "
                 "said by tables, whose names end in at and a number. The array w holds what one loop leaves to another."
+                " A comment names the functions whose operations the loops below it have."
             ),
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),

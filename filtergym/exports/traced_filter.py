@@ -347,7 +347,7 @@ def trace_filter(
         ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    graph = Graph()
+    graph = Graph(callers=True)
     try:
         with namespace.tracing(graph):
             return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
