@@ -14,6 +14,7 @@ not independent.
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy
@@ -51,6 +52,77 @@ APART = 10.0
 filter makes of them, and one-step predictions say much of that and little of errors that last."""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedLog:
+    """A recording as filters are fitted to it."""
+
+    problem: Problem
+    recording: Recording
+    """With truth or without."""
+    noise: bool = True
+    """Fit the scale of the measurement noise, too, where measurements state one."""
+    seed: int = 0
+    """Of the starts of the fits."""
+    keywords: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Parameters of the task."""
+
+    @cached_property
+    def task(self) -> Task:
+        """With the parameters of the recording, without it."""
+        parameters = self.recording.scenario(self.problem.task, self.keywords).parameters
+        return make_task(self.problem.task, None, **{**parameters, **self.keywords, "horizon": 1})
+
+    @cached_property
+    def share(self) -> Share:
+        """Which blocks fit, choose and judge."""
+        return share_out(self.recording)
+
+    @cached_property
+    def interval(self) -> float:
+        """Median time between measurements, s."""
+        return float(numpy.nanmedian(numpy.diff(self.recording.seconds, axis=1)))
+
+    def with_noise(self, family: Tunable, own: bool = False, robust: bool = False) -> Tunable:
+        """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it. Where
+        it is to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may
+        be less.
+        """
+        log_format = self.problem.task.log_format
+        if family.anchored or log_format is None or log_format.scale_noise is None:
+            return family
+        if robust and not own:
+            family = with_outliers(family, log_format.scale_noise)
+        return with_noise_scale(family, log_format.scale_noise) if self.noise else family
+
+    def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
+        """Likelihood of a tunable's parameters on spans of the recording; of an anchored one, or where that is asked
+        for, of measurements that are ``APART``.
+        """
+        every, warm_up = 1, self.share.warm_up
+        if tunable.anchored or thinned:
+            warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
+            every = max(1, round(APART / self.interval))
+        windows = cut_windows(self.recording, self.task, spans, warm_up, every)
+        return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+
+
+class Fits(NamedTuple):
+    """Families that were fitted to a log, by name."""
+
+    found: dict[str, Fit]
+    tunables: dict[str, Tunable]
+    likelihoods: dict[str, WindowLikelihood]
+
+    @property
+    def anchored(self) -> list[str]:
+        """Names of those with a second sensor."""
+        return [name for name, tunable in self.tunables.items() if tunable.anchored]
+
+    def make(self, name: str) -> Any:
+        """Return what makes the fitted filter."""
+        return make_tuned_policy(f"fitted {name}", self.tunables[name], self.found[name].values)
 
 
 class Anchor(NamedTuple):
@@ -139,109 +211,60 @@ class Advice(NamedTuple):
 
 
 def advise(
-    problem: Problem,
-    recording: Recording,
+    log: FittedLog,
     shipped: Mapping[str, Any],
     own: Mapping[str, Tunable] | None = None,
-    noise: bool = True,
-    seed: int = 0,
     progress: Callable[[str, float], None] = lambda what, share: None,
     price_of: Callable[[str, Any], Mapping[str, int] | None] = lambda name, maker: None,
-    **keywords: Any,
 ) -> Advice:
     """Fit every family of filters to a recording, choose one, and judge it against what is shipped.
 
     Args:
-        problem: of the recording.
-        recording: with truth or without.
+        log: the recording, and how filters are fitted to it.
         shipped: competitors that are not fitted, by name.
         own: further families, such as an estimator of a user's with limits of its parameters.
-        noise: fit the scale of the measurement noise, too, where measurements state one.
-        seed: of the starts of the fits.
         progress: told what is done, and which share of all.
         price_of: says what an update of a competitor costs, of its name and what makes it: ``operations`` and
             whatever else counts; None where that is not known, and then it is taken for dearer than all others.
-        **keywords: parameters of the task.
 
     Raises:
         ValueError: if nothing can be fitted, or the recording is too short.
     """
-    task, share = _task(problem, recording, keywords), share_out(recording)
-    families = {**families_of(problem, recording), **(own or {})}
-    if int(recording.rows.sum()) * _interval(recording) < FEWEST * APART:  # too few that are apart
-        families = {name: family for name, family in families.items() if not family.anchored}
-    fits: dict[str, Fit] = {}
-    tunables: dict[str, Tunable] = {}
-    likelihoods: dict[str, WindowLikelihood] = {}
-    outliers = True
-    for i, (name, family) in enumerate(families.items()):
-        tried = [_with_noise(problem, family, noise, name in (own or {}), robust) for robust in (False, True)]
-        for tunable in tried if outliers and tried[1] != tried[0] else tried[:1]:
-            begin = tunable
-            if name in fits:
-                begin = dataclasses.replace(tunable, start={**tunable.start, **fits[name].values})
-            likelihood = _likelihood(recording, task, share.fitted, share.warm_up, begin)
-            found = fit(likelihood, begin, seed)
-            if name not in fits or found.log_likelihood > fits[name].log_likelihood + DROP:
-                fits[name], tunables[name], likelihoods[name] = found, tunable, likelihood
-        mean = fits[name].log_likelihood / fits[name].measurements
-        progress(f"fitted {name}: {mean:.3f} nats per measurement", 0.6 * (i + 1) / len(families))
-        if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
-            outliers = OUTLIER_SHARE in fits[name].values
-    makers = {
-        **shipped,
-        **{
-            name: make_tuned_policy(f"fitted {name}", tunables[name], found.values)
-            for name, found in fits.items()
-        },
-    }
+    problem, recording = log.problem, log.recording
+    fits = _fit_families(log, own or {}, progress)
+    makers = {**shipped, **{name: fits.make(name) for name in fits.found}}
     prices = Prices(makers, price_of)
-    counts = {name: len(found.values) for name, found in fits.items()}
-    anchored = [name for name, tunable in tunables.items() if tunable.anchored]
+    counts = {name: len(found.values) for name, found in fits.found.items()}
 
     def judge(makers: Mapping[str, Any]) -> Judgement:
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
-            dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        return Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
+            dataset = problem.evaluate(makers, recording, tracks=True, **log.keywords)
+        predictions = Predictions(dataset, log.task)
+        return Judgement(predictions, log.share, counts, problem.baselines.score_paper, fits.anchored)
 
-    progress(_first_verdict(fits, tunables, len(shipped)), 0.6)
+    progress(_first_verdict(fits, len(shipped)), 0.6)
     judgement = all_judged = judge(makers)
     diverging = judgement.find_diverging(
-        {name: found for name, found in fits.items() if name not in anchored}
+        {name: found for name, found in fits.found.items() if name not in fits.anchored}
     )
     progress("computing intervals", 0.9)
     rival, best = judgement.rival(prices.operations), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
-    comparable = [c for c in competitors if c.name not in anchored]
-    chosen = judgement.simplest([c for c in comparable if c.fitted])
-    anchor = None
-    for name in anchored:
-        both = {each: tunables[each] for each in (name, chosen.name)}
-        anchor = _compare_anchored(recording, task, share, both, fits[name], seed)
-        if anchor.gain > 0.0:
-            chosen = next(c for c in competitors if c.name == name)
-    name, tunable = chosen.name, tunables[chosen.name]
-    profiles = {}
+    chosen, anchor = _choose(log, fits, judgement, competitors)
+    name, tunable = chosen.name, fits.tunables[chosen.name]
     takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
-    if share.apart:  # to all that does not judge
-        begin = dataclasses.replace(tunable, start=fits[name].values)
-        spans = [*share.fitted, *share.chosen]
-        likelihoods[name] = _likelihood(recording, task, spans, share.warm_up, begin)
-        again = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
-        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, again)
-        fitted = make_tuned_policy(f"fitted {name}", tunable, fits[name].values)
-        judgement = judge({name: fitted, rival: shipped[rival], best: shipped[best]})
+    profiles = _fit_again(log, fits, name)
+    if log.share.apart:
+        judgement = judge({name: fits.make(name), rival: shipped[rival], best: shipped[best]})
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
     if not tunable.anchored and chosen.relative_error.low > 0.0:
         takes_fitted = False  # the likelihood misleads
     advised = chosen if takes_fitted else next(c for c in competitors if c.name == rival)
-    likeliest, brought = likeliest_of(comparable), None
+    likeliest, brought = likeliest_of([c for c in competitors if c.name not in fits.anchored]), None
     if not tunable.anchored and likeliest.name != advised.name:
         brought = likeliest.name, all_judged.difference(likeliest.name, advised.name)
-    if name not in profiles:
-        fits[name], profiles[name] = fit_profiles(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     others = sorted(
         (c for c in competitors if c is not advised),
@@ -249,7 +272,7 @@ def advise(
     )
     return Advice(
         recording,
-        share,
+        log.share,
         [advised, *others],
         chosen,
         rival,
@@ -257,26 +280,81 @@ def advise(
         judgement.relative_error(advised.name, best),
         diverging,
         judgement.predictions.dataset.sel(policy=list(dict.fromkeys([name, rival, best]))),
-        fits,
-        tunables,
-        profiles,
+        fits.found,
+        fits.tunables,
+        {name: profiles},
         anchor,
-        find_outliers(task, recording, tunable, fits[name]),
+        find_outliers(log.task, recording, tunable, fits.found[name]),
         brought,
         prices,
     )
 
 
-def _first_verdict(fits: Mapping[str, Fit], tunables: Mapping[str, Tunable], shipped: int) -> str:
+def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable[[str, float], None]) -> Fits:
+    """Fit every family, and a user's own, to the blocks that fit: first as it is, then with outliers, which are kept
+    where the likelihood says that there are some.
+    """
+    families = {**families_of(log.problem, log.recording), **own}
+    if int(log.recording.rows.sum()) * log.interval < FEWEST * APART:  # too few that are apart
+        families = {name: family for name, family in families.items() if not family.anchored}
+    fits = Fits({}, {}, {})
+    outliers = True
+    for i, (name, family) in enumerate(families.items()):
+        tried = [log.with_noise(family, name in own, robust) for robust in (False, True)]
+        for tunable in tried if outliers and tried[1] != tried[0] else tried[:1]:
+            begin = tunable
+            if name in fits.found:
+                begin = dataclasses.replace(tunable, start={**tunable.start, **fits.found[name].values})
+            likelihood = log.likelihood(log.share.fitted, begin)
+            found = fit(likelihood, begin, log.seed)
+            if name not in fits.found or found.log_likelihood > fits.found[name].log_likelihood + DROP:
+                fits.found[name], fits.tunables[name], fits.likelihoods[name] = found, tunable, likelihood
+        mean = fits.found[name].log_likelihood / fits.found[name].measurements
+        progress(f"fitted {name}: {mean:.3f} nats per measurement", 0.6 * (i + 1) / len(families))
+        if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
+            outliers = OUTLIER_SHARE in fits.found[name].values
+    return fits
+
+
+def _choose(
+    log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[Competitor]
+) -> tuple[Competitor, Anchor | None]:
+    """Return the simplest fitted filter that the likeliest does not beat, or an anchored one that beats that, and how
+    the anchored one compares.
+    """
+    anchored, anchor = fits.anchored, None
+    chosen = judgement.simplest([c for c in competitors if c.fitted and c.name not in anchored])
+    for name in anchored:
+        both = {each: fits.tunables[each] for each in (name, chosen.name)}
+        anchor = _compare_anchored(log, both, fits.found[name])
+        if anchor.gain > 0.0:
+            chosen = next(c for c in competitors if c.name == name)
+    return chosen, anchor
+
+
+def _fit_again(log: FittedLog, fits: Fits, name: str) -> dict[str, Profile]:
+    """Fit the chosen family to all that does not judge, where there is such, and return the profiles of its likelihood
+    there.
+    """
+    tunable, found = fits.tunables[name], fits.found[name]
+    if log.share.apart:
+        begin = dataclasses.replace(tunable, start=found.values)
+        fits.likelihoods[name] = log.likelihood([*log.share.fitted, *log.share.chosen], begin)
+        found = fit(fits.likelihoods[name], begin, log.seed, starts=1)._replace(spread=found.spread)
+    fits.found[name], profiles = fit_profiles(fits.likelihoods[name], tunable, found)
+    return profiles
+
+
+def _first_verdict(fits: Fits, shipped: int) -> str:
     """Say which family is likeliest on what it was fitted to, one nat less for each parameter."""
     known = {
         name: (found.log_likelihood - len(found.values)) / found.measurements
-        for name, found in fits.items()
-        if not tunables[name].anchored
+        for name, found in fits.found.items()
+        if name not in fits.anchored
     }
     first, *rest = sorted(known, key=known.__getitem__, reverse=True)
     against = f", {known[first] - known[rest[0]]:.3f} more than {rest[0]}" if rest else ""
-    values = fits[first].values
+    values = fits.found[first].values
     noise = f", noise {10.0 ** values[NOISE_SCALE]:.2f} times as stated" if NOISE_SCALE in values else ""
     outliers = f", {100.0 * 10.0 ** values[OUTLIER_SHARE]:.1f} % outliers" if OUTLIER_SHARE in values else ""
     return (
@@ -285,40 +363,24 @@ def _first_verdict(fits: Mapping[str, Fit], tunables: Mapping[str, Tunable], shi
     )
 
 
-def fit_all(
-    problem: Problem,
-    recording: Recording,
-    family: Tunable,
-    noise: bool = True,
-    seed: int = 0,
-    **keywords: Any,
-) -> tuple[Tunable, Fit, dict[str, Interval]]:
+def fit_all(log: FittedLog, family: Tunable) -> tuple[Tunable, Fit, dict[str, Interval]]:
     """Fit one filter to all of a recording; nothing is left to judge it.
-
-    Args:
-        problem: of the recording.
-        recording: with truth or without.
-        family: what is fitted.
-        noise: as of :func:`advise`.
-        seed: of the starts of the fit.
-        **keywords: parameters of the task.
 
     Returns:
         The family with the scale of the noise, what was found, and the intervals of the parameters.
     """
-    task = _task(problem, recording, keywords)
-    share = share_out(recording)
-    spans = [Span(i, min(share.warm_up, int(rows) - 1), int(rows)) for i, rows in enumerate(recording.rows)]
+    share, rows = log.share, log.recording.rows
+    spans = [Span(i, min(share.warm_up, int(each) - 1), int(each)) for i, each in enumerate(rows)]
     if share.apart:  # side by side it takes a fraction of the time
         spans = [*share.fitted, *share.chosen, *share.judged]
-    tunable = _with_noise(problem, family, noise)
-    likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
-    found = fit(likelihood, tunable, seed)
-    robust = _with_noise(problem, family, noise, robust=True)
+    tunable = log.with_noise(family)
+    likelihood = log.likelihood(spans, tunable)
+    found = fit(likelihood, tunable, log.seed)
+    robust = log.with_noise(family, robust=True)
     if robust != tunable:
         begin = dataclasses.replace(robust, start={**robust.start, **found.values})
-        other = _likelihood(recording, task, spans, share.warm_up, begin)
-        again = fit(other, begin, seed)
+        other = log.likelihood(spans, begin)
+        again = fit(other, begin, log.seed)
         if again.log_likelihood > found.log_likelihood + DROP:
             tunable, likelihood, found = robust, other, again
     found, profiles = fit_profiles(likelihood, tunable, found)
@@ -349,73 +411,19 @@ def find_outliers(task: Task, recording: Recording, tunable: Tunable, found: Fit
     return is_outlier & (numpy.arange(is_outlier.shape[1]) < recording.rows[:, None])
 
 
-def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
-    """Task with the parameters of a recording, without it."""
-    parameters = recording.scenario(problem.task, keywords).parameters
-    return make_task(problem.task, None, **{**parameters, **keywords, "horizon": 1})
-
-
-def _with_noise(
-    problem: Problem, family: Tunable, noise: bool, own: bool = False, robust: bool = False
-) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it. Where it is
-    to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may be less.
-    """
-    log_format = problem.task.log_format
-    if family.anchored or log_format is None or log_format.scale_noise is None:
-        return family
-    if robust and not own:
-        family = with_outliers(family, log_format.scale_noise)
-    return with_noise_scale(family, log_format.scale_noise) if noise else family
-
-
-def _likelihood(
-    recording: Recording,
-    task: Task,
-    spans: Sequence[Span],
-    warm_up: int,
-    tunable: Tunable,
-    thinned: bool = False,
-) -> WindowLikelihood:
-    """Likelihood of a tunable's parameters on spans of a recording; of an anchored one, or where that is asked for, of
-    measurements that are ``APART``.
-    """
-    every = 1
-    if tunable.anchored or thinned:
-        warm_up = max(warm_up, int(recording.rows.sum()) // MEMORY)
-        every = max(1, round(APART / _interval(recording)))
-    windows = cut_windows(recording, task, spans, warm_up, every)
-    return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
-
-
-def _compare_anchored(
-    recording: Recording,
-    task: Task,
-    share: Share,
-    tunables: Mapping[str, Tunable],
-    fitted: Fit,
-    seed: int,
-) -> Anchor:
+def _compare_anchored(log: FittedLog, tunables: Mapping[str, Tunable], fitted: Fit) -> Anchor:
     """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such; the
     former, which is ``fitted``, is the first of the two ``tunables``.
 
     That is the likelihood that both have in common: of the same measurements, given the same earlier ones. From one
     measurement to the next the other follows errors that last, and so predicts them well.
     """
-
-    def apart(spans: Sequence[Span], tunable: Tunable) -> WindowLikelihood:
-        return _likelihood(recording, task, spans, share.warm_up, tunable, thinned=True)
-
     (name, anchored), (other, best) = tunables.items()
-    rival = fit(apart(share.fitted, best), best, seed)
+    rival = fit(log.likelihood(log.share.fitted, best, thinned=True), best, log.seed)
     means = []
     for tunable, found in ((anchored, fitted), (best, rival)):
-        chosen = apart(share.chosen, dataclasses.replace(tunable, start=found.values))
+        begin = dataclasses.replace(tunable, start=found.values)
+        chosen = log.likelihood(log.share.chosen, begin, thinned=True)
         values = numpy.array([[value] for value in found.values.values()])
         means.append(float(chosen(values)[0]) / chosen.count)
     return Anchor(name, other, means[0] - means[1])
-
-
-def _interval(recording: Recording) -> float:
-    """Median time between measurements, s."""
-    return float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))

@@ -244,7 +244,7 @@ class Unscented(Extended):
 
         if own.wraps:
             z = near + own.subtract(z, near)
-        R = self.R if own.model.D is None else self.R + own.measured_input_noise(mean, measurement)
+        R = own.measured_noise(self.R, mean, measurement)
         gates = own.within_gates if own.gated else None
         result = unscented_update(
             mean, spread + Q, z, h_near if own.wraps else h, R, measurement.available, gates

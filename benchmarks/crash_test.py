@@ -59,6 +59,8 @@ def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) 
         record = json.loads(path.read_text(encoding="utf-8"))
         table = {row[0]: row for row in record["data"]["rows"]} | known
         record["data"]["rows"] = [table[name] for name in names_of(problem) if name in table]
+        today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+        record["note"] += f" Rows of {', '.join(options.policy)} are of {today}."
         path.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
         return
     versions = {"Python": platform.python_version()}

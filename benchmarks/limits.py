@@ -13,15 +13,17 @@ from typing import NamedTuple
 
 import numpy
 import xarray
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
+from filtergym.evaluation.competitors.kinds import RandomPolicy
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import reduce_episodes
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.papers.grid import markdown_table
 
 from filtergym.names import evaluation_requests
-from filtergym.reports.tables.benchmark import affordable_episodes, ranked_names
+from filtergym.reports.tables.benchmark import affordable_episodes
 
 SIGNIFICANT = 3.0
 """Standard errors; of a few hundred comparisons, one in a thousand lies beyond by chance."""
@@ -47,6 +49,15 @@ class Nearest(NamedTuple):
     def verdict(self) -> str:
         """Whether the reference is a limit, in words."""
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
+
+
+def ranked_names(problem: Problem) -> list[str]:
+    """Names of all that is ranked, each under its own control, but random actions."""
+    known = problem.baselines
+    ranked = (*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id))
+    return [
+        name for name in dict.fromkeys(ranked) if problem.baselines.policies.get(name) is not RandomPolicy
+    ]
 
 
 def episode_costs(

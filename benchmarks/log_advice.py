@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy
 from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.advice import advise
+from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.fitted_filters import write_advised
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording
@@ -127,7 +127,9 @@ def judge(first: Recording, second: Recording, folder: Path) -> list[str]:
         if what.startswith("First verdict"):
             verdict[0] = time.process_time() - begun
 
-    advice = advise(problem, first, rivals, progress=progress, price_of=update_prices(problem, first))
+    advice = advise(
+        FittedLog(problem, first), rivals, progress=progress, price_of=update_prices(problem, first)
+    )
     used, name = time.process_time() - begun, advice.advised.name
     path = folder / "advised.filter.json"
     fitted = advice.fits[name] if advice.advised.fitted else None

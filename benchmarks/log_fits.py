@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 import numpy
-from filtergym.baselines.advice import fit_all
+from filtergym.baselines.advice import FittedLog, fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording
@@ -124,13 +124,13 @@ def main() -> None:
         for seed in range(asked.logs):
             recording = simulated_log(Path(folder), asked.family, asked.measurements, seed)
             family = families_of(problem, recording)[asked.family]
-            _, found, intervals = fit_all(problem, recording, family)
+            _, found, intervals = fit_all(FittedLog(problem, recording), family)
             others = [found.log_likelihood]
             for start in range(1, asked.starts):
                 rng = numpy.random.default_rng(1000 + start)
                 begin = {name: rng.uniform(low, high) for name, (low, high) in family.limits.items()}
                 other = dataclasses.replace(family, start=begin)
-                others.append(fit_all(problem, recording, other, seed=start)[1].log_likelihood)
+                others.append(fit_all(FittedLog(problem, recording, seed=start), other)[1].log_likelihood)
             below.append(max(others) - others[0])
             if asked.family == "imm-two" and KINDS[seed % len(KINDS)] != "outliers":
                 both = (likelihood_of_sequences(recording, values) for values in (true, found.values))

@@ -12,10 +12,11 @@ os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_paralleli
 
 import numpy
 from filtergym.compiler.functions import map_arrays
-from filtergym.envs.contract.model import Model
+from filtergym.envs.contract.model import Episode, Model
+from filtergym.envs.contract.observation import Array
 from filtergym.envs.engine.catalogue import import_task
 from filtergym.envs.engine.lanes import Lanes
-from filtergym.envs.engine.programs import step_episodes
+from filtergym.envs.engine.reward import OWN_PAY
 from filtergym.envs.engine.scenario_choice import make_task
 
 
@@ -42,10 +43,19 @@ def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[
         lambda values: jax.numpy.asarray(numpy.asarray(values)[..., :size]),
         (lanes.state, numpy.full((*(shape or ()), size), 0.1 if shape else 0), lanes.next_row()),
     )
-    step = jax.jit(lambda episode, action, noise: step_episodes("cost", model, episode, action, noise))
+    step = jax.jit(lambda episode, action, noise: step_episodes(model, episode, action, noise))
 
     def once() -> None:
         jax.block_until_ready(step(*given))
 
     once()
     return once
+
+
+def step_episodes(
+    model: Model, episode: Episode, action: Array, noise: Array
+) -> tuple[Episode, Array, Array]:
+    """Return episodes at the next measurement, the reward of the action, and the observation."""
+    after = model.act(episode, action)
+    following = model.measure(after, noise)
+    return following, OWN_PAY["cost"](model, after), model.observe(following)

@@ -1,8 +1,7 @@
-"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` printed for LLVM, C and CUDA.
+"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` printed for LLVM.
 
-:class:`Value` stands for a number in the text of a language; the functions of :mod:`.counter_numbers` run on such
-values as they run on arrays, and leave their text behind. :func:`bind_numbers` gives compiled code, :func:`c_text` the
-same in C.
+:class:`Value` stands for a number in the text; the functions of :mod:`.counter_numbers` run on such values as they run
+on arrays, and leave their text behind. :func:`bind_numbers` gives compiled code.
 """
 
 import functools
@@ -20,7 +19,7 @@ _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", 
 
 
 class Value:
-    """A number in the text of a language: a whole number of 64 bits (``whole``), or a float64.
+    """A number in the text: a whole number of 64 bits (``whole``), or a float64.
 
     Args:
         text: where its operations are written.
@@ -64,15 +63,17 @@ class Value:
 
 
 class _Text:
-    """Lines of a language, and the :class:`~.counter_numbers.Machine` of its values.
+    """Vector code for a block of lanes, and the :class:`~.counter_numbers.Machine` of its values.
 
     Args:
         prefix: of the names that are given here.
+        block: the lanes.
     """
 
-    def __init__(self, prefix: str) -> None:
+    def __init__(self, prefix: str, block: Block) -> None:
         self.lines: list[str] = []
         self._prefix, self._count = prefix, 0
+        self.block = block
 
     def name(self) -> str:
         """Name that is not taken."""
@@ -83,38 +84,19 @@ class _Text:
         """A whole number that the text knows by this name."""
         return Value(self, name, True)
 
-    def constant(self, value: int | float) -> str:
-        """Text of a constant."""
-        raise NotImplementedError
-
-    def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
-        """Write an operation; returns the name of its result."""
-        raise NotImplementedError
-
-
-class _LlvmText(_Text):
-    """Vector code for a block of lanes.
-
-    Args:
-        prefix: of names.
-        block: the lanes.
-    """
-
-    def __init__(self, prefix: str, block: Block) -> None:
-        super().__init__(prefix)
-        self.block = block
-
     def new(self, expression: str) -> str:
         name = self.name()
         self.lines.append(f"{name} = {expression}")
         return name
 
     def constant(self, value: int | float) -> str:
+        """Text of a constant."""
         if isinstance(value, int):
             return self.block.constant(str(value), "i64")
         return self.block.constant(f"0x{numpy.float64(value).view('u8'):016X}")
 
     def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
+        """Write an operation; returns the name of its result."""
         if whole:
             return self.new(f"{_LLVM[operator]} {self.block.words} {one}, {other}")
         return self.new(f"f{_LLVM.get(operator, 'div')} {self.block.numbers} {one}, {other}")
@@ -147,70 +129,20 @@ class _LlvmText(_Text):
         )
 
 
-class _CText(_Text):
-    """Scalar code in C99, or CUDA."""
-
-    def new(self, expression: str, whole: bool) -> str:
-        name = self.name()
-        self.lines.append(f"const {'uint64_t' if whole else 'double'} {name} = {expression};")
-        return name
-
-    def constant(self, value: int | float) -> str:
-        return f"UINT64_C({value})" if isinstance(value, int) else f"({value.hex()})"
-
-    def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
-        return self.new(f"{one} {operator} {other}", whole)
-
-    def bits(self, number: Value) -> Value:
-        return Value(self, self.new(f"counter_bits({number.name})", True), True)
-
-    def number(self, bits: Value) -> Value:
-        return Value(self, self.new(f"counter_number({bits.name})", False), False)
-
-    def sqrt(self, number: Value) -> Value:
-        return Value(self, self.new(f"sqrt({number.name})", False), False)
-
-    def choose(self, condition: Value, one: Value, other: Value) -> Value:
-        return Value(self, self.new(f"{condition.name} ? {one.name} : {other.name}", False), False)
-
-
 Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
-def _write_pair(text: Any, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
+def _write_pair(text: _Text, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
     """Write how two numbers are made of key, episode, measurement and pair; returns their names."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
-
-
-def c_text(qualifiers: str = "static inline") -> str:
-    """Functions ``counter_normal_pair`` and ``counter_uniform_pair`` in C99.
-
-    To be compiled without fused operations: ``-ffp-contract=off``, of CUDA ``--fmad=false``.
-
-    Args:
-        qualifiers: written before every function; ``__device__ static`` for CUDA.
-    """
-    given = "uint64_t key, uint64_t episode, uint64_t t, uint64_t pair, double *one, double *other"
-    lines = [
-        "#include <math.h>\n#include <stdint.h>\n#include <string.h>",
-        f"{qualifiers} double counter_number(uint64_t b) {{ double x; memcpy(&x, &b, 8); return x; }}",
-        f"{qualifiers} uint64_t counter_bits(double x) {{ uint64_t b; memcpy(&b, &x, 8); return b; }}",
-    ]
-    makers: dict[str, Make] = {"normal": normal_pair, "uniform": uniform_pair}
-    for kind, make in makers.items():
-        text = _CText("v")
-        one, other = _write_pair(text, make, ("key", "episode", "t", "pair"))
-        lines += [f"{qualifiers} void counter_{kind}_pair({given}) {{", *text.lines]
-        lines += [f"*one = {one};", f"*other = {other};", "}"]
-    return "\n".join(lines) + "\n"
 
 
 def _loop(
     block: Block, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
     """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
-    text = _LlvmText(f"%{kind}", block)
+    text = _Text(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
         f"%some_{kind} = icmp sgt i64 {count}, 0",

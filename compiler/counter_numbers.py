@@ -31,8 +31,8 @@ where the error is within a small factor of the least possible one, and the coef
 left is below what the operations round: 2^-51.5 of P, of which 0.015 at most counts in the logarithm; 2^-53.9
 of S; 2^-53.1 of C. A test derives the coefficients again.
 
-The algorithm is written once, for operands that know ``+ - * / & | ^ << >>``: arrays of NumPy here, text of LLVM, C and
-CUDA in :mod:`.counter_code`.
+The algorithm is written once, for operands that know ``+ - * / & | ^ << >>``: arrays of NumPy here, text of LLVM in
+:mod:`.counter_code`.
 
 Sources: J. K. Salmon, M. A. Moraes, R. O. Dror, D. E. Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC'11
 (2011), with the answers in Random123's ``kat_vectors``. G. E. P. Box, M. E. Muller, "A note on the generation of random

@@ -1,5 +1,6 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -88,6 +89,10 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return problem.competitor(name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
+        for ending in (".zip", ".safetensors", SUFFIX):
+            # Stable-Baselines3 saves "mine" as mine.zip. Unlike a Path, this takes a name that no file can have.
+            if os.path.isfile(f"{name}{ending}"):
+                raise ValueError(f"unknown policy {name!r}: a file is named whole, {name}{ending}")
         raise nearest("policy", name, [*problem.names, *pretrained_agents(problem.id)])
     holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):

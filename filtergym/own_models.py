@@ -194,7 +194,7 @@ def state_space(
     attributes = state_space_attributes(definition, names, units, dict(parameters))
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
-    cls.reward_unit = _typical_cost(cls, StateSpaceParameters(**parameters))
+    cls.reward_unit = _RewardUnit(StateSpaceParameters(**parameters))
     register_task(cls, state_space_baselines(cls))
     if module in sys.modules:
         setattr(sys.modules[module], name, cls)
@@ -302,6 +302,22 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
             f"transition must hold probabilities, each row with the sum 1, got {matrix.tolist()}"
         )
     return tuple(map(tuple, matrix.tolist()))
+
+
+class _RewardUnit:
+    """Unit of the reward of a class, which is estimated when it is first asked for: most uses of a model need none, and
+    it takes a tenth of a second, or half of one where the model is a drift.
+
+    Args:
+        parameters: of the class, as it is registered.
+    """
+
+    def __init__(self, parameters: StateSpaceParameters) -> None:
+        self._parameters = parameters
+
+    def __get__(self, task: StateSpace | None, cls: type[StateSpace]) -> float:
+        cls.reward_unit = _typical_cost(cls, self._parameters)
+        return cls.reward_unit
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:

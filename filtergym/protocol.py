@@ -79,9 +79,9 @@ class Protocol(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def protocol_names() -> list[str]:
-    """Return the names of the protocols of this package."""
-    found = [file.name for file in FOLDER.iterdir()]
-    return sorted(name.removesuffix(SUFFIX) for name in found if name.endswith(SUFFIX))
+    """Return the names of the protocols of this package, the newest last: by number, not by letter."""
+    found = [file.name.removesuffix(SUFFIX) for file in FOLDER.iterdir() if file.name.endswith(SUFFIX)]
+    return sorted(found, key=lambda name: int(name.rpartition("-")[2]))
 
 
 def read_protocol(name: str) -> tuple[Protocol, str]:

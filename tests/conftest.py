@@ -1,7 +1,7 @@
 """Every environment of the catalogue, for the tests that hold for all of them.
 
-A test that asks for ``env_id`` runs once for every environment; one that asks for ``control`` too, once for
-every control of every environment. A new environment is covered without an edit.
+A test that asks for ``env_id`` runs once for every environment, unless it names some; one that asks for ``control``
+too, once for every control of every environment. A new environment is covered without an edit.
 """
 
 import ctypes
@@ -92,7 +92,8 @@ def _resident():
 
 def pytest_generate_tests(metafunc):
     """Fill in the catalogue."""
-    if "env_id" not in metafunc.fixturenames:
+    own = [mark.args[0] for mark in metafunc.definition.iter_markers("parametrize")]
+    if "env_id" not in metafunc.fixturenames or "env_id" in own:
         return
     paired = metafunc.definition.get_closest_marker("with_controls")
     if paired:

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine.catalogue import task_class
+from gymnasium.utils.env_checker import check_env
 from models import make_model, random_actions, short_episodes
 
 NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
@@ -63,6 +64,32 @@ class Subject:
 def continued(env: Any, actions: Iterable[Any]) -> list[np.ndarray]:
     """Everything that some steps return."""
     return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
+
+
+def assert_equals_its_vector(
+    id: str, actions: Iterable[Any], render: bool = True, **keywords: Any
+) -> gym.Env:
+    """Gymnasium's check of an environment, and an episode as the last one of a vector; return the environment.
+
+    Args:
+        id: of the environment.
+        actions: of the last of three environments at every decision, alike in all; as many as an episode has.
+        render: whether it is drawn by the check.
+        keywords: of both.
+    """
+    env = gym.make(id, **keywords)
+    check_env(env.unwrapped, skip_render_check=not render)
+    vector = gym.make_vec(id, num_envs=3, **{k: v for k, v in keywords.items() if k != "render_mode"})
+    shown, _ = vector.reset(seed=4)
+    single, _ = env.reset(seed=6)
+    np.testing.assert_array_equal(shown[2], single)
+    truncated = False
+    for action in actions:
+        shown, *_ = vector.step(np.stack([action] * 3))
+        single, *_, truncated, _ = env.step(action)
+        np.testing.assert_array_equal(shown[2], single)
+    assert truncated
+    return env
 
 
 Property = Callable[[Any], None]

@@ -22,6 +22,7 @@ import sys
 import time
 import traceback
 import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -365,9 +366,8 @@ def run_inner(reader: str, place: Path, flags: list[str]) -> None:
     def mutate(content: bytes, longest: int, seed: int) -> bytes:
         rng = random.Random(seed)
         if rng.random() < 0.5:
-            with contextlib.suppress(
-                ValueError, LookupError, TypeError, OSError
-            ):  # it has lost its form before
+            # It may have lost its form before.
+            with contextlib.suppress(ValueError, LookupError, TypeError, OSError, EOFError, zlib.error):
                 return change_structure(reader, content, rng)[:longest]
         return atheris.Mutate(content, longest)
 

@@ -1,11 +1,13 @@
 """Commands that are killed at random moments and begun again end with the same bytes as undisturbed ones.
 
-``python tests/kill_and_resume.py SECONDS [SEED] [COMMAND ...]`` takes each command in turn: once undisturbed, then
-interrupted by SIGINT, SIGTERM and SIGKILL until the seconds are over, then left alone. What it prints and writes must
-be equal, but for lines that tell times, and nothing unfinished be left. It says how often each was killed, and how
-many kept parts the last attempt used; ``advise`` and ``export``, which take seconds, keep none and begin anew.
+``python tests/kill_and_resume.py SECONDS [SEED] [COMMAND ...]`` takes each command in turn: once undisturbed, and then
+until the seconds are over from the start, interrupted by SIGINT, SIGTERM and SIGKILL until it has ended. What it prints
+and writes must be equal, but for lines that tell times, and nothing unfinished be left. It says how often each was
+killed, and how many kept parts the last attempts used; ``advise`` and ``export``, which take seconds, keep none and
+begin anew.
 """
 
+import collections
 import os
 import random
 import re
@@ -96,40 +98,62 @@ def prepare(folder: Path, name: str) -> None:
         filtergym.record(ENVIRONMENT, "paper", 1).write(folder / "log.nc")
 
 
+def tear(name: str, torn: Path, usual: float, rng: random.Random, until: float) -> tuple[list[int], int]:
+    """Kill a command at random moments until it has ended by itself or the time is over, and then let it end.
+
+    Args:
+        name: of the command.
+        torn: folder that it runs in.
+        usual: seconds that it takes undisturbed.
+        rng: of moments and signals.
+        until: when the time is over, of ``time.monotonic``.
+
+    Returns:
+        Signals that killed it, and how many checkpoints its last attempt began with.
+    """
+    kills: list[int] = []
+    while True:
+        begun = len([*torn.rglob("checkpoint")])
+        number, last = rng.choice(SIGNALS), time.monotonic() > until
+        if run(COMMANDS[name][0], torn, None if last else rng.uniform(0.2, 1.0) * usual, number) == 0:
+            return kills, begun
+        kills.append(number)
+        assert not last, f"{name} does not end: {torn.with_suffix('.err').read_text()[-500:]}"
+
+
 def main(seconds: float, rng: random.Random, names: list[str]) -> int:
-    """Kill and resume each command, and return how many ended otherwise."""
+    """Kill and resume each command, again and again, and return how many ended otherwise."""
     wrong = 0
     for name in names:
         words, results = COMMANDS[name]
         with tempfile.TemporaryDirectory() as place:
-            whole, torn = Path(place, "whole"), Path(place, "torn")
+            whole = Path(place, "whole")
             prepare(whole, name)
-            prepare(torn, name)
             began = time.monotonic()
             code = run(words, whole)
             assert code == 0, f"{name} does not run: {whole.with_suffix('.err').read_text()[-500:]}"
-            usual, kills = time.monotonic() - began, dict.fromkeys(SIGNALS, 0)
-            until = time.monotonic() + seconds
-            while True:
-                begun = len([*torn.rglob("checkpoint")])
-                number, last = rng.choice(SIGNALS), time.monotonic() > until
-                code = run(words, torn, None if last else rng.uniform(0.2, 1.0) * usual, number)
-                if code == 0:
-                    break
-                kills[number] += 1
-                assert not last, f"{name} does not end: {torn.with_suffix('.err').read_text()[-500:]}"
-            left = [
-                path.name for path in torn.rglob("*") if path.name.startswith(".") or "partial" in path.name
-            ]
-            differing = [result for result in results if content(whole / result) != content(torn / result)]
-            printed = [content(folder.with_suffix(".out")) for folder in (whole, torn)]
-            if name != "train" and printed[0] != printed[1]:  # which says that it goes on
-                differing.append("what is printed")
+            usual, until = time.monotonic() - began, time.monotonic() + seconds
+            kills, used, checkpoints, trials = collections.Counter[int](), 0, 0, 0
+            left, differing = set[str](), set[str]()
+            while not trials or time.monotonic() < until:
+                torn = Path(place, f"torn{trials}")
+                prepare(torn, name)
+                killed, begun = tear(name, torn, usual, rng, until)
+                trials, checkpoints = trials + 1, checkpoints + begun
+                kills.update(killed)
+                used += int(torn.with_suffix(".used").read_text())
+                left |= {p.name for p in torn.rglob("*") if p.name.startswith(".") or "partial" in p.name}
+                differing |= {file for file in results if content(whole / file) != content(torn / file)}
+                printed = [content(folder.with_suffix(".out")) for folder in (whole, torn)]
+                if name != "train" and printed[0] != printed[1]:  # which says that it goes on
+                    differing.add("what is printed")
             wrong += bool(left or differing)
-            told = ", ".join(f"{number.name} {count}" for number, count in kills.items())
-            used = torn.with_suffix(".used").read_text()
-            parts = f"{used} kept parts and {begun} checkpoints used"
-            print(f"{name}: killed by {told}; {parts}; differing {differing}; left {left}", flush=True)
+            told = ", ".join(f"{number.name} {kills[number]}" for number in SIGNALS)
+            print(
+                f"{name}: ended {trials} times, killed by {told}; {used} kept parts and {checkpoints} checkpoints "
+                f"used; differing {sorted(differing)}; left {sorted(left)}",
+                flush=True,
+            )
     return wrong
 
 

@@ -11,6 +11,11 @@ from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 
+KINDS = tuple(
+    f"filtergym/{name}-v0" for name in ("ManeuveringTarget", "LooselyCoupledNavigation", "UavAutopilot")
+)
+"""Environments whose scans may miss, with ten measurements a decision, with a closed loop: for tests of what treats all
+environments alike."""
 DECISIONS = 5
 """Length of the short episodes, in decisions."""
 
@@ -82,6 +87,43 @@ def watch_hypotheses(model: Model, estimator: Any, field: str, no_action: Any) -
     for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
         pass
     return scans, answers
+
+
+def watch_estimator(model: Model, estimator: Any) -> tuple[Any, list[Any], list[Any]]:
+    """Fly an estimator, and look at what it is given and answers.
+
+    Returns:
+        the start, the measurements, and for each of them mean, covariance and likelihood.
+    """
+    given: list[Any] = []
+    answers: list[Any] = []
+    asked = Asked(estimator)
+
+    class Watched:
+        def start(self, initial: Any, N: int) -> Any:
+            given.append(initial)
+            return asked.start(initial, N)
+
+        def update(self, measurement: Any, memory: Any) -> Any:
+            mean, covariance, memory, likelihood = asked.update(measurement, memory)
+            given.append(measurement)
+            answers.append((mean, covariance, likelihood))
+            return mean, covariance, memory
+
+    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
+        pass
+    return given[0], given[1:], answers
+
+
+def assert_no_action_is_the_estimator(bank: Any, scans: Any, answers: Any, no_action: Any) -> None:
+    """Compare what :func:`watch_hypotheses` returns, bit for bit."""
+    for (state, measurement), (mean, covariance, _, likelihood) in zip(scans, answers, strict=True):
+        after = act(bank, state, measurement, no_action)
+        np.testing.assert_array_equal(bank.mean(after), mean)
+        np.testing.assert_array_equal(bank.covariance(after), covariance)
+        records = bank.records(after, measurement)
+        for name in ("log_likelihood", "nis", "nis_degrees"):
+            np.testing.assert_array_equal(records[name], getattr(likelihood, name))
 
 
 def random_actions(space: gymnasium.Space, count: int, step: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
-from filtergym.baselines.advice import advise, share_out
+from filtergym.baselines.advice import FittedLog, advise, share_out
 from filtergym.baselines.fitted_filters import own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.judgement import AS_GOOD, Judgement
@@ -235,7 +235,7 @@ def advice(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     recording = read(write_log(folder, count=600, acceleration=2.0, sigma=2.0, stated=1.0, seed=3))
     shipped = {name: PROBLEM.competitor(name) for name in ("imm", "kalman-imm", "fixed-low")}
-    return advise(PROBLEM, recording, shipped)
+    return advise(FittedLog(PROBLEM, recording), shipped)
 
 
 def test_the_filter_of_the_log_is_advised_and_is_better(advice):
@@ -321,12 +321,12 @@ def test_too_few_measurements_are_refused(tmp_path):
     with pytest.raises(
         ValueError, match="has 3 measurements after the start of its track: to fit anything takes 5"
     ):
-        advise(PROBLEM, recording, {})
+        advise(FittedLog(PROBLEM, recording), {})
 
 
 def test_a_short_log_says_that_it_is_short(tmp_path):
     recording = read(write_log(tmp_path, count=12))
-    found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})
+    found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
     text = "\n".join(advice_lines(found, []))
     assert "measurements are few" in text
     assert "which flatters it" in text
@@ -346,14 +346,14 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     """The rival is the paper's algorithm, or likelier beyond chance; so is what is advised to the rival."""
     recording = read(write_log(tmp_path, count=240, acceleration=0.8, sigma=1.0, seed=5))
     shipped = {"imm": PROBLEM.competitor("imm"), "same": PROBLEM.competitor("imm")}
-    found = advise(PROBLEM, recording, shipped)
+    found = advise(FittedLog(PROBLEM, recording), shipped)
     assert found.rival == "imm"
     assert found.fitted.gain.low > 0.0
     assert found.advised is found.fitted
     # What made the log is shipped, too: nothing that is fitted to it can be better beyond chance.
     true = partial(ConstantVelocity, acceleration=0.8)
     true.kind = "estimator"
-    found = advise(PROBLEM, recording, {**shipped, "true": true})
+    found = advise(FittedLog(PROBLEM, recording), {**shipped, "true": true})
     assert found.rival == found.advised.name == "true"
     lines = list(advice_lines(found, []))
     assert lines[0].startswith(
@@ -379,7 +379,9 @@ def test_a_cheaper_family_that_predicts_worse_beyond_chance_is_not_chosen(monkey
         return {"sluggish": own_family("sluggish", Sluggish), name: log_families(recording)[name]}
 
     monkeypatch.setattr(advice_module, "families_of", families)
-    found = advise(PROBLEM, read(write_log(tmp_path, count=240)), {"imm": PROBLEM.competitor("imm")})
+    found = advise(
+        FittedLog(PROBLEM, read(write_log(tmp_path, count=240))), {"imm": PROBLEM.competitor("imm")}
+    )
     assert found.diverging == ()
     assert found.fitted.name == "constant-velocity"
 
@@ -396,7 +398,9 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
         asked.append(name)
         return dict.fromkeys(PRICES.values(), operations[name]) if name in operations else None
 
-    found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm"), "true": true}, price_of=price_of)
+    found = advise(
+        FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm"), "true": true}, price_of=price_of
+    )
     assert found.rival == "true"
     assert -AS_GOOD < found.fitted.gain.low < 0.0
     assert found.advised.name == "constant-velocity"
@@ -448,7 +452,7 @@ def test_where_the_likelihood_misleads_the_rival_is_advised(one_family, tmp_path
     for low, kept in ((0.02, True), (-0.02, False)):
         errors = Estimate(0.07, low, 0.12)
         monkeypatch.setattr(Judgement, "relative_error", lambda self, name, other, errors=errors: errors)
-        found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})
+        found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
         assert found.fitted.gain.low > 0.0
         assert (found.advised.name == "imm") == kept
 
@@ -475,8 +479,7 @@ def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):
 
     recording = read(write_log(tmp_path, count=240))
     found = advise(
-        PROBLEM,
-        recording,
+        FittedLog(PROBLEM, recording),
         {"imm": PROBLEM.competitor("imm")},
         {"forgetful": own_family("forgetful", Forgetful)},
     )

@@ -12,14 +12,14 @@ import browser
 import numpy as np
 import pytest
 from filtergym.baselines import advice as advice_module
-from filtergym.baselines.advice import advise
+from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.running.metrics import chi_square_band
 
 from filtergym.__main__ import main
-from filtergym.reports.tables.advice import further_sentences, verdict
+from filtergym.reports.tables.advice import advice_rows, further_sentences, verdict
 
 pytest.importorskip("plotly")
 pytest.importorskip("jinja2")
@@ -47,7 +47,7 @@ def advice(tmp_path_factory):
         patch.setattr(
             advice_module, "families_of", lambda _, log: {n: log_families(log)[n] for n in FAMILIES}
         )
-        return advise(PROBLEM, read_recording(path, PROBLEM.id), shipped)
+        return advise(FittedLog(PROBLEM, read_recording(path, PROBLEM.id)), shipped)
 
 
 def page_of(advice):
@@ -72,6 +72,10 @@ def test_the_sentence_comes_first_and_tables_hold_what_was_fitted(advice, page):
     assert text.index(verdict(advice).split("[")[0]) < text.index("<table>")
     for name in advice.fits:
         assert name in text
+    first, *others = [row.label for row in advice_rows(advice, [])]
+    assert first == f"{advice.advised.name} (advised)"
+    assert not any(label.endswith("(advised)") for label in others)
+    assert {f"{name} (fitted)" for name in advice.fits} <= {*others}
     for sentence in further_sentences(advice, []):
         assert sentence.replace("'", "&#39;") in text
     assert "10 scans have no row: they missed the target" in text

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.baselines.advice import find_outliers, fit_all
+from filtergym.baselines.advice import FittedLog, find_outliers, fit_all
 from filtergym.baselines.fitted_filters import read_artefact, write_advised
 from filtergym.baselines.fitting import OUTLIER_SHARE, WIDE, Fit, RobustEstimator
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
@@ -62,9 +62,7 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
 
 LOGS = {
     "radar": {"names": POLAR, "missed": 0.2, "outliers": 0.05},
-    "clean": {"names": PLANE},
     "walk": {"names": PLANE, "speed": 1.4, "sigma": 1.0, "T": 0.25, "jitter": 0.02},
-    "uneven": {"names": PLANE, "jitter": 0.2, "missed": 0.1},
     "no deviations": {"names": PLANE[:2], "sigma": 30.0},
     "latitude": {"names": PLACE, "missed": 0.2, "outliers": 0.05},
     "latitude only": {"names": PLACE[:2], "jitter": 0.2},
@@ -230,7 +228,9 @@ def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
 def test_outliers_are_found_where_there_are_some_and_only_there(tmp_path):
     for outliers in (0.0, 0.05):
         recording = read_recording(write_log(tmp_path / "log.csv", PLANE, outliers=outliers), ID)
-        tunable, found, _ = fit_all(PROBLEM, recording, log_families(recording)["constant-velocity"])
+        tunable, found, _ = fit_all(
+            FittedLog(PROBLEM, recording), log_families(recording)["constant-velocity"]
+        )
         assert (OUTLIER_SHARE in found.values) == (outliers > 0.0)
         named = find_outliers(make_task(PROBLEM.task, None), recording, tunable, found)
         error = recording.measurements["position"][0] - recording.truth[0][:, :2]

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import commands
 import pytest
 from filtergym.baselines.problem import problem_of
+from filtergym.compiler import native
 from filtergym.envs.engine.catalogue import catalogue
 from made_results import without_times
 
@@ -265,6 +266,15 @@ def test_doctor_says_what_an_issue_needs(run, monkeypatch):
     lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
     assert lines["[fast]"].startswith("llvmlite missing, platformdirs ")
     assert "numpy 0.1, wants >=2.1" in lines["libraries"]
+    monkeypatch.setattr(native, "AVAILABLE", True)
+    for features, widest in (
+        ("+avx2,+avx512f", "AVX-512"),
+        ("+avx2", "AVX2"),
+        ("+sse2", "neither AVX2 nor AVX-512"),
+    ):
+        monkeypatch.setattr(native, "processor", lambda features=features: ("mine", features))
+        lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
+        assert lines["backend"] == f"compiled for mine, {widest}"
 
 
 def test_animate_draws_every_policy(tmp_path, run):

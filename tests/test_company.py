@@ -25,13 +25,13 @@ def assert_same(some, more):
         np.testing.assert_array_equal(some[name].values, expected, err_msg=str(name))
 
 
-def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
+@pytest.mark.parametrize("everybody", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_an_episode_is_the_same_in_any_company(env_id, everybody, short, monkeypatch):
+    """One of each kind, since a competitor may take a second to trace; everybody with the whole programs."""
     problem, agents = problem_of(env_id), pretrained_agents(env_id)
-    names = [*problem.names, *agents]
-    if env_id == "filtergym/TightlyCoupledNavigation-v0":  # every competitor takes a second to compile
-        known = problem.baselines
-        kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
-        names = [name for kind in kinds for name in list(kind)[:1]]
+    known = problem.baselines
+    kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
+    names = [name for kind in kinds for name in (kind if everybody else list(kind)[:1])]
     monkeypatch.setattr(programs, "PROGRAM_CACHE_SIZE", len(names))  # what was traced once serves twice
     everyone = evaluate(env_id, names, episodes=13, **short)
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 12)  # and the last one alone

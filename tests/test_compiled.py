@@ -71,7 +71,7 @@ def sampled(env, count):
 
 @pytest.mark.processors
 def test_whole_episodes_are_those_of_numpy(env_id):
-    """Under one control; what each shows and is paid is compared with the stored trajectories."""
+    """Under one control; what each shows, is paid and tells is compared over a few decisions."""
     keywords = KEYWORDS.get(env_id, {})
     decisions = gym.make(env_id, **keywords).unwrapped.last_decision
     assert_same_episodes(env_id, 8, decisions + 2, **keywords)
@@ -108,10 +108,14 @@ def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
     assert_same_episodes(env_id, 7, 12, shortened, reward=reward, autoreset_mode=mode, **short)
 
 
+@pytest.mark.processors
 def test_details_are_those_of_numpy(env_id, control, short):
+    """Beside observation and reward."""
+
     def fly(env):
         env.reset(seed=2)
-        return [env.step(action)[4] for action in sampled(env, 3)]
+        steps = [env.step(action) for action in sampled(env, 3)]
+        return [{"observation": shown, "reward": paid, **info} for shown, paid, _, _, info in steps]
 
     runs = compare(env_id, 7, fly, control=control, detailed_info=True, **short)
     for step, (found, expected) in enumerate(zip(*runs[:2], strict=True)):

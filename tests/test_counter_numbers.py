@@ -1,18 +1,15 @@
-"""Random numbers by counter: published answers, the same bits from every language, distribution and independence.
+"""Random numbers by counter: published answers, the same bits from compiled code, distribution and independence.
 
 The numbers are functions of counters that stand here, so nothing is left to chance from run to run. A statistic is held
 against a threshold that as many numbers of an ideal generator would pass with the stated probability: a false alarm
 could only come with a change of the algorithm.
 """
 
-import ctypes
 import math
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
-from filtergym.compiler.counter_code import bind_numbers, c_text
+from filtergym.compiler.counter_code import bind_numbers
 from filtergym.compiler.counter_numbers import (
     ARRAYS,
     LOW,
@@ -155,48 +152,6 @@ def test_compiled_code_gives_the_same_bits(normals, uniforms):
         np.testing.assert_array_equal(rows[:-1, 8:-8].view(WHOLE), expected.view(WHOLE))
         assert np.isnan(rows[-1]).all(), "nothing is written beyond the last row"
         assert np.isnan(rows[:, [*range(8), *range(-8, 0)]]).all(), "nor beside the lanes"
-
-
-def test_c_gives_the_same_bits(tmp_path):
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("no C compiler")
-    source = c_text() + (
-        "void many(const uint64_t *key, const uint64_t *episode, const uint64_t *t, long n, double *out) {\n"
-        "for (long i = 0; i < n; ++i) {\n"
-        "counter_normal_pair(key[i], episode[i], t[i], i % 7, out + 4 * i, out + 4 * i + 1);\n"
-        f"counter_uniform_pair(key[i], episode[i], t[i], {UNIFORM_PAIRS}u + i % 5, out + 4 * i + 2, out + 4 * i + 3);\n"
-        "}}\n"
-    )
-    (tmp_path / "numbers.c").write_text(source)
-    for optimised in ("-O0", "-O3"):
-        library = tmp_path / f"numbers{optimised}.so"
-        flags = [
-            "-std=c99",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            optimised,
-            "-ffp-contract=off",
-            "-shared",
-            "-fPIC",
-        ]
-        subprocess.run([compiler, *flags, "numbers.c", "-o", library, "-lm"], check=True, cwd=tmp_path)
-        count = 200_000
-        key, episode, t = np.random.default_rng(2).integers(0, 2**64, size=(3, count), dtype=WHOLE)
-        t &= WHOLE(LOW)
-        key[: len(EDGES)] = episode[-len(EDGES) :] = EDGES
-        out = np.empty((count, 4))
-        many = ctypes.CDLL(str(library)).many
-        many.argtypes = [ctypes.c_void_p] * 3 + [ctypes.c_long, ctypes.c_void_p]
-        many(key.ctypes.data, episode.ctypes.data, t.ctypes.data, count, out.ctypes.data)
-        place = np.arange(count, dtype=WHOLE)
-        normal = normal_pair(ARRAYS, *pair_of_bits(key, episode, t, place % WHOLE(7)))
-        even = [
-            uniform(ARRAYS, bits)
-            for bits in pair_of_bits(key, episode, t, WHOLE(UNIFORM_PAIRS) + place % WHOLE(5))
-        ]
-        np.testing.assert_array_equal(out.T.view(WHOLE), np.array([*normal, *even]).view(WHOLE))
 
 
 def test_numbers_do_not_depend_on_what_else_is_asked_for():

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
-from filtergym.baselines.advice import advise
+from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.fitted_filters import families_of, read_artefact, write_advised
 from filtergym.baselines.maneuvering_target.anchored import DeadReckoning, regress_odometry
 from filtergym.baselines.maneuvering_target.log_families import log_families
@@ -248,7 +248,7 @@ def advise_of_two(recording):
     problem = dataclasses.replace(
         PROBLEM, baselines=dataclasses.replace(PROBLEM.baselines, log_families=families)
     )
-    return advise(problem, recording, {"kalman-imm": PROBLEM.competitor("kalman-imm")})
+    return advise(FittedLog(problem, recording), {"kalman-imm": PROBLEM.competitor("kalman-imm")})
 
 
 @pytest.fixture(scope="module")

@@ -170,6 +170,12 @@ class TestPolicies:
         with pytest.raises(ValueError, match=r"unknown policy 'adaptve': did you mean 'adaptive'"):
             evaluate(ID, ["adaptve"], episodes=1)
 
+    def test_a_file_without_its_ending(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "mine.zip").touch()
+        with pytest.raises(ValueError, match=r"unknown policy 'mine': a file is named whole, mine\.zip"):
+            evaluate(ID, ["mine"], episodes=1)
+
     @pytest.mark.parametrize(
         ("policy", "control"), [("imm", "gain"), ("adaptive", "weights"), ("zero", "mode")]
     )

@@ -8,11 +8,11 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from contract import assert_equals_its_vector
 from environment_page import environment_table
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import registration
-from gymnasium.utils.env_checker import check_env
 from models import make_model
 
 import filtergym
@@ -39,18 +39,9 @@ def test_it_is_short():
 
 
 def test_environment(example):
-    env = gymnasium.make(ID, render_mode="rgb_array", horizon=8)
-    check_env(env.unwrapped)
-    vector = gymnasium.make_vec(ID, num_envs=3, horizon=8)
-    shown, _ = vector.reset(seed=4)
-    single, _ = env.reset(seed=6)
-    np.testing.assert_array_equal(shown[2], single)
-    for k in range(8):
-        action = np.full((3, 1), 0.1 * k)
-        shown, *_ = vector.step(action)
-        single, *_, truncated, _ = env.step(action[2])
-        np.testing.assert_array_equal(shown[2], single)
-    assert truncated
+    env = assert_equals_its_vector(
+        ID, [np.full(1, 0.1 * k) for k in range(8)], render_mode="rgb_array", horizon=8
+    )
     assert env.render().ndim == 3
 
 

@@ -298,7 +298,9 @@ def test_an_exported_bank_steers_the_tracking_loops(tmp_path, monkeypatch):
     np.testing.assert_allclose(program, own, rtol=1e-9)
     # The loops lose rates here: with what the estimate says alone others, and the costs are others.
     monkeypatch.setattr(HypothesisBank, "feedback", lambda *given: None)
-    (other, _) = costs_of("TightlyCoupledNavigation", "multi-hypothesis", tmp_path, **keywords)
+    name = "multi-hypothesis"
+    other = evaluate("filtergym/TightlyCoupledNavigation-v0", name, None, 16, backend="numpy", **keywords)
+    (other,) = other["cost"].mean("time").values
     assert np.abs(other / own - 1.0).max() > 1e-3
 
 

@@ -102,6 +102,11 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
         found = evaluate(TARGET, f"file:{tmp_path / name}.csv", recording, tracks=True)
         np.testing.assert_array_equal(found["cost"], whole["cost"])
         assert not found["missing"].any()
+    # Of the same moments by another clock nothing says that they are the same.
+    times = table["log_time"].str.partition("T")[2]
+    table.drop(columns=["seconds"]).assign(log_time=times).to_csv(tmp_path / "times.csv", index=False)
+    with pytest.raises(ValueError, match="are times of day, and those of the log dates"):
+        evaluate(TARGET, f"file:{tmp_path / 'times.csv'}", recording)
 
 
 @pytest.mark.parametrize(

@@ -250,10 +250,14 @@ def test_of_satellites_the_noise_of_the_motion_holds_until_the_next_measurement(
 def test_of_a_radar_any_answer_is_what_the_description_says():
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
     model, initial, measurements = episodes(RADAR, 16, 3)
-    rng, bank = np.random.default_rng(0), model.filter
+    rng, bank, correction = np.random.default_rng(0), model.filter, np.zeros((16, 2))
     state = bank.start(initial)
     for measurement in measurements:
         before, state = state, bank.predict(state, measurement)
+        shown = model.observe(Episode(None, measurement, state)).T
+        # Over what 1 m/s^2 makes of the velocity in the six seconds of a scan period.
+        np.testing.assert_allclose(model.reader("correction")(shown), correction / 6.0, rtol=1e-7, atol=1e-6)
+        correction = np.zeros((16, 2))
         action = rng.uniform(-1.2, 1.2, (radar.ANSWERS, 16))
         predicted, state = state, bank.act(state, measurement, action)
         for i, a in enumerate(np.clip(action, -1.0, 1.0).T):
@@ -282,6 +286,7 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
             mean = x + K @ (measurement.position[:, i] - x[:2])
             # The frame's direction is that of a speed 1e-3 m/s larger.
             np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-7, atol=1e-5)
+            correction[i] = U.T @ (mean - x)[2:]
             joseph = rest @ P @ rest.T + K @ R @ K.T
             np.testing.assert_allclose(state.covariance[:, :, i], joseph, rtol=1e-6, atol=1e-4)
             np.testing.assert_allclose(state.acceleration[:, i], radar.LARGEST_ACCELERATION * a[7:])

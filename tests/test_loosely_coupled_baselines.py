@@ -18,7 +18,6 @@ from filtergym.baselines.loosely_coupled_navigation.metrics import (
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.schedules import within
-from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled, receiver_faults
@@ -46,7 +45,6 @@ PRINTED = {
 """Root mean square errors from 2.5 to 5 s, m, of the reference table (its plain rows have the Riccati gain)."""
 
 
-KNOWN_SCENARIOS = list(task_class(ID).scenarios)
 FAULTY = ["random", "quiet", "jamming", "outage", "spoof-ramp", "outliers", "coloured-receiver"]
 
 
@@ -164,48 +162,6 @@ def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
     product = np.nanmean(normalised[:, 1:] * normalised[:, :-1], axis=1)
     assert abs(product.mean()) < 4 * product.std() / math.sqrt(runs)
     assert np.isnan(normalised).any() == (scenario in ("random", "outage"))
-
-
-class Recited:
-    """An estimator that knows the clock and the distribution of the motion, and looks at no measurement.
-
-    It answers the mean of the motion given where it starts, the least mean square error without a measurement.
-    """
-
-    kind = "estimator"
-
-    def __init__(self, task):
-        self.task, p = task, task.parameters
-        rate = np.exp(np.linspace(*np.log(p.manoeuvre_rate), 2001))
-        weight = 1.0 / rate**4 / np.sum(1.0 / rate**4)
-        times = np.arange(p.horizon + 1) * p.sampling_interval
-        # Linear in the start, whose correlation with the motion is the mean of cos(rate t).
-        self.share = weight @ np.cos(rate[:, None] * times)
-
-    def start(self, initial, N):
-        return initial.mean
-
-    def update(self, measurement, memory):
-        p = self.task.parameters
-        if p.manoeuvres:
-            mean = self.share[np.asarray(measurement.number, dtype=int)] * memory
-        else:
-            mean = memory + p.reference_amplitude * np.sin(
-                p.reference_rate * p.sampling_interval * measurement.number
-            )
-        variance = np.full((1, 1, mean.shape[-1]), 1.0)
-        return mean, variance, memory
-
-
-@pytest.mark.claims
-def test_a_recited_truth_scores_below_zero():
-    for scenario in KNOWN_SCENARIOS:
-        cost = evaluate(
-            ID, {"recited": Recited, "plain-reduced": "plain-reduced"}, scenario, episodes=40, seed=3
-        )["cost"].mean(["time", "episode"])
-        gain = float(cost.sel(policy="plain-reduced") - cost.sel(policy="recited"))
-        # The paper's experiment is as printed: one sine, which everybody may know.
-        assert (gain > 0.0) == (scenario == "paper"), scenario
 
 
 # --- against naive filters

@@ -11,29 +11,17 @@ from filtergym.evaluation.storage.dataset import windows_of
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from models import make_model
-from naive import episode_numbers
+from naive import BEARING_SIGMA, RANGE_SIGMA, T, episode_numbers, naive_bank, variances
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
-T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)
 REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
 """Every scan sees the target on time, as in the paper; where it does not, see test_missed_scans.py."""
 
 
 # --- the paper's experiment, written naively: one episode, matrices, no function of the package
-
-
-def variances(x, y):
-    """Equations (22), (23)."""
-    r, b = math.hypot(x, y), math.atan2(y, x)
-    return np.array(
-        [
-            (math.cos(b) * RANGE_SIGMA) ** 2 + (r * math.sin(b) * BEARING_SIGMA) ** 2,
-            (math.sin(b) * RANGE_SIGMA) ** 2 + (r * math.cos(b) * BEARING_SIGMA) ** 2,
-        ]
-    )
 
 
 def paper_flight():
@@ -58,39 +46,11 @@ def paper_data(seed):
 
 
 def naive_imm(start, measurements, gains, transition, probabilities):
-    """Equations (8) to (16) with the Joseph covariance: estimates and mode probabilities of every scan.
-
-    Gains are ``(M,)``, or ``(scans, M)`` where they change.
-    """
-    F = np.kron([[1.0, T], [0.0, 1.0]], np.eye(2))
-    H = np.eye(2, 4)
-    R0 = variances(*start[:2])
-    M = len(probabilities)
-    x, P = [start] * M, [np.diag(np.concatenate([R0, 2 * R0 / T**2]))] * M
-    mu = np.array(probabilities)
-    estimates, history = [], []
-    for z, used in zip(measurements, np.broadcast_to(gains, (len(measurements), M)), strict=True):
-        predicted = np.array([sum(transition[i][j] * mu[i] for i in range(M)) for j in range(M)])
-        R = np.diag(variances(*z))
-        new_x, new_P, log_weights = [], [], []
-        for j in range(M):
-            w = [transition[i][j] * mu[i] / predicted[j] for i in range(M)]
-            x0 = sum(w[i] * x[i] for i in range(M))
-            P0 = sum(w[i] * (P[i] + np.outer(x[i] - x0, x[i] - x0)) for i in range(M))
-            x0, P0 = F @ x0, F @ P0 @ F.T
-            S = H @ P0 @ H.T + R
-            log_weights.append(math.log(predicted[j]) + multivariate_normal.logpdf(z, H @ x0, S))
-            beta = used[j] ** 2 / (2 - used[j])
-            K = np.kron([[used[j]], [beta / T]], np.eye(2))
-            rest = np.eye(4) - K @ H
-            new_x.append(x0 + K @ (z - H @ x0))
-            new_P.append(rest @ P0 @ rest.T + K @ R @ K.T)
-        x, P = new_x, new_P
-        weights = np.exp(np.array(log_weights) - max(log_weights))
-        mu = weights / weights.sum()
-        estimates.append(sum(mu[j] * x[j] for j in range(M)))
-        history.append(mu)
-    return np.array(estimates), np.array(history)
+    """Estimates and mode probabilities of every scan; gains are ``(M,)``, or ``(scans, M)`` where they change."""
+    scans = [(T * k, None, z) for k, z in enumerate(measurements, 1)]
+    used = np.broadcast_to(gains, (len(scans), len(probabilities)))
+    mean, _, mu = zip(*naive_bank(start, scans, transition, probabilities, used), strict=True)
+    return np.array(mean), np.array(mu)
 
 
 BANKS = [

@@ -20,10 +20,9 @@ from filtergym.baselines.maneuvering_target.estimators import (
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
-from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
-from models import Asked, make_model
+from models import make_model, watch_estimator
 from scipy.stats import multivariate_normal
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -48,24 +47,11 @@ def model(request):
     return make_model(ID, None, "random", **(irregular if request.param == "irregular" else {}))
 
 
-def estimates(model, estimator, horizon=100):
+def estimates(model, estimator):
     """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
-    given, answers, estimator = [], [], Asked(estimator)
-
-    class Watched:
-        def start(self, initial, N):
-            given.append(initial)
-            return estimator.start(initial, N)
-
-        def update(self, measurement, memory):
-            mean, covariance, memory, _ = estimator.update(measurement, memory)
-            given.append(measurement)
-            answers.append((mean, covariance))
-            return mean, covariance, memory
-
-    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
-        pass
-    return given[0], given[1:], *map(np.array, zip(*answers, strict=True))
+    start, measurements, answers = watch_estimator(model, estimator)
+    mean, covariance, _ = zip(*answers, strict=True)
+    return start, measurements, np.array(mean), np.array(covariance)
 
 
 def compare(model, estimator, naive, rtol=1e-9):

@@ -12,31 +12,16 @@ from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
 from filtergym.filters.array_namespace import host_array
 from models import make_model
-from naive import episode_numbers
-from scipy.stats import multivariate_normal
+from naive import RANGE_SIGMA, T, episode_numbers, naive_bank, transition, variances
 
 from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
 CONTROLS = ("evidence", "gains", "gain", "mode", "weights")
-T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)
 IRREGULAR = {"detection_probability": (0.5, 0.9), "scan_jitter": (0.3, 0.9), "undisturbed": 0.0}
 REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}
 SEEN, MISSED = 0.0, 0.999
 """Uniform numbers of a scan that sees the target, and of one that does not."""
-
-
-def transition(dt):
-    """Of position and velocity over dt seconds."""
-    return np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
-
-
-def variances(x, y):
-    """Equations (22), (23)."""
-    r, b = math.hypot(x, y), math.atan2(y, x)
-    along, across = RANGE_SIGMA**2, (r * BEARING_SIGMA) ** 2
-    c, s = math.cos(b) ** 2, math.sin(b) ** 2
-    return np.array([c * along + s * across, s * along + c * across])
 
 
 def paper_state(time):
@@ -63,50 +48,6 @@ def paper_data(seed):
         z = truth[:2] + np.sqrt(variances(*truth[:2])) * rows[k - 1]
         scans.append((time, truth, z if uniforms[k - 1, 0] < detection else None))
     return start, scans
-
-
-def start_covariance(start):
-    """Equation (24)."""
-    R = variances(*start[:2])
-    return np.diag(np.concatenate([R, 2 * R / T**2]))
-
-
-def naive_bank(start, scans, chain, mu, gains):
-    """The paper's IMM with prediction over whatever interval, and prediction only where there is no measurement.
-
-    Yields estimate, covariance and mode probabilities of every scan.
-
-    Args:
-        start: of the track.
-        scans: time, truth and measurement of each.
-        chain: transition matrix of the modes.
-        mu: their probabilities at the start.
-        gains: position gains in every scan, ``(scans, M)``.
-    """
-    M, H = len(mu), np.eye(2, 4)
-    x, P, last, measured = [start] * M, [start_covariance(start)] * M, 0.0, 0.0
-    for (time, _, z), used in zip(scans, gains, strict=True):
-        predicted = np.array([sum(chain[i][j] * mu[i] for i in range(M)) for j in range(M)])
-        new, log_weights, F = [], np.log(predicted), transition(time - last)
-        for j in range(M):
-            w = [chain[i][j] * mu[i] / predicted[j] for i in range(M)]
-            x0 = sum(w[i] * x[i] for i in range(M))
-            P0 = sum(w[i] * (P[i] + np.outer(x[i] - x0, x[i] - x0)) for i in range(M))
-            x0, P0 = F @ x0, F @ P0 @ F.T
-            if z is not None:
-                R = np.diag(variances(*z))
-                log_weights[j] += multivariate_normal.logpdf(z, x0[:2], P0[:2, :2] + R)
-                K = np.kron([[used[j]], [used[j] ** 2 / (2 - used[j]) / (time - measured)]], np.eye(2))
-                rest = np.eye(4) - K @ H
-                x0, P0 = x0 + K @ (z - H @ x0), rest @ P0 @ rest.T + K @ R @ K.T
-            new.append((x0, P0))
-        x, P = zip(*new, strict=True)
-        mu = np.exp(log_weights - log_weights.max())
-        mu = mu / mu.sum()
-        last, measured = time, measured if z is None else time
-        mean = sum(mu[j] * x[j] for j in range(M))
-        spread = sum(mu[j] * (P[j] + np.outer(x[j] - mean, x[j] - mean)) for j in range(M))
-        yield mean, spread, mu
 
 
 CHAIN, PRIOR = ((0.95, 0.05), (0.3, 0.7)), (0.8, 0.2)

@@ -11,6 +11,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.running.transitions import member, transitions_of
+from models import KINDS
 
 import filtergym
 from filtergym import Trajectory
@@ -48,6 +49,7 @@ def in_a_loop_of_ones_own(id, policy, seed, **keywords):
     return np.array(observations), np.array(actions), np.array(rewards)
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 @pytest.mark.parametrize("which", ["paper", "tuned", "random"])
 def test_transitions_are_those_of_a_single_environment(env_id, short, which):
     name = {

@@ -32,6 +32,7 @@ from filtergym.evaluation.running.summary import Summary, combine_summaries, sum
 from filtergym.evaluation.storage import code
 from filtergym.evaluation.storage.store import Store
 from made_results import without_times
+from models import KINDS
 
 import filtergym
 from filtergym import evaluate, tidy_records
@@ -77,6 +78,7 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
     assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_summaries_tell_what_the_evaluation_does(env_id, short):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env_id)
@@ -132,6 +134,7 @@ def numbers_in(part):
     )
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_of_an_episode_a_few_numbers_are_kept_and_of_a_block_nothing_else(env_id, short, monkeypatch):
     """Memory grows by less than one measurement an episode, and the arrays of a block go before the next is run."""
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
@@ -173,6 +176,7 @@ def shuffled(run):
     return other
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_order(env_id, short, monkeypatch):
     known = baselines_of(env_id)
     names = [known.score_paper, next(iter(known.references)), list(known.bounds)[-1]]

@@ -172,6 +172,8 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("ManeuveringTarget", {"coloured_sigma": (0.0, 1e5)}),
         ("ManeuveringTarget", {"bias": 1e5}),
         ("UavAutopilot", {"moment_rate": 1e6}),
+        ("UavAutopilot", {"sensor_bias": (0.0, 1e6)}),
+        ("UavAutopilot", {"sensor_coloured": (0.0, 1e6)}),
         (
             "UavAutopilot",
             {
@@ -186,6 +188,8 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "coloured": 1e5}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "drift": 1e6}),
+        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "fixed_drift": -1e6}),
+        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "drift_factor": (1e6, 1e6)}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "receiver_factor": (1e-6, 1e-6)}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
         ("TightlyCoupledNavigation", {"pseudorange_sigma": 1e-6}),
@@ -193,6 +197,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ("TightlyCoupledNavigation", {"gravity": 1e6, "initial_attitude_sigma": 180.0}),
         ("TightlyCoupledNavigation", {"reset_acceleration_sigma": 1e6}),
         ("TightlyCoupledNavigation", {"increment_sigma": 1e6, "initial_velocity_sigma": 1e6}),
+        ("TightlyCoupledNavigation", {"frequency_walk_density": 1e6, "rate_sigma": 1e-6}),
     ],
 )
 def test_what_no_filter_can_answer_is_refused(environment, parameters):

@@ -108,6 +108,12 @@ def test_faults_hold_when_the_context_says():
     )
 
 
+def test_what_does_not_happen_has_no_steps():
+    contexts, _ = rollout(TIGHT, 1, scenario="matched", horizon=20)
+    for name in ("noisy", "stuck", "no_rates", "hidden", "ramp"):
+        np.testing.assert_array_equal(contexts[0][name], [-1.0, -1.0], err_msg=name)
+
+
 def test_levels_are_those_of_the_times():
     contexts, _ = rollout(UAV, 200, scenario="random")
     start = contexts[0]

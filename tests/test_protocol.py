@@ -18,6 +18,7 @@ from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit
+from models import KINDS
 
 import filtergym  # noqa: F401  (registers the environments)
 
@@ -49,7 +50,10 @@ def length(env):
 
 def test_every_environment(env_id):
     assert_properties(Subject(env_id, backend="numpy"), PROPERTIES)
-    assert_properties(Subject(env_id), [draws_without_a_trace_and_copies_alike])
+
+
+def test_pictures_of_every_kind():
+    assert_properties([Subject(id) for id in KINDS], [draws_without_a_trace_and_copies_alike])
 
 
 def test_float32_on_every_backend(env_id):
@@ -404,15 +408,6 @@ def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_m
     env.step(env.action_space.sample())
     assert called == []
     assert env.pictures is None
-
-
-def test_vectors_render_before_reset_and_without_a_mode():
-    with pytest.raises(gym.error.ResetNeeded, match="reset before the first render"):
-        TaskVectorEnv(ID, 2, render_mode="rgb_array").render()
-    env = TaskVectorEnv(ID, 2)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert env.render() is None
 
 
 @pytest.mark.slow

@@ -11,8 +11,10 @@ from filtergym.envs.contract.model import Model
 from filtergym.envs.drawing import estimate_picture, rendering
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
 from filtergym.evaluation.figures.animation import episode_frames, write_animation
+from models import KINDS
 
 from filtergym import evaluate
 from filtergym.names import competitor
@@ -234,15 +236,16 @@ def test_record_video_writes_the_episode(tmp_path):
         assert clip.duration == pytest.approx(0.6, abs=0.11)
 
 
-def test_render_before_reset_and_without_a_mode():
+@pytest.mark.parametrize(("face", "many"), [(TaskEnv, {}), (TaskVectorEnv, {"num_envs": 2})])
+def test_render_before_reset_and_without_a_mode(face, many):
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset before the first render"):
-        TaskEnv(ID, render_mode="rgb_array").render()
-    env = TaskEnv(ID)
+        face(ID, **many, render_mode="rgb_array").render()
+    env = face(ID, **many)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="without a render mode"):
         assert env.render() is None
     with pytest.raises(ValueError, match="rgb_array"):
-        TaskEnv(ID, render_mode="rgb_aray")
+        face(ID, **many, render_mode="rgb_aray")
 
 
 @pytest.mark.parametrize("backend", ["agg", "TkAgg"])
@@ -355,6 +358,7 @@ def test_estimators_smoothers_and_references_are_drawn(id, name, monkeypatch):
         numpy.testing.assert_allclose(drawn[-1][key], expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_steps_that_nobody_looks_at_are_drawn_when_somebody_does(env_id, short):
     """Stable-Baselines3's ``make_vec_env`` asks for a render mode always: it must cost nothing."""
     watched, unwatched = (

@@ -8,7 +8,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import reference
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from models import make_model
+from models import KINDS, make_model
 
 import filtergym
 
@@ -96,6 +96,7 @@ def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_acti
     np.testing.assert_allclose(both, cost + likelihood / len(envs[0].task.components), rtol=1e-12)
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 @pytest.mark.parametrize(
     "kind", ["cost", "relative", "log-relative", "log-likelihood", "cost-and-likelihood"]
 )

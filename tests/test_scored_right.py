@@ -195,7 +195,15 @@ ALGORITHMS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "control", "keywords"), ALGORITHMS, ids=lambda part: str(part)[:12])
+OFTEN = {"PPO", "RecurrentPPO", "SAC", "ARS", "DQN"}
+"""One of each form: on and off its policy, recurrent, linear, with discrete actions."""
+
+
+@pytest.mark.parametrize(
+    ("name", "control", "keywords"),
+    [pytest.param(*row, marks=[] if row[0] in OFTEN else [pytest.mark.slow]) for row in ALGORITHMS],
+    ids=lambda part: str(part)[:12],
+)
 def test_every_algorithms_zip_is_loaded(sb3, name, control, keywords, tmp_path):
     model = sb3.model(name, control, learn=16, **keywords)
     file = save(model, tmp_path, statistics=None)

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from filtergym.baselines.advice import fit_all
+from filtergym.baselines.advice import FittedLog, fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
@@ -288,7 +288,7 @@ def test_a_noise_that_the_log_does_not_tell_is_not_identifiable(make, tmp_path):
     np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header="time,gps,odometry,compass", comments="")
     log = read_recording(tmp_path / "log.csv", problem.id)
     family = families_of(problem, log)["extended"]
-    tunable, fitted, intervals = fit_all(problem, log, family)
+    tunable, fitted, intervals = fit_all(FittedLog(problem, log), family)
     said = "\n".join(parameter_lines(tunable, fitted, intervals))
     assert re.search(r"compass noise .*not identifiable, the likelihood is flat", said)
     for name, factor in (("process_noise", 0.25), ("gps_noise", 4.0), ("odometry_noise", 4.0)):
@@ -346,7 +346,7 @@ def test_a_log_tells_the_noise_of_each_source(make, tmp_path):
     np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header="time,gps,log", comments="")
     problem = problem_of(make(**{**TWO, "sensors": sensors}).id)
     log = read_recording(tmp_path / "log.csv", problem.id)
-    _, _, intervals = fit_all(problem, log, families_of(problem, log)["extended"])
+    _, _, intervals = fit_all(FittedLog(problem, log), families_of(problem, log)["extended"])
     for name, factor in (("speed_noise", 4.0), ("drift_noise", 0.25)):
         interval = intervals[f"log10_{name}"]
         assert interval.high - interval.low < 1.0

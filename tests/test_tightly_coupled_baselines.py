@@ -159,38 +159,6 @@ def test_bound_is_below_the_reference(on_random):
     assert (difference.mean(axis=0) > -4 * difference.std(axis=0) / math.sqrt(len(squares))).all()
 
 
-# --- nothing can be recited
-
-
-class Recited:
-    """An estimator that knows the clock and the distribution of the courses, and looks at no measurement.
-
-    The mean of the motion given where it starts: accelerations to come have a mean of zero.
-    """
-
-    kind = "estimator"
-
-    def __init__(self, task):
-        self.task = task
-
-    def start(self, initial, N):
-        return initial
-
-    def update(self, measurement, memory):
-        common, mean = self.task.common, memory.mean
-        # What is felt at the start is a manoeuvre; Singer's decay is its mean.
-        mean = gnss_ins.advance(mean, self.task.axis[:, :, SINGER], common.T, common.decay)
-        return mean, memory.covariance, memory._replace(mean=mean)
-
-
-@pytest.mark.parametrize("scenario", ["random", "urban"])
-@pytest.mark.claims
-def test_a_recited_truth_scores_below_zero(scenario):
-    names = {"recited": Recited, "multi-hypothesis": "multi-hypothesis"}
-    cost = evaluate(ID, names, scenario, episodes=48, seed=3)["cost"].mean(["time", "episode"])
-    assert cost.sel(policy="recited") > cost.sel(policy="multi-hypothesis")
-
-
 # --- the bank over faults
 
 
@@ -299,14 +267,14 @@ def test_levels_of_a_rate_find_the_noisy_one():
 # --- policies
 
 
-def test_sticky_changes_the_chain_of_the_bank(on_random):
+def test_sticky_changes_the_chain_of_the_bank():
     assert make_model(ID, **policies.Sticky.task_keywords).task.parameters.transition == policies.chain(
         0.9999
     )
     assert policies.chain(0.998) == pytest.approx(
         numpy.array(make_model(ID).task.parameters.transition), abs=1e-15
     )
-    error = on_random["error"]
+    error = evaluate(ID, ["sticky", "multi-hypothesis"], episodes=4, horizon=40)["error"]
     assert (error.sel(policy="sticky") != error.sel(policy="multi-hypothesis")).any()
 
 

@@ -24,6 +24,10 @@ CONTINUOUS = [
     for id, control in CONTROLS
     if isinstance(make_model(id, control).action_space, gymnasium.spaces.Box)
 ]
+TIGHTLY = [cell for cell in CONTROLS if "Tightly" in cell[0] and cell[1] != "gain"]
+"""Of which a step takes longest."""
+LONG = [*TIGHTLY, *((id, control) for id, control in CONTINUOUS if control == "hypotheses")]
+"""Those of which a gradient takes longest, too."""
 MODES = [mode.value for mode in gymnasium.vector.AutoresetMode]
 
 
@@ -92,7 +96,10 @@ def part(runs, name):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("id", "control", "scenario"), CELLS)
+@pytest.mark.parametrize(
+    ("id", "control", "scenario"),
+    [pytest.param(*cell, marks=[pytest.mark.slow] if cell[:2] in TIGHTLY else []) for cell in CELLS],
+)
 def test_torch_equals_numpy(id, control, scenario, device):
     def fly(env, convert):
         env.action_space.seed(1)
@@ -196,7 +203,10 @@ def test_actions_may_be_arrays_lists_or_whole_numbers(id):
         assert torch.equal(paid(convert), first)
 
 
-@pytest.mark.parametrize(("id", "control"), CONTINUOUS)
+@pytest.mark.parametrize(
+    ("id", "control"),
+    [pytest.param(*cell, marks=[pytest.mark.slow] if cell in LONG else []) for cell in CONTINUOUS],
+)
 def test_gradient_of_an_episode_equals_finite_differences(id, control):
     """Loss: mean charge of a short episode on fixed noise, through bank, mixing and update.
 

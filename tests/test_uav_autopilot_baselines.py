@@ -8,7 +8,7 @@ import numpy
 import pytest
 import xarray
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.measurement_noise import VariationalBayes
+from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
 from filtergym.baselines.uav_autopilot.metrics import METRICS, detect_raised_noise
@@ -23,7 +23,7 @@ from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.statistic import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
 from filtergym.papers.uav_autopilot_kalman import experiment
-from models import make_model
+from models import Asked, make_model
 
 from filtergym import evaluate, tidy_records
 from filtergym.papers import uav_autopilot_kalman as paper
@@ -571,6 +571,34 @@ def test_with_noise_as_stated_an_adaptive_filter_is_the_papers(plant):
     error = evaluate(ID, makers, "random", 8, plant=plant)["error"]
     # One sensor after the other, as in the bank; the loop carries rounding on, and is stable.
     numpy.testing.assert_allclose(error.sel(policy="own"), error.sel(policy="kalman"), rtol=0, atol=1e-10)
+
+
+@BOTH
+def test_noise_is_estimated_from_what_a_sensor_says_beyond_what_is_predicted(plant):
+    """Of the first sensor, by the matrices of the plant; in a dropout it says nothing."""
+    model = make_model(ID, plant=plant, backend="numpy", horizon=40)
+    kept = []
+
+    class Watched(MeasurementNoise):
+        def update(self, memory, innovation, P, stated, available):
+            kept.append((innovation, available))
+            return super().update(memory, innovation, P, stated, available)
+
+    class Flown(Asked):
+        def update(self, measurement, memory):
+            predicted = design.F @ memory.mean + model.task.constant(design.B) * measurement.control
+            first = len(kept)
+            answer = super().update(measurement, memory)
+            innovation, available = kept[first]
+            seen = available > 0.0
+            expected = measurement.reading[0] - predicted[model.task.measured[0]]
+            numpy.testing.assert_allclose(innovation[seen], expected[seen], rtol=1e-9, atol=1e-12)
+            return answer
+
+    design = model.task.design.model
+    for _ in rollout(model, Flown(AdaptiveKalman(model.task, Watched)), range(8)):
+        pass
+    assert len(kept) >= 40
 
 
 @BOTH

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters.geodesy import PlaneOrigin
+from ..contract.live_input import LARGEST
 from ..contract.log_format import TrackLog
 from ..contract.task import Task
 from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, ColumnNames, list_names, numbers, read_table, seconds
@@ -311,6 +312,9 @@ def read_columns(
         table[name] = numbers(name, table[name])
         if numpy.isinf(table[name]).any():
             raise ValueError(f"{name} is not finite in row {numpy.isinf(table[name]).idxmax()}")
+        if (large := table[name].abs() > LARGEST).any():
+            row = large.idxmax()
+            raise ValueError(f"{name} is {table[name][row]:g} in row {row}, and {LARGEST:g} at most")
     table.insert(0, "time", seconds(read[time_name]))
     if truth is not None:
         table, told = _add_truth(table, read[time_name], cls, keywords, truth)

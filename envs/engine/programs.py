@@ -19,7 +19,6 @@ from ..contract.draws import Draws
 from ..contract.filter import Filter, Input
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from .reward import OWN_PAY
 
 PROGRAM_CACHE_SIZE = 8
 """Tasks whose programs a process keeps."""
@@ -69,15 +68,6 @@ class Parts(NamedTuple):
     predict: Specialised
     episode: Episode
     """After the measurement, its arrays of the right shapes."""
-
-
-def step_episodes(
-    kind: str, model: Model, episode: Episode, action: Array, noise: Array
-) -> tuple[Episode, Array, Array]:
-    """A whole step: episodes at the next measurement, the reward of the action, and the observation."""
-    after = model.act(episode, action)
-    following = model.measure(after, noise)
-    return following, OWN_PAY[kind](model, after), model.observe(following)
 
 
 class _Once:

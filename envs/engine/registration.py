@@ -77,7 +77,7 @@ def _check_contract(cls: Any) -> None:
             raise ValueError(
                 f"scenario {scenario.name!r} of {name} sets unknown parameters {', '.join(sorted(unknown))}"
             )
-    expected = [n for n in Task.__annotations__ if n not in declared]
+    expected = [n for n in Task.__annotations__ if n not in declared and not hasattr(Task, n)]
     for control in (*cls.controls, *cls.trained_banks):
         with explain_errors(f"{name} cannot be made with control {control!r}"):
             model = Model(cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters)), control)

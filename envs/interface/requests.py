@@ -89,12 +89,12 @@ class EnvOptions:
         ValueError: for a value that is none of the choices.
     """
 
-    reward: str | None = None
+    reward: str | None
     """Kind of reward; None: the environment's own."""
-    detailed_info: bool = False
-    dtype: str = "float64"
-    context: bool = False
-    observation: str = "measured"
+    detailed_info: bool
+    dtype: str
+    context: bool
+    observation: str
 
     def __post_init__(self) -> None:
         if not isinstance(self.dtype, str) or self.dtype not in DTYPES:  # a NumPy dtype equals its name

@@ -241,9 +241,9 @@ class Equations:
         """
         return self._through(self.model.G, self._with_passed(x, Passage(passed.interval, None)), passed)
 
-    def measured_input_noise(self, x: Array, passed: Passed) -> Array | float:
-        """What it adds to R, ``(m, m, N)``; arguments as of :meth:`input_noise`, the state at the measurement."""
-        return self._through(self.model.D, x, passed)
+    def measured_noise(self, R: Array, x: Array, passed: Passed) -> Array:
+        """R with what noise of the inputs adds to it, ``(m, m, N)``; the state at the measurement."""
+        return R if self.model.D is None else R + self._through(self.model.D, x, passed)
 
     def _through(self, function: VectorFunction | None, given: Array, passed: Passed) -> Array | float:
         """Covariance that noise of the inputs has behind a function of them, and of what else is given to it."""
@@ -311,8 +311,7 @@ class Equations:
             R: covariance of the noise, ``(m, m, N)`` or ``(m, m, 1)``.
         """
         nu = self.subtract(measurement.values, self.measure(mean, measurement))
-        if self.model.D is not None:
-            R = R + self.measured_input_noise(mean, measurement)
+        R = self.measured_noise(R, mean, measurement)
         return keep_received(nu, self.measurement_matrix(mean, measurement), R, measurement.available)
 
     def gain(self, covariance: Array, received: Received) -> Array:

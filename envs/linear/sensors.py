@@ -14,12 +14,20 @@ import numpy
 from ..contract.causes import Cause, Moment
 from ..contract.draws import Draws
 from ..contract.observation import Array
+from ..contract.parameters import Limits, check, freeze
 
 if TYPE_CHECKING:
     from .state_space import StateSpace
 
 PERIODS = {"rad": 2.0 * math.pi, "deg": 360.0}
 """Of angles, by their units."""
+LIMITS: dict[str, tuple[Any, Limits]] = {
+    "interval": (float | None, Limits(above=0.0)),
+    "availability": (float, Limits(above=0.0, at_most=1.0)),
+    "gate": (float | None, Limits(above=0.0)),
+    "wraps": (str | None, Limits(choices=tuple(PERIODS))),
+}
+"""What must hold for a sensor's fields."""
 EARLY = 1e-6
 """Share of a sensor's interval by which it may be due early: sums of intervals are rounded."""
 
@@ -53,16 +61,8 @@ class Sensor:
     """Of its numbers; default: of the component that it measures, or of the angle."""
 
     def __post_init__(self) -> None:
-        if self.interval is not None and not 0.0 < self.interval < math.inf:
-            raise ValueError(f"interval of a sensor must be above 0 s, or None, got {self.interval!r}")
-        if not 0.0 < self.availability <= 1.0:
-            raise ValueError(
-                f"availability of a sensor must be above 0 and at most 1, got {self.availability!r}"
-            )
-        if self.gate is not None and not 0.0 < self.gate < math.inf:
-            raise ValueError(f"gate of a sensor must be above 0, or None, got {self.gate!r}")
-        if self.wraps not in (None, *PERIODS):
-            raise ValueError(f"wraps of a sensor must be None, {' or '.join(PERIODS)}, got {self.wraps!r}")
+        for name, (hint, limits) in LIMITS.items():
+            check(f"{name} of a sensor", freeze(getattr(self, name)), hint, limits)
 
 
 class Channel(NamedTuple):

@@ -157,13 +157,16 @@ class LooselyCoupledNavigationParameters(TaskParameters):
             )
         T = self.sampling_interval
         growth = (self.white_intensity + 2.0 * self.coloured**2 * min(self.correlation_time, T)) * T
-        growth += (self.drift * T) ** 2
+        # The true drift, too: hypotheses that it leaves behind are merged with their distances.
+        true = self.drift * self.drift_factor[1] if self.fixed_drift is None else abs(self.fixed_drift)
+        growth += (max(self.drift, true) * T) ** 2
         best = min(1.0, self.receiver_factor[0]) * self.receiver_variance
         if growth > MOST_RATIO * best:
             raise ValueError(
-                "sampling_interval, drift, coloured or white_intensity must be smaller, or receiver_intensity or "
-                f"receiver_factor larger: from one measurement to the next the error gains {growth / best:.1e} times "
-                f"the variance of the receiver, and a number keeps digits of at most {MOST_RATIO:g}"
+                "sampling_interval, drift, fixed_drift, drift_factor, coloured or white_intensity must be smaller, or "
+                "receiver_intensity or receiver_factor larger: from one measurement to the next the error gains "
+                f"{growth / best:.1e} times the variance of the receiver, and a number keeps digits of at most "
+                f"{MOST_RATIO:g}"
             )
 
     @property

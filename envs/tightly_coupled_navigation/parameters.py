@@ -21,6 +21,8 @@ KNOWN_BY = {
     "attitude_sigma": ("initial_attitude_sigma", "attitude_rate_sigma", "angle_walk"),
 }  # fmt: skip
 """Standard deviations of what each sensor reads, as they are before it does."""
+WALKS = {"pseudorange_sigma": "frequency_density", "rate_sigma": "frequency_walk_density"}
+"""Densities of the walks of the clock that each sensor reads."""
 LARGEST_RATIO = 1e6
 """Of them to that of the sensor: squared, it takes twelve of the sixteen digits."""
 
@@ -261,6 +263,13 @@ class TightlyCoupledNavigationParameters(TaskParameters):
                         f"{name} must be at most {LARGEST_RATIO:g} times {sensor}, got {unknown!r} and {known!r}: "
                         "the covariance would have no digits left"
                     )
+        for sensor, density in WALKS.items():
+            known, walked = getattr(self, sensor), math.sqrt(getattr(self, density) * self.sampling_interval)
+            if walked > LARGEST_RATIO * known:
+                raise ValueError(
+                    f"{density} must be smaller: in an interval the clock walks by {walked:.1e}, more than "
+                    f"{LARGEST_RATIO:g} times {sensor}, {known!r}: the covariance would have no digits left"
+                )
         tilt = self.gravity * min(math.radians(self.initial_attitude_sigma), 1.0)
         if tilt > LARGEST_RATIO * self.accelerometer_sigma:
             raise ValueError(

@@ -41,6 +41,10 @@ _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
+LARGEST_ERROR = 1e5
+"""Standard deviations by which a sensor is wrong: at ten times as many, hypotheses stand so far apart that the
+covariance of those that are merged has no digits left."""
+
 
 @dataclass(frozen=True)
 class UavAutopilotParameters(TaskParameters):
@@ -135,13 +139,17 @@ class UavAutopilotParameters(TaskParameters):
     """Range of the first measurement of the second and further parts."""
     changing_sensors: tuple[str, ...] | None = None
     """Sensors that these factors apply to; None: all, drawn independently."""
-    sensor_coloured: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    sensor_coloured: tuple[float, float] = parameter(
+        (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
+    )
     """Interval of the stationary standard deviation of the coloured error of each sensor (first-order Gauss-Markov),
     beside the white one, over its nominal standard deviation, drawn uniformly; nobody reports it."""
     sensor_correlation_time: tuple[float, float] = parameter((0.2, 5.0), above=0.0, ascending=True)
     """Interval of the correlation time of this error, s, drawn log-uniformly. Ours: from ten samples to half an
     episode of plant U."""
-    sensor_bias: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
+    sensor_bias: tuple[float, float] = parameter(
+        (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
+    )
     """Interval of the size of a constant error of a sensor, over its nominal standard deviation, drawn uniformly, of
     either sign; nobody reports it."""
     biased_sensors: tuple[str, ...] | None = None

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from ..agents.named_policies import pretrained_agents
-from ..baselines.advice import advise, fit_all
+from ..baselines.advice import FittedLog, advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
@@ -82,7 +82,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
     if name in families:
         writable_file(out)
-    tunable, fitted, intervals = fit_all(problem, found, family, seed=seed)
+    tunable, fitted, intervals = fit_all(FittedLog(problem, found, seed=seed), family)
     likelihood = fitted.log_likelihood / fitted.measurements
     console.print(
         f"{name}, fitted to {fitted.measurements:,} measurements, {likelihood:.3f} nats per measurement:",
@@ -175,17 +175,8 @@ def advise_on_log(
             bar.update(line, completed=share)
             bar.say(what)
 
-        advice = advise(
-            problem,
-            found,
-            shipped,
-            own,
-            noise=noise,
-            seed=seed,
-            progress=progress,
-            price_of=update_prices(problem, found),
-            **keywords,
-        )
+        prices = update_prices(problem, found)
+        advice = advise(FittedLog(problem, found, noise, seed, keywords), shipped, own, progress, prices)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:

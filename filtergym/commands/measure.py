@@ -40,7 +40,7 @@ from .evaluation import (
     write,
 )
 from .protocol import check_options, evaluate_protocol
-from .shown import REPORT, make_report, print_headline, print_outcome, print_results
+from .shown import REPORT, make_report, print_headline, print_outcome
 from .terminal import (
     Backend,
     Cluster,
@@ -364,9 +364,6 @@ def benchmark(
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
-    details: Annotated[
-        bool, typer.Option("--details", help="Print the table of every environment and scenario.")
-    ] = False,
     format: Formats = None,
     columns: Columns = 2,
     backend: Backend = "auto",
@@ -398,8 +395,6 @@ def benchmark(
                 f"{result.short}, {result.scenario}: {count} competitor{'s' * (count > 1)} over "
                 f"{first.episodes:,} episodes"
             )
-            if details:
-                print_results(result.records, result.knows)
 
         def save_figures(cell: Cell, curves: xarray.Dataset) -> None:
             learned = pretrained_agents(cell.environment)

@@ -1,29 +1,16 @@
 """What several commands print of results, and the report that they make of them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..evaluation.running.metrics import Record
 from ..evaluation.storage.files import write_text
 from ..reports.pages.outcome import outcome_sentences, protocol_sentences
 from ..reports.tables.headline import headline_table
 from ..reports.tables.ranking import remarks
 from ..reports.tables.results import Result, Settings
-from ..reports.tables.terminal_tables import results_tables
 from .terminal import console, print_sentence, print_table
 
 REPORT = "report.html"
-
-
-def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
-    """Print the comparison of one environment and scenario, in as many tables as the terminal is narrow.
-
-    Args:
-        records: of all competitors.
-        knows: what references and bounds know, by their names.
-    """
-    for table in results_tables(records, knows, console.width):
-        print_table(table)
 
 
 def print_outcome(results: Sequence[Result]) -> None:

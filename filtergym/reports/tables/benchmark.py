@@ -15,7 +15,6 @@ from ...agents.named_policies import pretrained_agents
 from ...baselines.problem import Problem, problem_of
 from ...envs.engine.catalogue import catalogue
 from ...envs.engine.scenario_choice import make_task
-from ...evaluation.competitors.kinds import RandomPolicy
 from ...evaluation.running.metrics import Record
 from ...evaluation.running.parallel import Workers, check_workers
 from ...evaluation.running.rollout import Progress
@@ -103,15 +102,6 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         telling = known.benchmark or known.names
         everything = (*(name for name in telling if f"{name}-tuned" not in tuned), *tuned, *learned)
     return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
-
-
-def ranked_names(problem: Problem) -> list[str]:
-    """Names of all that is ranked, each under its own control, but random actions."""
-    known = problem.baselines
-    ranked = (*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id))
-    return [
-        name for name in dict.fromkeys(ranked) if problem.baselines.policies.get(name) is not RandomPolicy
-    ]
 
 
 def affordable_episodes(problem: Problem, scenario: str, most: int) -> int:
