@@ -2,7 +2,7 @@
 
     python benchmarks/plain_ppo.py --out plain_ppo.json
     python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
-    python benchmarks/plain_ppo.py --algo sac --set gradient_steps=-1 --split validation --out more_updates.json
+    python benchmarks/plain_ppo.py --algo sac --set ent_coef=0.001 --split validation --out less_entropy.json
 
 One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 in
 TightlyCoupledNavigation), five training seeds; then the deterministic policy, the action zero and the paper's
@@ -106,6 +106,7 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
         "zero_difference": float(cost["nothing"].mean() / cost[paper].mean() - 1.0),
         "zero_median_difference": float(numpy.median(cost["nothing"] / cost[paper]) - 1.0),
         "median_difference_to_zero": float(numpy.median(cost["plain"] / cost["nothing"]) - 1.0),
+        "geometric_difference_to_zero": float(numpy.expm1(numpy.log(cost["plain"] / cost["nothing"]).mean())),
     }
 
 

@@ -16,8 +16,8 @@ from filtergym.papers.grid import markdown_table
 
 import filtergym
 
-OPPONENTS = ("bptt", "bptt-small", "kalman-net", "semi-markov-9", "semi-markov")
-"""Whom students are compared with: agents, a bank of about their time, and the strongest filter."""
+OPPONENTS = ("bptt", "bptt-small", "kalman-net", "semi-markov-9", "semi-markov-15", "semi-markov")
+"""Whom students are compared with: agents, banks of less time, and the strongest filter."""
 SCENARIOS = ("random", "atc", "cruise", "descent", "irregular-scans", "glint")
 """The training distribution, and held-out ones."""
 

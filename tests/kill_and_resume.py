@@ -8,6 +8,7 @@ begin anew.
 """
 
 import collections
+import difflib
 import os
 import random
 import re
@@ -147,6 +148,9 @@ def main(seconds: float, rng: random.Random, names: list[str]) -> int:
                 printed = [content(folder.with_suffix(".out")) for folder in (whole, torn)]
                 if name != "train" and printed[0] != printed[1]:  # which says that it goes on
                     differing.add("what is printed")
+                    print(
+                        "\n".join(difflib.unified_diff(*printed, "undisturbed", "resumed", n=0, lineterm=""))
+                    )
             wrong += bool(left or differing)
             told = ", ".join(f"{number.name} {kills[number]}" for number in SIGNALS)
             print(

@@ -147,8 +147,6 @@ def test_there_are_shipped_agents():
         f"{id.partition('/')[2]}/{name}" for id, cls in catalogue().items() for name in cls.trained_banks
     ]
     estimators.remove("TightlyCoupledNavigation-v0/kalman-net")
-    # A recipe: trained shortly, it is level with kalman-net.
-    estimators.remove("ManeuveringTarget-v0/student")
     assert sorted(f"{file.parent.name}/{file.stem}" for file in SHIPPED) == sorted(policies + estimators)
 
 

@@ -285,6 +285,7 @@ def costs_of(environment, name, folder, scenario=None, **keywords):
     return found["cost"].mean("time").values
 
 
+@pytest.mark.slow
 def test_an_exported_bank_steers_the_tracking_loops(tmp_path, monkeypatch):
     """From its first answer on; before it they follow the initial estimate, here of both."""
     feedback = HypothesisBank.feedback

@@ -184,6 +184,7 @@ BARE = {"FILTERGYM_COMPILER_PROCESSOR": "x86-64", "OPENBLAS_CORETYPE": "Prescott
 """Settings of a processor that can do the least, of which libraries take two threads."""
 
 
+@pytest.mark.slow
 def test_the_row_does_not_depend_on_the_processor(small, tmp_path, command):
     """Nor on who shares the work, nor on whether it is compiled."""
     words = ["evaluate", "--protocol", small, "--policy", "bptt-small"]

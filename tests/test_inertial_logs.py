@@ -247,6 +247,7 @@ def test_without_pyins_the_extra_is_named(log, monkeypatch):
         inertial_recording(*log[:2])
 
 
+@pytest.mark.slow
 def test_position_only_fixes_aid_the_ins(pyins, log):
     imu, fixes, _ = log
     recorded = inertial_recording(imu, fixes[["time", "latitude", "longitude", "height", "sigma"]], **WINDOWS)

@@ -25,8 +25,7 @@ agents_RadarEsmTracking := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-net
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
-# Its student is trained but not shipped: it is level with kalman-net.
-shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net
+shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net student
 shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo kalman-net
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
@@ -133,10 +132,12 @@ $(DONE)/harm-%: $(DONE)/ship-%
 	  --command "python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*)"
 	$(finish)
 
+cross = arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard
+
 $(DONE)/exported: $(shipped)
-	$(BIN)/python benchmarks/exported.py --out docs/data/exported.csv > build/exported.txt
+	$(BIN)/python benchmarks/exported.py --cross "$(cross)" --out docs/data/exported.csv > build/exported.txt
 	$(table) build/exported.txt --name exported_accuracy --name exported_cost \
-	  --command "python benchmarks/exported.py --out docs/data/exported.csv"
+	  --command "python benchmarks/exported.py --cross '$(cross)' --out docs/data/exported.csv"
 	$(finish)
 
 $(DONE)/budgets: $(ENVIRONMENTS:%=$(DONE)/tune-%)

@@ -41,8 +41,8 @@ _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-LARGEST_ERROR = 1e5
-"""Standard deviations by which a sensor is wrong: at ten times as many, hypotheses stand so far apart that the
+LARGEST_ERROR = 1e3
+"""Standard deviations by which a sensor is wrong: at a hundred times as many, hypotheses stand so far apart that the
 covariance of those that are merged has no digits left."""
 
 
