@@ -242,7 +242,7 @@ def converse(program, given):
             {"manoeuvre_rate": (1e-6, 1e-6)},
         ),  # 1e13 m away
         ("RadarEsmTracking", "forgetting-joint-type", "paper", {"range_sigma": 1e-6}),
-        ("UavAutopilot", "bptt-small", "gyro-bias", {"sensor_bias": (1e6, 1e6)}),
+        ("UavAutopilot", "bptt-small", "gyro-bias", {"sensor_bias": (1e3, 1e3)}),
         ("ManeuveringTarget", "kalman-imm", "glint", {"glint_factor": 1e3, "range_sigma": 1e-6}),
     ],
 )

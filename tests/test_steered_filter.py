@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.agents.settings import ESTIMATORS
 from filtergym.compiler import namespace
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.engine.backend import make_model
@@ -16,7 +17,7 @@ from filtergym.names import find_competitor, import_problem
 
 pytest.importorskip("llvmlite")
 
-AGENTS = [file for file in sorted(PRETRAINED.glob("*/*.safetensors")) if file.stem != "kalman-net"]
+AGENTS = [file for file in sorted(PRETRAINED.glob("*/*.safetensors")) if file.stem not in ESTIMATORS]
 """All that are shipped and act."""
 SEEDS = range(8)
 HORIZON = 30
