@@ -25,6 +25,8 @@ from filtergym.filters import coordinated_turn
 from models import make_model, watch_estimator
 from scipy.stats import multivariate_normal
 
+from filtergym import evaluate, tidy_records
+
 ID = "filtergym/ManeuveringTarget-v0"
 T, LANES = 6.0, 8
 H, H5 = np.eye(2, 4), np.eye(2, 5)
@@ -277,6 +279,21 @@ def test_untuned_values_are_those_in_force():
 
 
 # --- the reference
+
+
+@pytest.mark.parametrize("is_polar", [False, True])
+@pytest.mark.parametrize(("scenario", "errors"), [("biased", {}), ("random", {"coloured_sigma": (0.8, 1.2)})])
+def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, errors, is_polar):
+    """Along x and y, or of range and azimuth: its own errors are then as large as it says."""
+    keywords = {"polar_measurements": is_polar, **errors}
+    records = tidy_records(evaluate(ID, ["imm", "known-turn"], scenario, episodes=200, **keywords))
+    [anees] = [
+        record.value
+        for record in records
+        if (record.policy, record.metric, record.component, record.window)
+        == ("known-turn", "anees", "state", "all")
+    ]
+    assert anees == pytest.approx(1.0, abs=0.1)  # 20,000 scans; told the wrong axes it was 16
 
 
 @pytest.mark.parametrize(

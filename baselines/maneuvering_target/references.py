@@ -80,18 +80,19 @@ class KnownTurn(KalmanModel):
         variance = polar.cartesian_variances(
             truth.position, self.task.parameters.range_sigma, world.bearing_sigma
         )
-        sigma = xp.sqrt(variance)
+        axes = world.error_axes(truth.position)
         if "clutter" in disturbances:
             measurement = measurement._replace(**disturbances["clutter"].echo._asdict())
         if "bias" in disturbances:
-            measurement = measurement._replace(position=measurement.position - sigma * disturbances["bias"])
+            bias = apply(axes, disturbances["bias"])
+            measurement = measurement._replace(position=measurement.position - bias)
         if "coloured" in disturbances:
             colour = disturbances["coloured"]
             process = GaussMarkov.sampled(colour.deviation, colour.correlation_time, measurement.interval, xp)
             F = self.block_diagonal(F, self.identity * process.decay)
             Q = self.block_diagonal(Q, self.identity * process.kick**2)
-            offset = xp.concat([offset, 0.0 * sigma])
-            H = xp.concat([H + 0.0 * sigma[0], self.identity * sigma], axis=1)
+            offset = xp.concat([offset, 0.0 * variance])
+            H = xp.concat([H + 0.0 * variance[0], axes], axis=1)
         if "glint" in disturbances:
             variance = disturbances["glint"] ** 2 * variance
         predicted = kalman.predict(state.mean, state.covariance, F, Q, offset)

@@ -67,13 +67,14 @@ class ManeuveringTargetParameters(TaskParameters):
     coloured_sigma: tuple[float, float] = parameter(
         (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
     )
-    """Limits of the standard deviation of coloured errors along x and y, first-order Gauss-Markov, beside the white
-    ones and in units of theirs; each episode draws its own, and nobody says so (ours; the paper: none)."""
+    """Limits of the standard deviation of coloured errors along x and y, or of range and azimuth where measurements are
+    polar, first-order Gauss-Markov, beside the white ones and in units of theirs; each episode draws its own, and nobody
+    says so (ours; the paper: none)."""
     coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
     """Limits of their correlation time, s; each episode draws its own (ours)."""
     bias: float = parameter(0.0, at_least=0.0, at_most=LARGEST_ERROR)
-    """Constant errors along x and y, in units of the white ones' standard deviations, are drawn within this for each
-    episode, and nobody says so (ours; the paper: none)."""
+    """Constant errors along x and y, or of range and azimuth where measurements are polar, in units of the white ones'
+    standard deviations, are drawn within this for each episode, and nobody says so (ours; the paper: none)."""
     clutter_density: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, ascending=True)
     """Limits of the density of false plots, per square kilometre; each episode draws its own. A Poisson number of them
     lies in the window (ours; the paper: none)."""

@@ -137,6 +137,18 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Of a measurement of a position, m^2, ``(2, N)``."""
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
+    def error_axes(self, position: Array) -> Array:
+        """What errors of one standard deviation do to the measured position, to first order, ``(2, 2, N)``: in columns
+        those along x and y or, where measurements are polar, of range and azimuth.
+        """
+        xp, p = self.xp, self.parameters
+        if not p.polar_measurements:
+            x, y = xp.sqrt(self._variances(position))
+            return xp.stack([xp.stack([x, 0.0 * x]), xp.stack([0.0 * y, y])])
+        along = position / xp.sqrt(position[0] ** 2 + position[1] ** 2) * p.range_sigma
+        across = xp.stack([-position[1], position[0]]) * self.bearing_sigma
+        return xp.stack([along, across], axis=1)
+
     def _measure(
         self, position: Array, errors: Array, states: dict[str, Any]
     ) -> tuple[dict[str, Any], Array]:
