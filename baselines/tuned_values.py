@@ -84,6 +84,13 @@ class TunedValues:
         tables = [table for _, table in self._tables()]
         return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
 
+    def has_won(self, policy: str) -> bool:
+        """Whether the stored values of a policy are others than those in force without tuning, which a search keeps
+        where nothing beats them.
+        """
+        start = {name: round_value(value) for name, value in self.tunable[policy].start.items()}
+        return self.values(policy)[0] != start
+
     def best_policy(self, control: str | None = None) -> str | None:
         """Return ``NAME-tuned`` of the policy that cost least on the validation split; None if none was tuned.
 

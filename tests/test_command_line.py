@@ -468,6 +468,19 @@ def test_full_benchmark_compares_everything():
     assert [cell.scenario for cell in benchmark.cells(True, [ENV], "validation")] == ["random"]
 
 
+def test_the_quick_benchmark_runs_a_tuned_one_in_the_place_of_what_it_was_and_only_where_it_has_won():
+    """Of equals the first is called the best: not what is made of it."""
+    from filtergym.reports.tables import benchmark
+
+    [cell] = benchmark.cells(False, [ENV])
+    names, values = cell.policies, cell.problem.tuned_values
+    assert values.has_won("kalman-imm")
+    assert not values.has_won("semi-markov")
+    assert {"kalman-imm-tuned", "semi-markov"} <= {*names}
+    assert not {"kalman-imm", "semi-markov-tuned"} & {*names}
+    assert names.index("kalman-imm-tuned") < names.index("semi-markov") < names.index("semi-markov-pda")
+
+
 def test_curves_in_a_format_that_nobody_writes_are_refused_first(make_page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, errors = make_page("seeds", "nowhere", "--curves", "curves.gif")

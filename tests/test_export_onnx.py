@@ -30,6 +30,9 @@ QUICK = [(RADAR, "bptt"), (RADAR, "bptt-small"), (RADAR, "bptt-linear"), (RADAR,
 TOLERANCE = 1e-5
 """Single precision rounds by 6e-8; here in another order of the sums, with other functions for tanh, and with a memory
 that carries it on: some 50 times as much over 1000 steps (3.6e-6 was found). Actions are numbers of about one."""
+LONG_MEMORY = {"student": 3e-4}
+"""Some of a student's units forget over hundreds of scans, and sum the rounding of as many: 5e-6 was found over 40 steps,
+8e-5 over 640 and no more over 1000."""
 
 
 def largest_differences(session, network, steps=1000, tracks=3):
@@ -66,7 +69,7 @@ def test_shipped_agents_act_as_they_do_here(env, name, tmp_path):
     stored = getattr(stored, "policy", stored)
     model, header = make_model(problem.task, stored.control), stored.header
     network = LearnedPolicy(model, stored.arrays, header["output"], header["activation"], header["fields"])
-    assert max(largest_differences(session_of(str(path)), network)) < TOLERANCE
+    assert max(largest_differences(session_of(str(path)), network)) < LONG_MEMORY.get(name, TOLERANCE)
 
 
 def random_network(unit, output, activation, control):

@@ -280,6 +280,7 @@ BASELINES = Baselines(
     benchmark=(
         "multi-hypothesis",
         "nis-adaptive",
+        "stuck-check",
         "singer",
         "fault-hypotheses",
         "known-mode",

@@ -205,6 +205,7 @@ BASELINES = Baselines(
         "raw-sensors",
         "innovation-adaptive",
         "gust-imm",
+        "sage-husa",
         "level-bank",
         "level-bank-4",
         "random",

@@ -84,8 +84,8 @@ def _horizon(cls: Any, scenario: str) -> int:
 def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
     """Names that a cell compares, the paper's algorithm first.
 
-    Quick: the telling ones, tuned where they can be and episodes are not long; shipped agents. Full: every policy and
-    estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
+    Quick: the telling ones, tuned where that has won and episodes are not long; others that are tuned; shipped agents.
+    Full: every policy and estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
 
     Args:
         problem: whose they are.
@@ -99,8 +99,10 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         unranked = (*known.smoothers, *known.references, *known.bounds)
         everything = (*known.policies, *known.estimators, *tuned, *learned, *unranked)
     else:
+        won = [name for name in tuned if problem.tuned_values.has_won(name.removesuffix("-tuned"))]
         telling = known.benchmark or known.names
-        everything = (*(name for name in telling if f"{name}-tuned" not in tuned), *tuned, *learned)
+        own = (f"{name}-tuned" if f"{name}-tuned" in won else name for name in telling)
+        everything = (*own, *won, *learned)
     return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
 
 
