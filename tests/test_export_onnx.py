@@ -31,8 +31,8 @@ TOLERANCE = 1e-5
 """Single precision rounds by 6e-8; here in another order of the sums, with other functions for tanh, and with a memory
 that carries it on: some 50 times as much over 1000 steps (3.6e-6 was found). Actions are numbers of about one."""
 LONG_MEMORY = {"student": 3e-4}
-"""Some of a student's units forget over hundreds of scans, and sum the rounding of as many: 5e-6 was found over 40 steps,
-8e-5 over 640 and no more over 1000."""
+"""Some of a student's units forget over hundreds of scans, and sum the rounding of as many: 5e-6 was found over 40
+steps, 8e-5 over 640 and no more over 1000."""
 
 
 def largest_differences(session, network, steps=1000, tracks=3):

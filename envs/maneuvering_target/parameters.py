@@ -68,8 +68,8 @@ class ManeuveringTargetParameters(TaskParameters):
         (0.0, 0.0), at_least=0.0, at_most=LARGEST_ERROR, ascending=True
     )
     """Limits of the standard deviation of coloured errors along x and y, or of range and azimuth where measurements are
-    polar, first-order Gauss-Markov, beside the white ones and in units of theirs; each episode draws its own, and nobody
-    says so (ours; the paper: none)."""
+    polar, first-order Gauss-Markov, beside the white ones and in units of theirs; each episode draws its own, and
+    nobody says so (ours; the paper: none)."""
     coloured_time: tuple[float, float] = parameter((12.0, 60.0), above=0.0, ascending=True)
     """Limits of their correlation time, s; each episode draws its own (ours)."""
     bias: float = parameter(0.0, at_least=0.0, at_most=LARGEST_ERROR)
