@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..envs.contract.log_format import is_assumed
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
@@ -89,7 +90,7 @@ class LogSetup(NamedTuple):
     @property
     def assumed(self) -> dict[str, float]:
         """Parameters under which a log without deviations is read as the fitted one was; empty where it stated any."""
-        isotropic = self.deviations.get("sigma_x") if "no column" in self.deviations_from else None
+        isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
         return {} if isotropic is None else {"range_sigma": isotropic}
 
 

@@ -10,6 +10,22 @@ if TYPE_CHECKING:
     from ..data.recorded_tables import Columns
 
 
+NO_DEVIATIONS = "no column states deviations"
+"""How whoever assumes deviations begins to say so."""
+UNITS = {"azimuth_sigma": "degrees"}
+"""Of deviations that are no metres."""
+
+
+def is_assumed(words: str) -> bool:
+    """Whether words say of deviations that no column states them."""
+    return words.startswith(NO_DEVIATIONS)
+
+
+def deviation_words(deviations: Mapping[str, float]) -> str:
+    """Typical deviations in words, such as "sigma_x 13.8 m, sigma_y 13.8 m"."""
+    return ", ".join(f"{name} {value:.3g} {UNITS.get(name, 'm')}" for name, value in deviations.items())
+
+
 class TrackStart(NamedTuple):
     """The start of the tracks of E episodes, made of their first measurements."""
 

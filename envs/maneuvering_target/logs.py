@@ -12,7 +12,15 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import (
+    NO_DEVIATIONS,
+    LogFormat,
+    Predicted,
+    TrackLog,
+    TrackStart,
+    deviation_words,
+    is_assumed,
+)
 from ..data.plausibility import check_bearings, scatter_of
 from ..data.recorded_tables import Columns
 from ..data.recorded_world import Feed
@@ -283,22 +291,20 @@ def _deviations_of(columns: Columns, there: numpy.ndarray, assumed: float) -> tu
     if assumed:
         named = "range_sigma" in columns.given
         who = "as --set range_sigma says" if named else "as positions scatter about their neighbours"
-        return dict.fromkeys(pairs[0], assumed), f"no column states deviations of x and y, assumed {who}"
+        return dict.fromkeys(pairs[0], assumed), f"{NO_DEVIATIONS} of x and y, assumed {who}"
     names = {"range_sigma": "range_sigma", "azimuth_sigma": "bearing_sigma"}
     values = {
         column: float(columns.given.get(name, getattr(ManeuveringTargetParameters, name)))
         for column, name in names.items()
     }
-    return values, "no column states deviations, assumed as of the environment's radar"
+    return values, f"{NO_DEVIATIONS}, assumed as of the environment's radar"
 
 
 def _assumption_notes(columns: Columns, deviations: Mapping[str, float], source: str) -> list[str]:
     """Say which deviations are assumed where neither a column nor the user states one."""
-    if "no column" not in source or "range_sigma" in columns.given:
+    if not is_assumed(source) or "range_sigma" in columns.given:
         return []
-    units = {"azimuth_sigma": "degrees"}
-    listed = ", ".join(f"{name} {value:.3g} {units.get(name, 'm')}" for name, value in deviations.items())
-    return [f"{source}: {listed}"]
+    return [f"{source}: {deviation_words(deviations)}"]
 
 
 def _variances(

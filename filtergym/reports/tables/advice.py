@@ -12,6 +12,7 @@ from ...baselines.advice import APART, Advice
 from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
 from ...baselines.judgement import Competitor
 from ...baselines.table import Tunable
+from ...envs.contract.log_format import deviation_words, is_assumed
 from ...envs.data.recording import Recording
 from ...evaluation.statistics.bootstrap import Estimate
 
@@ -151,14 +152,12 @@ def reading_lines(recording: Recording) -> Iterator[str]:
             "guess, and a longer log is better."
         )
     if recording.deviations:
-        units = {"azimuth_sigma": "degrees"}
-        listed = ", ".join(f"{n} {v:.3g} {units.get(n, 'm')}" for n, v in recording.deviations.items())
-        source = recording.deviations_from
-        if "no column" in source:
+        listed, source = deviation_words(recording.deviations), recording.deviations_from
+        if is_assumed(source):
             yield f"Errors: {source}: {listed}. Their scale is fitted."
         else:
             yield f"Errors as stated: {listed} (median of {source})."
-    yield from (note for note in recording.notes if "no column" not in note)
+    yield from (note for note in recording.notes if not is_assumed(note))
 
 
 def _extent(recording: Recording) -> Iterator[str]:
