@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from ..baselines.problem import Problem
 from ..envs.contract.task import Task
 from ..envs.data.flights import is_folder
 from .gate import PolicyMaker, as_trained
@@ -13,6 +14,14 @@ from .training_run import TrainingRun, best_agent, load_run
 def pretrained_agents(id: str) -> list[str]:
     """Names of the agents that are shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
+
+
+def ranked_names(problem: Problem) -> list[str]:
+    """Names of all that is shipped for a problem and is told nothing of the truth: policies and estimators as they are,
+    those that were tuned, and agents.
+    """
+    known = problem.baselines
+    return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
 def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:

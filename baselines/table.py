@@ -182,6 +182,11 @@ class Baselines:
     """Class that says from observations that something is wrong, for any control; None: the general one."""
 
     @property
+    def compared_paper(self) -> str:
+        """The reading of the paper's algorithm that costs are compared with where all of them take part."""
+        return self.stronger_paper or self.score_paper
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Every name, policies first."""
         return (*self.policies, *self.estimators, *self.smoothers, *self.references, *self.bounds)

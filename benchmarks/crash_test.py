@@ -22,7 +22,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
-from filtergym.agents.named_policies import pretrained_agents
+from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.stress.alterations import ALTERATIONS
@@ -33,12 +33,6 @@ from filtergym.names import find_competitor
 FOLDER = Path(__file__).parent.parent / "docs" / "records" / "stress"
 LIBRARIES = ("filtergym", "numpy", "scipy", "gymnasium", "llvmlite")
 COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
-
-
-def names_of(problem: Problem) -> list[str]:
-    """Names of all that a crash test can ask."""
-    known = problem.baselines
-    return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
 def row(name: str, findings: Sequence[Finding]) -> list[str]:
@@ -58,7 +52,7 @@ def write_record(problem: Problem, rows: Sequence[Sequence[str]], options: Any) 
     if options.policy and path.exists():
         record = json.loads(path.read_text(encoding="utf-8"))
         table = {row[0]: row for row in record["data"]["rows"]} | known
-        record["data"]["rows"] = [table[name] for name in names_of(problem) if name in table]
+        record["data"]["rows"] = [table[name] for name in ranked_names(problem) if name in table]
         today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
         record["note"] += f" Rows of {', '.join(options.policy)} are of {today}."
         path.write_text(json.dumps(record, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
@@ -98,7 +92,7 @@ def main() -> None:
         experiment = problem.experiment(None, options.episodes)
         test = CrashTest(experiment, options.steps, (paper, find_competitor(problem, paper)))
         rows = []
-        for name in options.policy or names_of(problem):
+        for name in options.policy or ranked_names(problem):
             findings = list(test.findings(name, find_competitor(problem, name)))
             everything += findings
             rows.append(row(name, findings))

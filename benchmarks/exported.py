@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
-from filtergym.agents.named_policies import pretrained_agents
+from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
@@ -226,12 +226,6 @@ def least_time(call: Any, count: int) -> float:
     return min(times)
 
 
-def ranked(problem: Problem) -> list[str]:
-    """Names of what is ranked."""
-    known = problem.baselines
-    return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
-
-
 def lines(
     problem: Problem, names: list[str], episodes: int, measurements: int, compilers: Compilers
 ) -> Iterator[dict[str, Any]]:
@@ -336,7 +330,8 @@ def main() -> None:
     found: list[dict[str, Any]] = []
     for id in asked.environment or list(catalogue()):
         problem = problem_of(id)
-        names, compilers = asked.policy or ranked(problem), Compilers(asked.compiler, asked.cross.split())
+        names = asked.policy or ranked_names(problem)
+        compilers = Compilers(asked.compiler, asked.cross.split())
         for line in lines(problem, names, asked.episodes, asked.measurements, compilers):
             found.append(line)
             print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)

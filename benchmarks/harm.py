@@ -52,11 +52,6 @@ class Cell(NamedTuple):
         return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in self.ratio))
 
 
-def paper_of(problem: Problem) -> str:
-    """Name of the paper's algorithm, in the stronger reading where there are two."""
-    return problem.baselines.stronger_paper or problem.paper
-
-
 def cells_of(problem: Problem) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield the name of each cell, its scenario and its keywords."""
     for scenario in problem.task.scenarios:
@@ -77,7 +72,7 @@ def fly(
     """What each competitor did in a cell."""
     name, scenario, keywords = cell
     run = problem.evaluate(makers, scenario, episodes, split=split, **keywords)
-    paper, bootstrap = mean_cost(run, paper_of(problem)), Bootstrap(run.sizes["episode"])
+    paper, bootstrap = mean_cost(run, problem.baselines.compared_paper), Bootstrap(run.sizes["episode"])
     beyond, found = numpy.quantile(paper, 0.99), {}
     for policy in makers:
         cost = mean_cost(run, policy)
@@ -92,7 +87,8 @@ def fly(
 def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
     """The paper's algorithm, the gate's fallback, and each agent alone and behind the gate."""
     fallback = problem.baselines.fallback or problem.paper
-    makers = {name: problem.competitor(name) for name in dict.fromkeys([paper_of(problem), fallback])}
+    first = dict.fromkeys([problem.baselines.compared_paper, fallback])
+    makers = {name: problem.competitor(name) for name in first}
     for policy in policies:
         makers[policy] = found = find_competitor(problem, policy)
         if is_gateable(found) and not policy.startswith(GATED):
@@ -135,6 +131,7 @@ if __name__ == "__main__":
                     print(
                         f"{problem.short_name} {own.name} {name} {own.text} ANEES {own.anees:.2f}", flush=True
                     )
-        table += [summary(problem, name, cells) for name, cells in found.items() if name != paper_of(problem)]
+        del found[problem.baselines.compared_paper]
+        table += [summary(problem, name, cells) for name, cells in found.items()]
         print("\n".join(table), flush=True)
         table = []

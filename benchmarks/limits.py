@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy
 import xarray
-from filtergym.agents.named_policies import pretrained_agents
+from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.competitors.kinds import RandomPolicy
@@ -51,13 +51,10 @@ class Nearest(NamedTuple):
         return f"beaten by {', '.join(self.below)}" if self.below else "a limit"
 
 
-def ranked_names(problem: Problem) -> list[str]:
+def asked_names(problem: Problem) -> list[str]:
     """Names of all that is ranked, each under its own control, but random actions."""
-    known = problem.baselines
-    ranked = (*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id))
-    return [
-        name for name in dict.fromkeys(ranked) if problem.baselines.policies.get(name) is not RandomPolicy
-    ]
+    policies = problem.baselines.policies
+    return [name for name in ranked_names(problem) if policies.get(name) is not RandomPolicy]
 
 
 def episode_costs(
@@ -89,7 +86,7 @@ def nearest(
         names: of competitors; none: all that is ranked.
     """
     reference = problem.baselines.score_reference
-    costs = episode_costs(problem, scenario, [*(names or ranked_names(problem)), reference], episodes, seed)
+    costs = episode_costs(problem, scenario, [*(names or asked_names(problem)), reference], episodes, seed)
     told = costs.pop(reference)
     differences = {name: own - told for name, own in costs.items()}
     errors = {

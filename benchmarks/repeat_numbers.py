@@ -90,7 +90,7 @@ def repeat(one: Published, seed: int) -> Record:
     problem = problem_of(environment_id(one.environment))
     known, metric = problem.baselines, one.record.metric
     best = one.record.component if metric == "behind_best" else ""
-    names = [known.stronger_paper or known.score_paper, known.score_reference, one.competitor, best]
+    names = [known.compared_paper, known.score_reference, one.competitor, best]
     experiment = problem.experiment(one.scenario, one.record.episodes, seed)
     wanted = list(dict.fromkeys(filter(None, names)))
     requests = evaluation_requests(problem, experiment, wanted, curves=False)

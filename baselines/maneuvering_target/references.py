@@ -7,7 +7,7 @@ from ...envs.contract.filter import Initial, Input, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
-from ...filters import bounds, kalman, polar
+from ...filters import bounds, kalman
 from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
@@ -77,9 +77,7 @@ class KnownTurn(KalmanModel):
         F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
         before, now = (xp.concat([state.position, state.velocity]) for state in (state.truth, truth))
         offset, Q, H = now - apply(F, before), 0.0 * F, self.H[:, :, None]
-        variance = polar.cartesian_variances(
-            truth.position, self.task.parameters.range_sigma, world.bearing_sigma
-        )
+        variance = world.variances(truth.position)
         axes = world.error_axes(truth.position)
         if "clutter" in disturbances:
             measurement = measurement._replace(**disturbances["clutter"].echo._asdict())
@@ -114,10 +112,10 @@ class KnownInputBound(ConstantVelocityModel):
         """Bound after this scan: the diagonal of the covariance recursion at the true position. A scan that missed the
         target adds no information.
         """
-        world, p = self.task.world, self.task.parameters
+        world = self.task.world
         assert isinstance(world, RadarWorld)
         predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])
-        variance = polar.cartesian_variances(truth.position, p.range_sigma, world.bearing_sigma)
+        variance = world.variances(truth.position)
         P = bounds.posterior_cramer_rao_bound(predicted, self.H, self.identity * variance)
         clutter = truth.disturbances.get("clutter")
         available = measurement.available if clutter is None else clutter.echo.available

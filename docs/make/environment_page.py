@@ -130,7 +130,7 @@ def _first_sentence(maker: Any) -> str:
 
 def _policies(problem: Problem) -> list[str]:
     known = problem.baselines
-    roles = {known.stronger_paper or known.score_paper: " (score 0)", known.score_reference: " (score 1)"}
+    roles = {known.compared_paper: " (score 0)", known.score_reference: " (score 1)"}
     rows = []
     for name, maker in known.policies.items():
         rows.append(

@@ -102,11 +102,11 @@ class RadarWorld(World[Task, Truth, Measurement]):
         xp, p = self.xp, self.parameters
         ones = xp.ones_like(normals[0])
         flight, (position, velocity) = self.course.begin(draws, ones)
-        sigma = xp.sqrt(self._variances(position))
+        sigma = xp.sqrt(self.variances(position))
         start = position + sigma * normals[:2]
         start_velocity = velocity + (math.sqrt(2.0) / p.sampling_interval) * sigma * normals[2:4]
         # The start is a measurement too: its variance is evaluated where it puts the target.
-        variance = self._variances(start)
+        variance = self.variances(start)
         diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
@@ -124,7 +124,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         states = self.disturbances.advance(truth.disturbances, scan.interval, numbers)
         errors = self.disturbances.change_errors(states, noise[:2])
         states, measured = self._measure(position, errors, states)
-        variance = self._variances(measured)
+        variance = self.variances(measured)
         if not p.regular:
             seen = available > 0.0
             measured = self.xp.where(seen, measured, 0.0)
@@ -133,7 +133,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         states, measurement = self.disturbances.change_measurement(states, measurement, numbers, feedback)
         return Truth(number, position, velocity, flight, scans, states), measurement
 
-    def _variances(self, position: Array) -> Array:
+    def variances(self, position: Array) -> Array:
         """Of a measurement of a position, m^2, ``(2, N)``."""
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
@@ -143,7 +143,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
-            x, y = xp.sqrt(self._variances(position))
+            x, y = xp.sqrt(self.variances(position))
             return xp.stack([xp.stack([x, 0.0 * x]), xp.stack([0.0 * y, y])])
         along = position / xp.sqrt(position[0] ** 2 + position[1] ** 2) * p.range_sigma
         across = xp.stack([-position[1], position[0]]) * self.bearing_sigma
@@ -157,7 +157,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:
-            reading = position + xp.sqrt(self._variances(position)) * errors
+            reading = position + xp.sqrt(self.variances(position)) * errors
             return self.disturbances.change_reading(states, reading)
         radius = xp.sqrt(position[0] ** 2 + position[1] ** 2) + p.range_sigma * errors[0]
         azimuth = xp.atan2(position[1], position[0]) + self.bearing_sigma * errors[1]

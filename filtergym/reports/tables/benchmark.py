@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import xarray
 
-from ...agents.named_policies import pretrained_agents
+from ...agents.named_policies import pretrained_agents, ranked_names
 from ...baselines.problem import Problem, problem_of
 from ...envs.engine.catalogue import catalogue
 from ...envs.engine.scenario_choice import make_task
@@ -93,16 +93,14 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         horizon: measurements of an episode.
     """
     known = problem.baselines
-    tuned = problem.tuned_policies if full or horizon <= LONG else []
-    learned = pretrained_agents(problem.id)
     if full:
-        unranked = (*known.smoothers, *known.references, *known.bounds)
-        everything = (*known.policies, *known.estimators, *tuned, *learned, *unranked)
+        everything = (*ranked_names(problem), *known.smoothers, *known.references, *known.bounds)
     else:
+        tuned = problem.tuned_policies if horizon <= LONG else []
         won = [name for name in tuned if problem.tuned_values.has_won(name.removesuffix("-tuned"))]
         telling = known.benchmark or known.names
         own = (f"{name}-tuned" if f"{name}-tuned" in won else name for name in telling)
-        everything = (*own, *won, *learned)
+        everything = (*own, *won, *pretrained_agents(problem.id))
     return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
 
 
