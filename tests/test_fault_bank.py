@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from filtergym.baselines.table import Variant
 from filtergym.envs.contract.filter import Initial, Input
-from filtergym.envs.loosely_coupled_navigation.fault_bank import FEW, TRAINING, VAGUE, FaultBank
+from filtergym.envs.loosely_coupled_navigation.fault_bank import FaultBank
+from filtergym.envs.loosely_coupled_navigation.fault_prior import FEW, TRAINING, VAGUE
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.running.rollout import rollout

@@ -136,17 +136,18 @@ def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
     matched, s, found = Matched(model.task), model.task.parameters.sampling, []
 
     class Watched:
-        start = matched.start
+        start, disturbances = matched.start, matched.disturbances
 
         def update(self, measurement, truth, memory):
             delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
             growth = truth.coloured_step**2, truth.white_step**2
-            kick = truth.receiver_decay, truth.receiver_kick**2
-            P = receiver_faults.predict_fault(memory.covariance, s, *growth, *kick)
+            decay, kick = truth.disturbances["coloured"].process
+            P = receiver_faults.predict_fault(memory.covariance, s, *growth, decay, kick**2)
             P = receiver_faults.measured_direction(P, np.ones((1, 1))).variance
-            since = 0.01 * (truth.number - truth.spoofing[0] + 1.0)
-            pull = np.where(within(truth.number, truth.spoofing), truth.spoofing_rate * since, 0.0)
-            predicted = delta[0] - truth.receiver_decay * memory.receiver[0]
+            spoofing = truth.disturbances["spoofing"]
+            since = 0.01 * (truth.number - spoofing.window[0] + 1.0)
+            pull = np.where(within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
+            predicted = delta[0] - decay * memory.receiver[0]
             innovation = measurement.ins[0] - (measurement.fix[0] - pull) - predicted
             # A measurement that failed has no innovation.
             used = measurement.available > 0
@@ -182,8 +183,10 @@ def test_matched_equals_a_naive_filter_told_the_truth():
         sigma = first.coloured_step[lane] / s.coloured
         white = (first.white_step[lane] ** 2 - s.residual * sigma**2) / 0.01
         A, W, start = loosely_coupled.error_model(first.drift_deviation[lane], sigma, 1.0, white)
-        decay, kick, rate = (
-            values[lane] for values in (first.receiver_decay, first.receiver_kick, first.spoofing_rate)
+        told = first.disturbances
+        (decay, kick), rate = (
+            [each[lane] for each in told["coloured"].process],
+            told["spoofing"].strength[lane],
         )
         Phi, Qd, P = np.diag([0.0, 0.0, 0.0, decay]), np.diag([0.0, 0.0, 0.0, kick**2]), np.zeros((4, 4))
         Phi[:3, :3], Qd[:3, :3] = van_loan(A, W, 0.01)

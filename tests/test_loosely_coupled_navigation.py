@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from contract import assert_properties
 from filtergym.baselines.loosely_coupled_navigation.policies import FixedGain
+from filtergym.compiler.functions import leaves, map_arrays
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.model import Model
 from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
@@ -45,13 +46,10 @@ def states(model, drawn, policy):
         yield seen, state
 
 
-def arrays(values):
-    """The arrays of nested tuples."""
-    return [x for part in values for x in arrays(part)] if isinstance(values, tuple) else [values]
-
-
 def chosen(condition, one, other):
     """``numpy.where`` for nested tuples."""
+    if isinstance(one, dict):
+        return {name: chosen(condition, part, other[name]) for name, part in one.items()}
     if isinstance(one, tuple):
         return type(one)(*(chosen(condition, a, b) for a, b in zip(one, other, strict=True)))
     return np.where(condition, one, other)
@@ -393,7 +391,7 @@ def test_disturbances_stand_where_they_are_drawn():
         for k, (seen, _) in enumerate(
             states(model, (uniforms, normals, rows), constant(model, 0.0, lanes)), 1
         ):
-            first, end = getattr(seen.truth, drawn)
+            first, end = seen.truth.disturbances[drawn].window
             inside = (k >= first) & (k < end)
             said = seen.measurement
             np.testing.assert_array_equal(said.available, np.where(inside & (name == "outage"), 0.0, 1.0))
@@ -420,21 +418,23 @@ def test_random_draws_what_it_says_and_reports_half_of_the_changes():
     model, lanes = make("random", undisturbed=0.0), 20000
     state = model.begin(*numbers(model, lanes, 0, 8)[:2]).truth
     low, high = 10**-0.5, 10**0.5
-    intensities = state.receiver_levels**2 / 2.0
+    found = state.disturbances
+    receiver, jamming, spoofing = found["noise_changes"], found["jamming"], found["spoofing"]
+    intensities = receiver.true**2 / 2.0
     for lowest, drawn in ((0.05, state.drift_deviation / 0.6), *((low, values) for values in intensities)):
         assert lowest <= drawn.min() * (1 + 1e-12)
         assert drawn.max() <= high * (1 + 1e-12)
         middle, width = 0.5 * math.log(lowest * high), math.log(high / lowest)
         assert abs(np.log(drawn).mean() - middle) < 4 * width / math.sqrt(12 * lanes)
-    changes = (state.change < 1e6).sum(axis=0)
+    changes = (receiver.change < 1e6).sum(axis=0)
     for count in range(3):
         assert abs((changes == count).mean() - 1 / 3) < 4 * math.sqrt(2 / 9 / lanes)
-    assert (state.change[0] <= state.change[1]).all()
-    silent = state.reported_levels[1] == state.reported_levels[0]
+    assert (receiver.change[0] <= receiver.change[1]).all()
+    silent = receiver.reported[1] == receiver.reported[0]
     assert abs(silent.mean() - 0.5) < 2 / math.sqrt(lanes)
-    for window, share in ((state.outage, 0.4), (state.jamming, 0.25), (state.spoofing, 0.25)):
-        assert abs((window[0] < 1e6).mean() - share) < 2 / math.sqrt(lanes)
-    gain, rate = 2.0 * np.log(state.jamming_gain), state.spoofing_rate
+    for each, share in ((found["outage"], 0.4), (jamming, 0.25), (spoofing, 0.25)):
+        assert abs((each.window[0] < 1e6).mean() - share) < 2 / math.sqrt(lanes)
+    gain, rate = 2.0 * np.log(jamming.strength), spoofing.strength
     assert math.log(3.0) <= gain.min() < math.log(3.1)
     assert math.log(290.0) < gain.max() <= math.log(300.0)
     assert -3.0 <= rate.min() < -2.9
@@ -449,9 +449,11 @@ def test_nothing_befalls_one_of_six():
     modelled = make("paper").begin(*numbers(make("paper"), 8, 0, 8)[:2]).truth
     for name in ("coloured_step", "white_step"):
         assert getattr(state, name)[calm] == pytest.approx(getattr(modelled, name)[0], rel=1e-12)
-    assert state.receiver_levels[0, calm] == pytest.approx(math.sqrt(2.0), rel=1e-12)
-    for name in ("change", "outage", "jamming", "spoofing"):
-        assert (getattr(state, name)[:, calm] == 1e9).all()
+    found = state.disturbances
+    assert found["noise_changes"].true[0, calm] == pytest.approx(math.sqrt(2.0), rel=1e-12)
+    windows = [found[name].window for name in ("outage", "jamming", "spoofing")]
+    for window in (found["noise_changes"].change, *windows):
+        assert (window[:, calm] == 1e9).all()
 
 
 def test_outliers_are_as_many_and_as_large_as_stated():
@@ -525,14 +527,14 @@ def has_its_shapes_and_sizes(case):
     model = make(scenario, control, axes=axes)
     actions = random_actions(model, lanes, steps, 0)
     uniforms, normals, rows = numbers(model, lanes, steps, 0)
-    shapes = [x.shape for x in arrays(model.begin(uniforms, normals).filter)]
+    shapes = [x.shape for x in leaves(model.begin(uniforms, normals).filter)]
     for seen, state in states(model, (uniforms, normals, rows), lambda k, seen: actions[k]):
         observation = model.observe(seen)
         assert observation.shape == (len(model.fields), lanes)
         assert np.isfinite(observation).all()
         assert np.abs(observation).max() < 50
-        assert [x.shape for x in arrays(state.filter)] == shapes
-        assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in arrays(state))
+        assert [x.shape for x in leaves(state.filter)] == shapes
+        assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in leaves(state))
         assert model.error(state).shape == (axes, lanes) == (len(model.task.components), lanes)
         assert model.covariance(state).shape == (axes, axes, lanes)
         np.testing.assert_allclose(model.cost(state), (model.error(state) ** 2).sum(0) / 2.0, rtol=1e-12)
@@ -553,7 +555,7 @@ def test_the_truth_follows_the_noise_and_not_the_control(control):
         states(model, drawn, lambda k, s: actions[k]),
         strict=True,
     ):
-        for found, expected in zip(arrays(other[:2]), arrays(seen[:2]), strict=True):
+        for found, expected in zip(leaves(other[:2]), leaves(seen[:2]), strict=True):
             np.testing.assert_array_equal(found, expected)
 
 
@@ -567,7 +569,7 @@ def test_no_truth_at_any_distance(control):
     bank = model.filter.start(model.begin(*drawn[:2]).measurement)
     for k, (seen, state) in enumerate(states(model, drawn, lambda k, s: actions[k])):
         bank = model.filter.predict(bank, seen.measurement)
-        false = type(seen.truth)(*(rng.normal(size=x.shape) for x in seen.truth))
+        false = map_arrays(lambda x: rng.normal(size=x.shape), seen.truth)
         np.testing.assert_array_equal(
             model.observe(seen._replace(truth=false, filter=bank)), model.observe(seen)
         )
@@ -612,7 +614,7 @@ def test_lanes_at_different_times_do_not_disturb_each_other(control):
         state = model.act(
             model.measure(state, row), np.where(restarted & (k >= late), actions[k - late], actions[k])
         )
-    for found, old, new in zip(*map(arrays, (state, alone[119], alone[119 - late])), strict=True):
+    for found, old, new in zip(*map(leaves, (state, alone[119], alone[119 - late])), strict=True):
         np.testing.assert_array_equal(found, np.where(restarted, new, old))
 
 
@@ -627,12 +629,12 @@ def test_torch_equals_numpy(torch, control):
     run = states(model, drawn, lambda k, s: actions[k])
     other = states(twin, copies, lambda k, s: torch.from_numpy(actions[k]))
     for (seen, state), (seen_too, state_too) in zip(run, other, strict=True):
-        assert all(x.dtype == torch.float64 for x in arrays(state_too))
+        assert all(x.dtype == torch.float64 for x in leaves(state_too))
         # The two libraries round exp, log and sin differently in the last place.
         np.testing.assert_allclose(
             twin.observe(seen_too).numpy(), model.observe(seen), rtol=1e-10, atol=1e-12
         )
-        for a, b in zip(arrays(state), arrays(state_too), strict=True):
+        for a, b in zip(leaves(state), leaves(state_too), strict=True):
             np.testing.assert_allclose(b.numpy(), a, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(twin.cost(state_too).numpy(), model.cost(state), rtol=1e-9, atol=1e-12)
         for name, record in model.records(state).items():
@@ -778,7 +780,7 @@ def test_the_coloured_error_of_the_receiver_is_first_order_and_stationary():
     model = make("coloured-receiver", **keywords)
     errors = np.stack(
         [
-            seen.truth.receiver_error[0]
+            seen.truth.disturbances["coloured"].level[0]
             for seen, _ in states(model, numbers(model, lanes, steps, 23), constant(model, 0.0, lanes))
         ]
     )

@@ -88,7 +88,7 @@ def test_bound_is_the_dense_recursion():
     run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
     bounds = [episode.filter.own.mean for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
-    assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
+    assert numpy.stack([s.disturbances["stuck"].now for _, s in seen]).any(axis=0).all()
     p, S = model.task.parameters, model.task.satellites
     identity = numpy.eye(17)[:, :, None, None]
     F = [
@@ -103,7 +103,8 @@ def test_bound_is_the_dense_recursion():
     for i in (8, 9, 10):
         Q[LINE][i, i] = 0.0  # the acceleration of straight flight is zero, not nearly
     for lane in range(8):
-        coloured, decay = seen[0][1].coloured_deviation[lane], seen[0][1].coloured_decay[lane]
+        colour = seen[0][1].disturbances["coloured"]
+        coloured, decay = colour.deviation[lane], colour.process.decay[lane]
         P = numpy.diag([*model.task.world.initial_sigma[:, 0] ** 2, *[coloured**2] * S])
         mode = int(seen[0][1].mode[lane])
         for (said, truth), mean_square in zip(seen, bounds, strict=True):
@@ -119,7 +120,7 @@ def test_bound_is_the_dense_recursion():
             H = numpy.hstack([dense(rows, truth.state)[..., lane], numpy.eye(len(rows), S)])
             R = numpy.array(model.task.sensor_variance) * truth.noise_factor[:, lane] ** 2
             there = said.available[:, lane] > 0.0
-            there[2 * S : 2 * S + 3] &= truth.stuck[lane] == 0.0
+            there[2 * S : 2 * S + 3] &= truth.disturbances["stuck"].now[lane] == 0.0
             H, R = H[there], numpy.diag(R[there])
             P = P - P @ H.T @ numpy.linalg.solve(H @ P @ H.T + R, H @ P)
             # Subtraction of the dense form: 100 m^2 and 1e-6 (rad/s)^2 stand in one matrix.
@@ -189,7 +190,7 @@ def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
     for _episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
         truth = _episode.truth
     errors = (found[-1][0] * found[-1][1]).sum(axis=1)
-    place = truth.faults.ramp_satellite.astype(int)
+    place = truth.disturbances["ramp"].satellites[0].astype(int)
     lanes = numpy.arange(8)
     before = (found[90][0] * found[90][1]).sum(axis=1)
     # What was there before, 2 m of the prior, is left in.
@@ -214,7 +215,7 @@ def test_the_bank_over_satellite_faults_believes_the_fault_that_is_there():
     estimator = Watched(model.task)
     for episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
         truth = episode.truth
-    place, lanes = truth.faults.ramp_satellite.astype(int), numpy.arange(8)
+    place, lanes = truth.disturbances["ramp"].satellites[0].astype(int), numpy.arange(8)
     assert found[38].weights[0].min() > 0.9
     last = found[-1]
     assert last.weights.sum(axis=0) == pytest.approx(1.0, rel=1e-12)
@@ -319,7 +320,7 @@ def test_stuck_check_switches_stuck_accelerometers_off():
             return action, state
 
     states = [episode for episode, _ in rollout(model, Watched(model), episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([s.truth.stuck for s in states]) > 0.0
+    stuck = numpy.stack([s.truth.disturbances["stuck"].now for s in states]) > 0.0
     assert stuck.any()
     # A decision is told of the measurements since the last one; the first of one.
     first = [max(0, (k - 1) * model.task.decision_interval + 1) for k in range(len(actions))]
@@ -462,7 +463,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
 
     estimator.bank.predict = watched
     told = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([episode.truth.stuck for episode in told])
+    stuck = numpy.stack([episode.truth.disturbances["stuck"].now for episode in told])
     there = numpy.stack([episode.measurement.available for episode in told])
     assert stuck.any()
     assert (there == 0.0).any()

@@ -4,7 +4,9 @@ import math
 
 import numpy
 import pytest
+from filtergym.envs.contract.faults import Step
 from filtergym.envs.contract.model import Episode, Model
+from filtergym.envs.tightly_coupled_navigation.disturbances import Reception, Reflections
 from filtergym.envs.tightly_coupled_navigation.parameters import (
     SINGER,
     TightlyCoupledNavigationParameters,
@@ -172,6 +174,10 @@ def test_lanes_may_stand_at_different_times():
     mask = numpy.arange(8) < 4
 
     def chosen(a, b):
+        if isinstance(a, dict):
+            return {name: chosen(part, b[name]) for name, part in a.items()}
+        if a is None:
+            return None
         if isinstance(a, tuple):
             return type(a)(*(chosen(*parts) for parts in zip(a, b, strict=True)))
         return numpy.where(mask, a, b)
@@ -195,19 +201,6 @@ def test_no_truth_in_the_observation(scenario, control):
         assert (model.observe(state) == observation).all()
         state = model.act(state, numpy.zeros((ZERO[control], 8)))
         assert (model.mean(state) == model.mean(after)).all()
-
-
-@pytest.mark.parametrize("hidden", ["noise_factor", "stuck", "mode", "jumped"])
-def test_what_the_sensors_hide_is_not_measured(hidden):
-    """A truth that differs in what nobody is told, in a step where it has no effect, measures alike."""
-    model = make("random", stick_probability=0.0, rate_fault_probability=0.0)
-    uniforms, normals, rows = numbers(model, 8, 7, 2)
-    first, second = rows
-    truth = model.measure(model.begin(uniforms, normals), first).truth
-    other = truth._replace(**{hidden: 1 + getattr(truth, hidden)})
-    (_, said), (_, same) = (model.task.world.advance(t, second, None) for t in (truth, other))
-    for name, value in said._asdict().items():
-        numpy.testing.assert_array_equal(value, getattr(same, name), err_msg=name)
 
 
 @pytest.mark.parametrize("control", ["evidence", "gain"])
@@ -311,25 +304,27 @@ def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre()
     model, N = make("random", horizon=300), 4000
     uniforms, normals, _ = numbers(model, N, 21, 0)
     truth = model.begin(uniforms, normals).truth
-    faults, p = truth.faults, model.task.parameters
+    found, p = truth.disturbances, model.task.parameters
+    urban, aperture = found["reflections"].urban, found["aperture"]
     four = 4.0 * math.sqrt(0.25 / N)
-    windows = numpy.stack([faults.noisy, faults.stuck, faults.no_rates, faults.hidden, faults.ramp])[:, 1]
-    calm = (windows < 0.0).all(axis=0) & (faults.urban == 0.0) & (faults.aperture == 0.0)
+    names = "noisy", "stuck", "no_rates", "hidden", "ramp"
+    windows = numpy.stack([found[name].window for name in names])[:, 1]
+    calm = (windows < 0.0).all(axis=0) & (urban == 0.0) & (aperture == 0.0)
     without = (1 - 0.3) * (1 - 0.3) * (1 - 0.15) * (1 - 0.2) * (1 - 0.15) * (1 - 0.2)
     assert abs(calm.mean() - (p.undisturbed + (1 - p.undisturbed) * without)) < four
-    for values, share in ((faults.urban, 0.15), (faults.aperture, 0.2)):
+    for values, share in ((urban, 0.15), (aperture, 0.2)):
         assert abs(values.mean() - (1 - p.undisturbed) * share) < four
-    assert (faults.ramp == -1.0).all()
+    assert (found["ramp"].window == -1.0).all()
     throughout = (truth.legs.kind == 2.0).all(axis=0)
     assert abs(throughout.mean() - 0.15) < four
     assert (truth.legs.start[1:, throughout] > p.horizon + 1).all()
     strength = numpy.linalg.norm(truth.legs.acceleration, axis=0)
-    assert strength[:, faults.urban > 0.0].max() <= 4.0 + 1e-12
+    assert strength[:, urban > 0.0].max() <= 4.0 + 1e-12
     assert strength.max() > 39.0
     speed = numpy.linalg.norm(truth.state[4:7], axis=0)
-    assert 10.0 < speed[faults.urban > 0.0].max() <= 15.0 + 1e-9
+    assert 10.0 < speed[urban > 0.0].max() <= 15.0 + 1e-9
     assert speed.max() > 290.0
-    assert (truth.cn0[:, faults.urban == 0.0] == p.clear_cn0).all()
+    assert (found["reflections"].cn0[:, urban == 0.0] == p.clear_cn0).all()
 
 
 def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_reflections():
@@ -339,25 +334,25 @@ def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_refle
     )  # fmt: skip
     lost, off = numpy.zeros(16), numpy.zeros(16)
     for _, state, _, _ in drive(model, 16, 22, 60):
-        faults, step = state.truth.faults, state.truth.step
-        excused = numpy.zeros(16, dtype=bool)
-        for first, last in (faults.no_rates, faults.hidden):
-            excused |= (first <= step) & (step <= last)
+        found = state.truth.disturbances
+        excused = (found["no_rates"].now > 0.0) | (found["hidden"].now > 0.0)
         lost += (state.measurement.available[4:8] == 0.0).any(axis=0) & ~excused
         off += (state.truth.range_error != 0.0).any(axis=0)
-    assert (lost[faults.aperture == 0.0] == 0.0).all()
-    assert (lost[faults.aperture == 1.0] > 0.0).all()
-    assert 0 < faults.aperture.sum() < 16
-    assert (off[faults.urban == 0.0] == 0.0).all()
-    assert (off[faults.urban == 1.0] > 0.0).all()
-    assert 0 < faults.urban.sum() < 16
+    aperture, urban = found["aperture"], found["reflections"].urban
+    assert (lost[aperture == 0.0] == 0.0).all()
+    assert (lost[aperture == 1.0] > 0.0).all()
+    assert 0 < aperture.sum() < 16
+    assert (off[urban == 0.0] == 0.0).all()
+    assert (off[urban == 1.0] > 0.0).all()
+    assert 0 < urban.sum() < 16
 
 
 def test_a_pseudorange_drifts_off_as_stated():
     quiet = make("satellite-ramp", pseudorange_sigma=1e-4)
     for k, state, _, _ in drive(quiet, 8, 23, 350):
         s = state.truth
-        place, first = s.faults.ramp_satellite.astype(int), s.faults.ramp[0]
+        ramp = s.disturbances["ramp"]
+        place, first = ramp.satellites[0].astype(int), ramp.window[0]
         expected = numpy.where(k >= first, 10.0 * 0.01 * (k - first + 1.0), 0.0)
         error = numpy.zeros((4, 8))
         error[place, numpy.arange(8)] = expected
@@ -377,28 +372,29 @@ def test_a_pseudorange_drifts_off_as_stated():
 def test_a_bias_is_as_large_as_drawn():
     model, biased = make("satellite-bias"), numpy.zeros((4, 16))
     for k, state, _, _ in drive(model, 16, 24, 350):
-        faults, error = state.truth.faults, state.truth.range_error
-        place = faults.ramp_satellite.astype(int)
+        ramp, error = state.truth.disturbances["ramp"], state.truth.range_error
+        place, jump = ramp.satellites[0].astype(int), ramp.own[0]
         biased[...] = 0.0
-        biased[place, numpy.arange(16)] = numpy.where(k >= faults.ramp[0], faults.ramp_jump, 0.0)
+        biased[place, numpy.arange(16)] = numpy.where(k >= ramp.window[0], jump, 0.0)
         assert (error == biased).all()
-    assert ((faults.ramp_jump >= 10.0) & (faults.ramp_jump <= 50.0)).all()
-    assert (biased.max(axis=0) == faults.ramp_jump).all()
+    assert ((jump >= 10.0) & (jump <= 50.0)).all()
+    assert (biased.max(axis=0) == jump).all()
 
 
 def test_coloured_errors_have_the_deviation_and_the_correlation_that_are_drawn():
     model = make("coloured-ranges", pseudorange_correlation_time=(0.1, 0.5))
     errors = []
     for _, state, _, _ in drive(model, 200, 25, 60):
-        errors.append(state.truth.coloured)
-    truth, errors = state.truth, numpy.array(errors) / state.truth.coloured_deviation
-    assert (truth.range_error == truth.coloured).all()
-    assert ((truth.coloured_deviation >= 3.0) & (truth.coloured_deviation <= 8.0)).all()
-    assert (truth.coloured_decay >= math.exp(-0.1)).all()
+        errors.append(state.truth.disturbances["coloured"].level)
+    coloured = state.truth.disturbances["coloured"]
+    errors, decay = numpy.array(errors) / coloured.deviation, coloured.process.decay
+    assert (state.truth.range_error == coloured.level).all()
+    assert ((coloured.deviation >= 3.0) & (coloured.deviation <= 8.0)).all()
+    assert (decay >= math.exp(-0.1)).all()
     # 800 errors at a time: standard error of a variance 0.05; stationary from the start.
     assert abs((errors[[0, -1]] ** 2).mean(axis=(1, 2)) - 1.0).max() < 4 * 0.05
-    kicks = errors[1:] - truth.coloured_decay * errors[:-1]
-    scaled = kicks / numpy.sqrt(1.0 - truth.coloured_decay**2)
+    kicks = errors[1:] - decay * errors[:-1]
+    scaled = kicks / numpy.sqrt(1.0 - decay**2)
     assert abs((scaled**2).mean() - 1.0) < 4 * math.sqrt(2.0 / scaled.size)
     assert abs((scaled * errors[:-1]).mean()) < 4 / math.sqrt(scaled.size)
 
@@ -406,9 +402,9 @@ def test_coloured_errors_have_the_deviation_and_the_correlation_that_are_drawn()
 def test_undisturbed_episodes_have_no_coloured_errors():
     model = make("random", undisturbed=0.5)
     *_, (_, state, _, _) = drive(model, 32, 26, 3)
-    truth = state.truth
-    assert 0 < truth.faults.calm.sum() < 32
-    assert (((truth.coloured != 0.0).all(axis=0)) == (truth.faults.calm == 0.0)).all()
+    coloured = state.truth.disturbances["coloured"]
+    assert 0 < (coloured.deviation == 0.0).sum() < 32
+    assert ((coloured.level != 0.0).all(axis=0) == (coloured.deviation > 0.0)).all()
 
 
 def test_heading_is_drawn_but_on_the_courses_of_the_paper():
@@ -437,11 +433,12 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     previous, noisy, stuck, out = None, 0, 0, 0
     for k, state, _, _ in drive(model, 8, 11, 600):
         s, said = state.truth, state.measurement
-        assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.faults.rate_factor)).all()
+        assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.disturbances["noisy"].own)).all()
         noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
         assert (s.noise_factor[:4] == 1.0).all()
-        held = (s.step >= s.faults.stuck[0]) & (s.step <= s.faults.stuck[1]) & (k > 1)
-        assert (held == (s.stuck == 1.0)).all()
+        first, last = s.disturbances["stuck"].window
+        held = (s.step >= first) & (s.step <= last) & (k > 1)
+        assert (held == (s.disturbances["stuck"].now == 1.0)).all()
         if previous is not None:
             same = (said.readings[8:11] == previous.readings[8:11]).all(axis=0)
             assert (same == held).all()
@@ -454,15 +451,15 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()
-    assert ((s.faults.rate_factor > 2.0) & (s.faults.rate_factor < 10.0)).all()
-    assert numpy.ptp(s.faults.rate_factor) > 2.0
+    assert ((s.disturbances["noisy"].own > 2.0) & (s.disturbances["noisy"].own < 10.0)).all()
+    assert numpy.ptp(s.disturbances["noisy"].own) > 2.0
 
 
 def test_rates_are_lost_when_it_is_drawn():
     model = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5, **UNMIXED)
     lost, drawn = 0, 0
     for _, state, _, _ in drive(model, 16, 11, 600):
-        (first, last), step = state.truth.faults.no_rates, state.truth.step
+        (first, last), step = state.truth.disturbances["no_rates"].window, state.truth.step
         inside = (first <= step) & (step <= last)
         assert (state.measurement.available[4:8] == ~inside).all()
         assert (state.measurement.available[:4] == 1.0).all()
@@ -475,10 +472,10 @@ def test_outages_are_as_probable_and_as_long_as_stated():
     runs = 4000
     model = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6, **UNMIXED)
     p = model.task.parameters
-    faults = model.begin(*numbers(model, runs, 14, 0)[:2]).truth.faults
+    faults = model.begin(*numbers(model, runs, 14, 0)[:2]).truth.disturbances
     for (first, last), probability, seconds in (
-        (faults.no_rates, 0.3, p.rates_outage_duration),
-        (faults.hidden, 0.6, p.satellites_outage_duration),
+        (faults["no_rates"].window, 0.3, p.rates_outage_duration),
+        (faults["hidden"].window, 0.6, p.satellites_outage_duration),
     ):
         there = first > 0.0
         assert abs(there.mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / runs)
@@ -496,23 +493,22 @@ def test_urban_errors_have_the_stated_quantiles():
     model = make("urban")
     rng = numpy.random.default_rng(12)
     N = 40000
-    truth = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.standard_normal((17, 8))).truth
-    wide = numpy.zeros((4, N))
+    reflections = Reflections(model.task)
+    wide, between = numpy.zeros((4, N)), numpy.ones(N)
 
     def noise():
-        return numpy.concatenate([wide, rng.standard_normal((4, N)), rng.random((4, N))])
+        normals = numpy.concatenate([wide, rng.standard_normal((4, N))])
+        return Step(between, 0.01, normals, rng.random((4, N)))
 
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
-        s = truth._replace(cn0=wide + cn0, multipath=wide, hold=wide)
-        s = s._replace(faults=s.faults._replace(urban=numpy.ones(N)))
-        s = model.task.world._reflect(s, noise())
+        s = reflections.advance(Reception(between, wide + cn0, wide, wide), noise())
         assert (s.multipath >= 0.0).all()
         # 160,000 draws: four standard errors of the quantiles.
         assert numpy.median(s.multipath) == pytest.approx(median, abs=0.02 * median + 0.15)
         assert numpy.quantile(s.multipath, 0.95) == pytest.approx(upper, rel=0.03)
         assert s.hold.min() >= 48.0
         assert s.hold.max() <= 199.0
-        held = model.task.world._reflect(s, noise())
+        held = reflections.advance(s, noise())
         assert (held.multipath == s.multipath).all()
 
 

@@ -377,7 +377,8 @@ def test_observation_is_recomputed_from_the_measurements_alone(plant: str, contr
         drive[readout] = 0.0
         trial = model.measure(two, drive)
         without, wanted = (
-            model.task.design.H @ each.truth.state + each.truth.sensor_coloured for each in (trial, one)
+            model.task.design.H @ each.truth.state + each.truth.disturbances["coloured"].level
+            for each in (trial, one)
         )
         wanted = wanted + sigmas * one.truth.sensor_level * noise.rows[k][readout]
         drive[readout] = (wanted - without) / (sigmas * trial.truth.sensor_level)
@@ -615,10 +616,11 @@ def test_random_episodes_hold_what_they_promise() -> None:
     assert changes.min() >= 4
     assert changes.max() <= 12
     assert set(numpy.unique(changes)) > {6, 8, 10}  # steps are one change, doublets three
-    length = truth.dropout_stops - truth.dropout_starts
+    dropouts = truth.disturbances["dropouts"]
+    length = dropouts.stops - dropouts.starts
     assert (length >= 1).all()
     assert (length <= 15).all()
-    assert (truth.dropout_stops <= p.horizon + 1).all()
+    assert (dropouts.stops <= p.horizon + 1).all()
 
 
 def test_nothing_befalls_one_of_six() -> None:
@@ -627,13 +629,11 @@ def test_nothing_befalls_one_of_six() -> None:
     truth = model.begin(noise.uniforms, noise.initial).truth
     calm = (truth.levels.values == 1.0).all(axis=0)
     assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / N)
-    assert (truth.sensor_levels.values[..., calm] == 1.0).all()
-    assert (truth.coloured_kick[:, calm] == 0.0).all()
-    assert (truth.sensor_coloured[:, calm] == 0.0).all()
-    assert (truth.coloured_kick[:, ~calm] > 0.0).all()
-    assert (truth.sensor_levels.values[..., ~calm] != 1.0).all()
-    assert (truth.dropout_stops[..., calm] == truth.dropout_starts[..., calm]).all()
-    assert (truth.dropout_stops[..., ~calm] > truth.dropout_starts[..., ~calm]).all()
+    sensor_levels, coloured, _, dropouts = truth.disturbances.values()
+    lengths = dropouts.stops - dropouts.starts
+    for values in (sensor_levels.levels.values - 1.0, coloured.process.kick, coloured.level, lengths):
+        assert (values[..., calm] == 0.0).all()
+        assert (values[..., ~calm] != 0.0).all()
 
 
 @BOTH
@@ -650,7 +650,7 @@ def test_slow_errors_of_sensors_are_as_stated(plant: str) -> None:
     before = model.begin(noise.uniforms, noise.initial)
     p, rate = model.task.parameters, list(model.task.sensors).index("rate")
     sigmas = numpy.array(p.value("sensor_sigmas"))[:, None]
-    bias = before.truth.sensor_bias / sigmas
+    bias = before.truth.disturbances["bias"] / sigmas
     assert (numpy.delete(bias, rate, axis=0) == 0.0).all()
     assert abs(bias[rate]).min() >= 1.0
     assert abs(bias[rate]).max() <= 2.0
@@ -659,16 +659,16 @@ def test_slow_errors_of_sensors_are_as_stated(plant: str) -> None:
     error = after.measurement.reading - model.task.design.H @ after.truth.state
     white = sigmas * noise.rows[0][model.task.world.drives :][: len(sigmas)]
     # The sum of four numbers against three of them: rounding.
-    numpy.testing.assert_allclose(
-        error - white, after.truth.sensor_coloured + after.truth.sensor_bias, rtol=0, atol=1e-12
-    )
-    one, two = before.truth.sensor_coloured / sigmas, after.truth.sensor_coloured / sigmas
+    found = after.truth.disturbances
+    slow = found["coloured"].level + found["bias"]
+    numpy.testing.assert_allclose(error - white, slow, rtol=0, atol=1e-12)
+    one, two = (each.truth.disturbances["coloured"].level / sigmas for each in (before, after))
     decay = math.exp(-p.value("sampling_interval"))
     # Four standard errors of a sample variance of as many episodes.
     for product, expected in ((one * one, 1.0), (two * two, 1.0), (one * two, decay)):
         found = product.mean(axis=1) / 0.8**2
         numpy.testing.assert_allclose(found, expected, rtol=0, atol=4.0 * math.sqrt(2.0 / N))
-    numpy.testing.assert_array_equal(after.truth.sensor_bias, before.truth.sensor_bias)
+    numpy.testing.assert_array_equal(after.truth.disturbances["bias"], before.truth.disturbances["bias"])
 
 
 def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:
@@ -676,7 +676,7 @@ def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone(
         model = make(plant, "sensor-degradation")
         noise = Noise(model, 8, 0, 1)
         state = model.begin(noise.uniforms, noise.initial)
-        after = state.truth.sensor_levels.values[1, :, 0]
+        after = state.truth.disturbances["noisy_sensors"].levels.values[1, :, 0]
         assert dict(zip(model.task.sensors, after, strict=True))["rate"] == pytest.approx(5.0)
         assert sorted(after)[:-1] == [1.0] * (len(after) - 1)
     lag = make("U", "actuator-lag").task.design

@@ -212,7 +212,7 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
     for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, 2)):
         pass
     lane, truth = 1, seen[0][1]
-    psi, kick = truth.coloured_decay[:, lane], truth.coloured_kick[:, lane]
+    psi, kick = (each[:, lane] for each in truth.disturbances["coloured"].process)
     initial = numpy.square(model.task.parameters.value("initial_sigmas"))
     initial[n - 1] *= truth.levels.values[0, lane] ** 2
     x, P = numpy.zeros(n + m), numpy.diag([*initial, *(kick**2 / (1.0 - psi**2))])
@@ -227,7 +227,7 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
         dropped += int((~there).sum())
         H, R = C[there], numpy.diag((sigmas * truth.sensor_level[:, lane])[there] ** 2)
         S = H @ P @ H.T + R
-        nu = (measurement.reading[:, lane] - truth.sensor_bias[:, lane])[there] - H @ x
+        nu = (measurement.reading[:, lane] - truth.disturbances["bias"][:, lane])[there] - H @ x
         K = P @ H.T @ numpy.linalg.inv(S)
         x, P = x + K @ nu, (numpy.eye(n + m) - K @ H) @ P
         if there.any():
@@ -237,7 +237,7 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
         numpy.testing.assert_allclose(covariance[..., lane], P[:n, :n], rtol=0, atol=1e-10)
     assert dropped > 0
     assert (kick > 0.0).all()
-    assert (truth.sensor_bias[:, lane] != 0.0).all()
+    assert (truth.disturbances["bias"][:, lane] != 0.0).all()
 
 
 @BOTH
