@@ -5,10 +5,9 @@ import math
 import numpy
 import pytest
 from filtergym.envs.contract.faults import Step
-from filtergym.envs.contract.model import Episode, Model
+from filtergym.envs.contract.model import Model
 from filtergym.envs.tightly_coupled_navigation.disturbances import Reception, Reflections
 from filtergym.envs.tightly_coupled_navigation.parameters import (
-    SINGER,
     TightlyCoupledNavigationParameters,
 )
 from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
@@ -48,10 +47,6 @@ def drive(model, N, seed, steps, action=None, kind=numpy.asarray):
         zero = kind(numpy.zeros((ZERO.get(model.control, 3), N)))
         state = model.act(measured, zero if action is None else action(k, observation, measured))
         yield k, measured, observation, state
-
-
-def singer(k, observation, state):
-    return numpy.full(state.truth.step.shape, SINGER)
 
 
 def naive_bank(model, state, posterior):
@@ -96,7 +91,7 @@ def naive_bank(model, state, posterior):
     return (new_means, new_covariances, posterior), estimate
 
 
-@pytest.mark.parametrize(("scenario", "seed"), [("random", 0), ("random", 1), ("paper", 2)])
+@pytest.mark.parametrize(("scenario", "seed"), [("random", 0), ("paper", 2)])
 def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
     model = make(scenario, leg_steps=(20, 40))
     posterior = None
@@ -133,76 +128,6 @@ def test_weights_that_state_the_probabilities_follow_the_paper():
         numpy.testing.assert_allclose(estimate, state.filter.mean, rtol=1e-9, atol=1e-9)
 
 
-def test_truth_and_noise_do_not_depend_on_the_control():
-    ends = []
-    for control, action in (
-        ("evidence", None),
-        ("gain", lambda k, o, s: numpy.ones((4, 8))),
-        ("mode", singer),
-    ):
-        *_, (*_, state) = drive(make("random", control), 8, 4, 30, action)
-        ends.append(state)
-    for other in ends[1:]:
-        assert (other.truth.state == ends[0].truth.state).all()
-        assert (other.measurement.readings == ends[0].measurement.readings).all()
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_lanes_do_not_depend_on_their_neighbours(scenario):
-    """16 lanes at different times give bit for bit what each gives alone (padded to 8)."""
-    model = make(scenario)
-    uniforms, normals, rows = numbers(model, 16, 5, 12)
-    rows = list(rows)
-    state = model.begin(uniforms, normals)
-    for row in rows:
-        state = model.act(model.measure(state, row), numpy.zeros((3, 16)))
-    half = model.begin(uniforms[:, 8:], normals[:, 8:])
-    for row in rows:
-        half = model.act(model.measure(half, row[:, 8:]), numpy.zeros((3, 8)))
-    assert (model.observe(state)[:, 8:] == model.observe(half)).all()
-    assert (model.cost(state)[8:] == model.cost(half)).all()
-
-
-def test_lanes_may_stand_at_different_times():
-    model = make("random")
-    uniforms, normals, rows = numbers(model, 8, 6, 10)
-    rows, zero = list(rows), numpy.zeros((3, 8))
-    ahead = model.begin(uniforms, normals)
-    for row in rows[:5]:
-        ahead = model.act(model.measure(ahead, row), zero)
-    fresh = model.begin(uniforms, normals)
-    mask = numpy.arange(8) < 4
-
-    def chosen(a, b):
-        if isinstance(a, dict):
-            return {name: chosen(part, b[name]) for name, part in a.items()}
-        if a is None:
-            return None
-        if isinstance(a, tuple):
-            return type(a)(*(chosen(*parts) for parts in zip(a, b, strict=True)))
-        return numpy.where(mask, a, b)
-
-    mixed = Episode(chosen(ahead.truth, fresh.truth), None, chosen(ahead.filter, fresh.filter))
-    both = model.measure(mixed, rows[5])
-    for lanes, alone in ((mask, model.measure(ahead, rows[5])), (~mask, model.measure(fresh, rows[5]))):
-        assert (model.observe(both)[:, lanes] == model.observe(alone)[:, lanes]).all()
-
-
-@pytest.mark.parametrize("control", ["evidence", "gain"])
-@pytest.mark.parametrize("scenario", ["random", "two-satellites", "urban", "paper"])
-def test_no_truth_in_the_observation(scenario, control):
-    """The measurements alone, replayed over no truth at all, give the same observations and estimates."""
-    model = make(scenario, control)
-    start = model.begin(*numbers(model, 8, 7, 0)[:2]).measurement
-    state = Episode(None, start, model.filter.start(start))
-    for _, measured, observation, after in drive(model, 8, 7, 30):
-        bank = model.filter.predict(state.filter, measured.measurement)
-        state = Episode(None, measured.measurement, bank)
-        assert (model.observe(state) == observation).all()
-        state = model.act(state, numpy.zeros((ZERO[control], 8)))
-        assert (model.mean(state) == model.mean(after)).all()
-
-
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     model = make("paper", control)
@@ -222,16 +147,6 @@ def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     assert not make("matched", control).task.closes_loop
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_fields_match_the_observation_and_are_of_order_one(scenario):
-    model = make(scenario)
-    assert len({f.name for f in model.fields}) == len(model.fields)
-    for *_, observation, _ in drive(model, 8, 8, 20):
-        assert observation.shape == (len(model.fields), 8)
-        assert numpy.isfinite(observation).all()
-        assert abs(observation).max() < 10.0
-
-
 def test_innovations_are_read_in_their_units():
     model = make("paper")
     for _, measured, observation, _ in drive(model, 8, 8, 5):
@@ -245,7 +160,7 @@ def test_innovations_are_read_in_their_units():
             numpy.testing.assert_allclose(read.T, innovation[part], rtol=1e-13, atol=1e-15)
 
 
-@pytest.mark.parametrize("slots", [(19,), (1, 19), (1, 11, 19), (1, 2, 11, 19, 20)])
+@pytest.mark.parametrize("slots", [(19,), (1, 2, 11, 19, 20)])
 def test_other_numbers_of_satellites(slots):
     model = make("random", satellites=slots, satellites_outage_probability=0.0)
     *_, (*_, observation, state) = drive(model, 8, 9, 60)
@@ -348,12 +263,12 @@ def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_refle
 
 
 def test_a_pseudorange_drifts_off_as_stated():
-    quiet = make("satellite-ramp", pseudorange_sigma=1e-4)
+    quiet = make("satellite-ramp", pseudorange_sigma=1e-4, ramp_jump=(10.0, 50.0))
     for k, state, _, _ in drive(quiet, 8, 23, 350):
         s = state.truth
         ramp = s.disturbances["ramp"]
         place, first = ramp.satellites[0].astype(int), ramp.window[0]
-        expected = numpy.where(k >= first, 10.0 * 0.01 * (k - first + 1.0), 0.0)
+        expected = numpy.where(k >= first, ramp.own[0] + 10.0 * 0.01 * (k - first + 1.0), 0.0)
         error = numpy.zeros((4, 8))
         error[place, numpy.arange(8)] = expected
         assert s.range_error == pytest.approx(error, abs=1e-12)
@@ -366,19 +281,8 @@ def test_a_pseudorange_drifts_off_as_stated():
         # Ranges of 2e7 m are rounded by 4e-9, the noise is 1e-4: ten sigma.
         assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-3)
     assert ((first >= 101) & (first <= 301)).all()
+    assert ((ramp.own[0] >= 10.0) & (ramp.own[0] <= 50.0)).all()
     assert (error > 0.0).sum(axis=0).all()
-
-
-def test_a_bias_is_as_large_as_drawn():
-    model, biased = make("satellite-bias"), numpy.zeros((4, 16))
-    for k, state, _, _ in drive(model, 16, 24, 350):
-        ramp, error = state.truth.disturbances["ramp"], state.truth.range_error
-        place, jump = ramp.satellites[0].astype(int), ramp.own[0]
-        biased[...] = 0.0
-        biased[place, numpy.arange(16)] = numpy.where(k >= ramp.window[0], jump, 0.0)
-        assert (error == biased).all()
-    assert ((jump >= 10.0) & (jump <= 50.0)).all()
-    assert (biased.max(axis=0) == jump).all()
 
 
 def test_coloured_errors_have_the_deviation_and_the_correlation_that_are_drawn():
@@ -428,10 +332,11 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         satellites_outage_duration=(2.0, 2.0),
         stick_duration=(0.3, 1.0),
         rate_fault_duration=(1.0, 3.0),
+        horizon=320,
         **UNMIXED,
     )
     previous, noisy, stuck, out = None, 0, 0, 0
-    for k, state, _, _ in drive(model, 8, 11, 600):
+    for k, state, _, _ in drive(model, 8, 11, 320):
         s, said = state.truth, state.measurement
         assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.disturbances["noisy"].own)).all()
         noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
@@ -456,9 +361,11 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
 
 
 def test_rates_are_lost_when_it_is_drawn():
-    model = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5, **UNMIXED)
+    model = make(
+        "random", satellites_outage_probability=0.0, rates_outage_probability=0.5, horizon=250, **UNMIXED
+    )
     lost, drawn = 0, 0
-    for _, state, _, _ in drive(model, 16, 11, 600):
+    for _, state, _, _ in drive(model, 16, 11, 250):
         (first, last), step = state.truth.disturbances["no_rates"].window, state.truth.step
         inside = (first <= step) & (step <= last)
         assert (state.measurement.available[4:8] == ~inside).all()
@@ -466,27 +373,6 @@ def test_rates_are_lost_when_it_is_drawn():
         lost, drawn = lost + inside, numpy.where(first < 0.0, 0.0, last - first + 1.0)
     assert (lost == drawn).all()
     assert 0 < (drawn > 0).sum() < 16
-
-
-def test_outages_are_as_probable_and_as_long_as_stated():
-    runs = 4000
-    model = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6, **UNMIXED)
-    p = model.task.parameters
-    faults = model.begin(*numbers(model, runs, 14, 0)[:2]).truth.disturbances
-    for (first, last), probability, seconds in (
-        (faults["no_rates"].window, 0.3, p.rates_outage_duration),
-        (faults["hidden"].window, 0.6, p.satellites_outage_duration),
-    ):
-        there = first > 0.0
-        assert abs(there.mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / runs)
-        length = p.sampling_interval * (last - first + 1.0)[there]
-        low, high = seconds
-        half = 0.5 * p.sampling_interval + 1e-9
-        assert low - half <= length.min() < low + 0.05
-        assert high - 0.05 < length.max() <= high + half
-        assert first[there].min() >= 1.0
-        assert last[there].max() <= p.horizon
-        assert (last[~there] < 1.0).all()
 
 
 def test_urban_errors_have_the_stated_quantiles():
@@ -548,36 +434,6 @@ def test_random_course_has_every_leg_and_bounded_strength():
     assert lengths.max() <= 300
 
 
-def test_torch_rolls_out_as_numpy_does(torch):
-    for control, scenario in (("evidence", "urban"), ("gain", "random"), ("evidence", "paper")):
-        a = list(drive(make(scenario, control), 8, 14, 15))
-        b = list(drive(make(scenario, control, torch), 8, 14, 15, kind=torch.asarray))
-        for (_, _, seen, state), (_, _, also, other) in zip(a, b, strict=True):
-            # Elementary functions differ in the last place; the bank multiplies that.
-            numpy.testing.assert_allclose(also.numpy(), seen, rtol=1e-6, atol=1e-6)
-            numpy.testing.assert_allclose(other.filter.mean.numpy(), state.filter.mean, rtol=1e-7, atol=1e-7)
-
-
-def test_gradient_from_cost_to_action(torch):
-    # Where loops lose what they do not expect the cost has steps.
-    model = make("random", "gain", torch, aperture=False)
-
-    def loss(action):
-        total = 0.0
-        for *_, state in drive(model, 8, 15, 4, lambda k, o, s: action, torch.asarray):
-            total = total + model.cost(state).sum()
-        return total
-
-    action = torch.full((4, 8), 0.1, dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(loss(action), action)
-    for place in ((0, 0), (1, 3), (2, 5)):
-        step = torch.zeros((4, 8), dtype=torch.float64)
-        step[place] = 1e-3
-        numeric = (loss(action.detach() + step) - loss(action.detach() - step)) / 2e-3
-        # Ranges of 2e7 m carry a rounding of 4e-9 m into the difference: 1e-6 of a cost of hundreds.
-        assert float(gradient[place]) == pytest.approx(float(numeric), rel=1e-4, abs=1e-6)
-
-
 def within(values, reference, error, allowance=0.0):
     """Root of the mean of ``values`` agrees with a reference within four standard errors of both."""
     root = numpy.sqrt(values.mean())
@@ -634,48 +490,3 @@ def test_reference_table_of_the_adaptive_filter():
     sigma = numpy.sqrt(numpy.diagonal(P, axis1=-2, axis2=-1))
     # Positive definite after 3000 steps: smallest eigenvalue of the correlations.
     assert numpy.linalg.eigvalsh(P / (sigma[..., None] * sigma[..., None, :])).min() > 0.1
-
-
-@pytest.mark.parametrize(
-    ("course", "hypothesis", "band"),
-    [
-        ("increment", 2, (0.65, 0.75)),
-        ("increment", 0, (0.39, 0.43)),
-        ("kinematic", 2, None),
-        ("increment", 1, None),
-    ],
-)
-@pytest.mark.claims
-def test_loss_of_track_with_the_aperture(course, hypothesis, band):
-    """Median time from the motion of the first step of leg 2 to the first of ten lost rates.
-
-    A shorter leg 1 than the paper's, 300 steps, suffices for a steady filter.
-    """
-    model = make("paper", "mode", course=course, leg_steps=(300, 1300))
-    outside = []
-    for k, _, _, state in drive(model, 16, 17, 420, lambda k, o, s: numpy.full(16, hypothesis)):
-        if k > 300:
-            outside.append(model.records(state)["rate_outside_aperture"] > 0.0)
-    lasting = numpy.stack([numpy.all(outside[j : j + 10], axis=0) for j in range(len(outside) - 9)])
-    if band is None:
-        assert not lasting.any()
-    else:
-        assert lasting.any(axis=0).all()
-        assert band[0] <= numpy.median(lasting.argmax(axis=0) + 1) * 0.01 <= band[1]
-
-
-@pytest.mark.claims
-def test_matched_filter_is_consistent():
-    """NEES / 17 and NIS / 14 of the Singer filter on its own model: 0.987 +- 0.018 and 1.001."""
-    model, N = make("matched", "mode"), 32
-    nees, nis = [], []
-    for k, _, _, state in drive(model, N, 18, 600, singer):
-        if k >= 200:
-            nis.append(model.records(state)["nis"].mean() / 14)
-            if k % 20 == 0:
-                error, P = model.error(state).T, numpy.moveaxis(model.covariance(state), -1, 0)
-                nees.append((error * numpy.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 17)
-    means = numpy.mean(nees, axis=0)
-    assert abs(means.mean() - 1.0) < 4.0 * means.std() / numpy.sqrt(N)
-    # 32 * 400 epochs of 14 degrees: standard error sqrt(2 / 14 / 12800) = 0.0033.
-    assert numpy.mean(nis) == pytest.approx(1.0, abs=0.0133)
