@@ -14,7 +14,6 @@ from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
 from filtergym.envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from filtergym.filters import gnss_ins
 from filtergym.filters.packed_covariance import unpack
-from models import make_model
 from naive import dense
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
@@ -432,61 +431,3 @@ def test_random_course_has_every_leg_and_bounded_strength():
     lengths = numpy.diff(legs.start, axis=0)
     assert lengths.min() >= 100
     assert lengths.max() <= 300
-
-
-def within(values, reference, error, allowance=0.0):
-    """Root of the mean of ``values`` agrees with a reference within four standard errors of both."""
-    root = numpy.sqrt(values.mean())
-    own = values.std() / numpy.sqrt(len(values)) / (2.0 * root)
-    assert abs(root - reference) < 4.0 * numpy.hypot(own, error) + allowance, (root, own, reference)
-
-
-@pytest.mark.claims
-def test_reference_table_of_the_adaptive_filter():
-    """Increment course, 24 runs: RMS errors of three legs, NIS, probabilities and adaptation times."""
-    N, model = 24, make_model(TightlyCoupledNavigation.id, "evidence", "paper", backend="auto")
-    windows = SCENARIOS["paper"].windows
-    squares = {leg: numpy.zeros((3, N)) for leg in ("leg1", "leg2", "leg3")}
-    nis = dict.fromkeys(squares, 0.0)
-    probability = {}
-    for k, _, _, state in drive(model, N, 16, 3000):
-        error, records = model.error(state), model.records(state)
-        probability[k] = records["mode_probability"]
-        assert (records["rate_outside_aperture"] == 0.0).all() or k < 5
-        for leg, total in squares.items():
-            first, last = windows[leg]
-            if first <= k <= last:
-                parts = [(error[i : i + 3] ** 2).sum(axis=0) for i in (0, 4, 8)]
-                total += numpy.stack(parts) / (last - first + 1)
-                nis[leg] += records["nis"].mean() / 14 / (last - first + 1)
-    table = {
-        "leg1": ((0.367, 0.014), (0.0031, 0.0002), (0.0432, 0.0001)),
-        "leg2": ((0.204, 0.009), (0.1745, 0.0003), (0.0434, 0.0001)),
-        "leg3": ((0.174, 0.009), (0.0290, 0.0004), (0.0881, 0.0002)),
-    }
-    for leg, rows in table.items():
-        for values, (reference, error) in zip(squares[leg], rows, strict=True):
-            within(values, reference, error)
-    # 24 runs of 800 or more steps and 14 degrees: standard error 0.0027, of the reference 0.0013.
-    assert [nis[leg] for leg in table] == pytest.approx([0.886, 0.786, 1.000], abs=0.0125)
-    error = 4.0 * probability[1].std(axis=1) / numpy.sqrt(N)
-    assert (abs(probability[1].mean(axis=1) - numpy.array([0.96, 0.04, 0.0])) < error + 0.005).all()
-    # A few runs in doubt carry the mean of the rest.
-    assert probability[100].mean(axis=1) == pytest.approx([0.9995, 0.0005, 0.0], abs=1e-3)
-    assert (probability[1500][1] > 0.999).all()
-    for k in (2000, 2500, 3000):
-        assert (probability[k][2] > 0.999).all()
-
-    def adaptation(i, start):
-        steps = numpy.stack([probability[k][i] > 0.5 for k in range(start, start + 60)])
-        lasting = numpy.stack([steps[j : j + 10].all(axis=0) for j in range(50)])
-        return lasting.argmax(axis=0) + 1
-
-    first, second = adaptation(1, 1001), adaptation(2, 2000)
-    assert ((first >= 1) & (first <= 3)).all()
-    assert 1.5 < first.mean() < 2.5
-    assert (second == 1).all()
-    P = numpy.moveaxis(unpack(state.filter.covariances, 17), (0, 1), (-2, -1))
-    sigma = numpy.sqrt(numpy.diagonal(P, axis1=-2, axis2=-1))
-    # Positive definite after 3000 steps: smallest eigenvalue of the correlations.
-    assert numpy.linalg.eigvalsh(P / (sigma[..., None] * sigma[..., None, :])).min() > 0.1
