@@ -129,9 +129,7 @@ class Dropouts(_OfSensors):
         """None of them lasts."""
         return state._replace(stops=self.xp.where(calm, state.starts, state.stops))
 
-    def change_measurement(
-        self, state: Holds, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Holds, Any]:
+    def change_measurement(self, state: Holds, measurement: Any, step: Step) -> tuple[Holds, Any]:
         """Hold the last reading of each sensor that is out."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
