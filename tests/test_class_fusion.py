@@ -95,22 +95,6 @@ def test_identity_is_a_bank_of_kalman_filters(seed):
         assert step.innovation == pytest.approx(update.innovation, rel=1e-11, abs=1e-11)
 
 
-def test_class_transition_is_read_from_row_to_column():
-    P, mean, covariance, z = bank(numpy.random.default_rng(0), 8)
-    P = numpy.array([[0.0], [1.0], [0.0]]) + numpy.zeros(8)
-    step = class_fusion.advance(P, mean, covariance, z, MODELS, ASYMMETRIC)
-    assert numpy.exp(step.log_predicted) == pytest.approx(ASYMMETRIC[1][:, None] + numpy.zeros(8), abs=1e-12)
-
-
-def test_a_class_of_no_probability_and_a_wild_measurement_stay_finite():
-    P, mean, covariance, _ = bank(numpy.random.default_rng(1), 8)
-    z = numpy.full((2, 8), 1e9)
-    P = numpy.array([[1.0], [0.0], [0.0]]) + 0.0 * P
-    for q in (numpy.eye(3), ASYMMETRIC):
-        step = class_fusion.advance(P, mean, covariance, z, MODELS, q)
-        assert all(numpy.isfinite(array).all() for array in step)
-
-
 def test_whitened_innovations_square_to_the_nis():
     P, mean, covariance, z = bank(numpy.random.default_rng(2), 8)
     step = class_fusion.advance(P, mean, covariance, z, MODELS, numpy.eye(3))
@@ -264,14 +248,3 @@ def test_gate_and_wrapped_bearings():
     for bad in (0.0, 1.0, -0.1, 1.5):
         with pytest.raises(ValueError, match="error_probability"):
             class_fusion.bearing_gate(1.0, 1.0, bad)
-
-
-def test_wrong_target_association():
-    # P(associate a wrong target) at 2, 5, 10, 20 degrees.
-    from scipy.stats import norm
-
-    for sigma, expected in ((15.0, (0.90, 0.88, 0.83, 0.63)), (1.5, (0.84, 0.56, 0.09, 0.000))):
-        gate, spread = class_fusion.bearing_gate(sigma, 3.0, 0.1), math.hypot(sigma, 3.0)
-        for separation, probability in zip((2, 5, 10, 20), expected, strict=True):
-            inside = norm.cdf((gate - separation) / spread) - norm.cdf((-gate - separation) / spread)
-            assert inside == pytest.approx(probability, abs=0.0055)

@@ -6,12 +6,15 @@ import pickle
 
 import gymnasium
 import numpy as np
+import pytest
 from contract import BACKENDS, continued
+from models import KINDS
 
 make_three = functools.partial(gymnasium.make_vec, num_envs=3)
 WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_copies_go_on_as_the_original(env_id, short):
     """One pass over an environment: single and many, each backend that is here, each way to copy."""
     for backend in BACKENDS:

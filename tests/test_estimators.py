@@ -276,15 +276,6 @@ def test_lost_episodes_stand_in_table_records_and_results(command, without_figur
             assert [note for note in result.notes if note.startswith(told)]
 
 
-def test_an_estimate_in_place_of_three_is_refused():
-    class Short(Start):
-        def update(self, measurement, memory):
-            return memory[0]
-
-    with pytest.raises(ValueError, match="must return mean, covariance and memory"):
-        filtergym.evaluate(ID, {"mine": Short}, episodes=2, horizon=3)
-
-
 RAISING = """class AtUpdate:
     def start(self, initial, N):
         return initial

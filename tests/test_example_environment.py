@@ -1,7 +1,6 @@
 """The complete small example in the documentation: a user's own environment in one file."""
 
 import importlib.util
-import subprocess
 import sys
 from pathlib import Path
 
@@ -32,10 +31,6 @@ def example():
     for table in (sys.modules, registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
         table.pop("inverted_pendulum", None)
         table.pop(ID, None)
-
-
-def test_it_is_short():
-    assert len((FOLDER / "inverted_pendulum.py").read_text().splitlines()) < 300
 
 
 def test_environment(example):
@@ -80,13 +75,3 @@ def test_tables_of_its_page(example):
     assert "Limits of its true factor" in environment_table(problem, "parameters")
     assert "Knows the factor on the gusts at every moment." in environment_table(problem, "policies")
     assert make_model(ID).task.noise.uniforms == 3
-
-
-def test_command_line_finds_it_in_the_working_directory():
-    arguments = ["evaluate", f"inverted_pendulum:{ID}", "--policy", "kalman", "--policy", "known-gusts"]
-    done = subprocess.run(
-        [sys.executable, "-m", "filtergym", *arguments, "--episodes", "5", "--set", "horizon=20"],
-        capture_output=True, text=True, cwd=FOLDER, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "known-gusts" in done.stdout

@@ -1,12 +1,9 @@
 """An environment of a user's own package is a citizen: nothing here is in the catalogue by itself."""
 
 import json
-import os
 import pickle
-import subprocess
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -80,13 +77,6 @@ def forget(id):
     gymnasium.registry.pop(id, None)
 
 
-def run(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "filtergym", *arguments],
-        capture_output=True, text=True, cwd=cwd, check=False, env={**os.environ, "PYTHONPATH": str(cwd)},
-    )  # fmt: skip
-
-
 def test_gymnasium_makes_and_renders_it(package):
     env = gymnasium.make(ID, control="gain", render_mode="rgb_array", horizon=5)
     own = gymnasium.make("filtergym/ManeuveringTarget-v0", control="gain", horizon=5)
@@ -109,13 +99,6 @@ def test_a_spawned_process_finds_it(package):
     finally:
         vector.close()
     np.testing.assert_array_equal(observation[0], gymnasium.make(ID, horizon=5).reset(seed=3)[0])
-
-
-def test_a_problem_goes_to_another_process_by_its_name(package):
-    packed = pickle.dumps(import_problem(ID))
-    sys.modules.pop("turns_package")
-    forget("mine/Turns-v0")
-    assert pickle.loads(packed).id == "mine/Turns-v0"
 
 
 def test_an_experiment_goes_to_another_process_by_the_name_of_its_task(package):
@@ -180,16 +163,6 @@ def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
     assert sentences
     for sentence in sentences:
         assert sentence.replace("`", "") in " ".join(shown.split())
-
-
-@pytest.mark.slow
-def test_the_command_line_finds_it_in_the_folder_where_it_is_started(package):
-    out = run(
-        "evaluate", ID, "--policy", "turns_package:Middle", "--policy", "random", "--episodes", "4", "--out", "out",
-        "--set", "horizon=20", cwd=package,
-    )  # fmt: skip
-    assert out.returncode == 0, out.stderr
-    assert len(json.loads((package / "out" / "records.json").read_text())) > 0
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
@@ -342,18 +315,3 @@ def test_baselines_must_fit_the_task(turns):
     ):
         with pytest.raises(ValueError, match=expected):
             filtergym.register_task(turns, table)
-
-
-def test_an_unknown_module_gets_one_sentence():
-    with pytest.raises(ValueError, match="cannot import 'nowhere'"):
-        filtergym.evaluate("nowhere:mine/Turns-v0", ["random"])
-
-
-def test_importing_filtergym_stays_light(tmp_path):
-    code = (
-        "import sys, filtergym\n"
-        "heavy = {'xarray', 'torch', 'matplotlib', 'scipy.optimize', 'yaml', 'typer'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-        "assert callable(filtergym.evaluate) and 'xarray' in sys.modules and 'torch' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(tmp_path))

@@ -64,17 +64,6 @@ def test_one_is_what_the_paper_pays_on_average(env_id):
         assert 0.8 < charged.mean() < 1.25
 
 
-def test_the_default_is_the_environments_own(env_id, short, random_actions):
-    own = make_model(env_id).task.reward
-    envs = [TaskVectorEnv(env_id, 2, reward=kind, **short) for kind in (None, own, "cost", "relative")]
-    for env in envs:
-        env.reset(seed=4)
-    actions = random_actions(envs[0].single_action_space, 2, 0)
-    default, same, cost, relative = (env.step(actions)[1] for env in envs)
-    np.testing.assert_array_equal(default, same)
-    assert (cost != relative).any()
-
-
 def test_doing_nothing_is_worth_nothing(env_id, short, random_actions):
     """Under "log-relative", to the last bit, under every control; anything else is worth something."""
     for control in make_model(env_id).task.controls:

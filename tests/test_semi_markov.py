@@ -173,12 +173,11 @@ def answers_of(model, estimator, count):
     return start, measurements[:count], told[:count]
 
 
-@pytest.fixture(scope="module", params=["regular", "irregular"])
-def model(request):
+@pytest.fixture(scope="module")
+def model():
     irregular = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
     # Manoeuvres at once, so that a short horizon holds them.
-    free = {"horizon": 40, "maneuver_count": (3, 3)}
-    return make_model(ID, None, "random", **free, **(irregular if request.param == "irregular" else {}))
+    return make_model(ID, None, "random", horizon=40, maneuver_count=(3, 3), **irregular)
 
 
 def prior(**changed):
@@ -211,7 +210,7 @@ def test_stays_near_the_enumeration_where_it_merges(model, hypotheses):
     # Manoeuvres end and begin again: what is merged differs only in when.
     # The fewer ages, the sooner manoeuvres may end, and the more sequences there are.
     scans, size = (
-        (6, {"hazards": (0.0, 0.3, 0.4)}) if hypotheses == 32 else (4, training_prior(hypotheses)._asdict())
+        (5, {"hazards": (0.0, 0.3, 0.4)}) if hypotheses == 32 else (4, training_prior(hypotheses)._asdict())
     )
     filter = SemiMarkov(model.task, **{**size, **prior(begin=0.05)})
     initial, measurements, answers = answers_of(model, filter, scans)
