@@ -10,13 +10,12 @@ from contract import BACKENDS, Subject, assert_properties
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import episode_noise
-from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.compiled import share_world
 from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import OWN_PAY, reference
 from filtergym.evaluation.running.rollout import start_lanes
-from models import make_model
+from models import KINDS, make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -113,12 +112,13 @@ def test_identities_of_seeds_are_those_of_environments_that_are_reset():
         identities[0, 0] = 1
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_lanes_on_every_backend(env_id):
     for backend in [one for one in BACKENDS if one != "torch"]:
         assert_properties(Subject(env_id, backend=backend), [restart_at_different_times_as_single_ones])
     if "compiled" in BACKENDS:
         # One of two in turn: for either, programs of both algorithms are traced.
-        kind = ("relative", "log-relative")[list(catalogue()).index(env_id) % 2]
+        kind = ("relative", "log-relative")[KINDS.index(env_id) % 2]
         assert_runs_beside_as_lanes_of_its_own(Subject(env_id, backend="compiled"), kind)
 
 
