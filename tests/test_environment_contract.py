@@ -3,7 +3,6 @@
 import inspect
 import json
 import warnings
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -308,38 +307,3 @@ def test_relative_reward_is_the_difference_of_costs(env_id):
             theirs.step(paper_action)[1],
         )
         np.testing.assert_allclose(difference, mine - papers, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("env_id", KINDS)
-def test_stable_baselines3_evaluates_a_baseline(env_id, short):
-    pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.evaluation import evaluate_policy
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
-    policy_class = baselines_of(env_id).policies[baselines_of(env_id).score_paper]
-    env = gym.make(env_id, control=policy_class.control, **short)
-    policy, vector = policy_class(env.unwrapped.model), DummyVecEnv([lambda: env])
-    vector.seed(5)
-    found, _ = evaluate_policy(policy, vector, n_eval_episodes=1, return_episode_rewards=True, warn=False)
-    (observation, _), paid, state, ended = env.reset(seed=5), 0.0, None, False
-    while not ended:
-        action, state = policy.predict(observation, state, np.array([state is None]))
-        observation, reward, _, ended, _ = env.step(action)
-        paid += reward
-    assert found == pytest.approx([paid], rel=1e-6)  # rewards are float32 there
-
-
-def test_spawned_processes():
-    # A process that starts afresh imports the package by the name before the colon.
-    env_id, short = "filtergym/ManeuveringTarget-v0", {"horizon": 5}
-    make = partial(gym.make, f"filtergym:{env_id}", disable_env_checker=True, **short)
-    there = gym.vector.AsyncVectorEnv([make], context="spawn")
-    here = gym.make_vec(env_id, num_envs=1, **short)
-    try:
-        np.testing.assert_array_equal(there.reset(seed=8)[0], here.reset(seed=8)[0])
-        for step in range(3):
-            actions = random_actions(here.single_action_space, 1, step)
-            for one, other in zip(there.step(actions)[:4], here.step(actions)[:4], strict=True):
-                np.testing.assert_array_equal(one, other)
-    finally:
-        there.close()

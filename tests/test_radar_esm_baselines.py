@@ -20,87 +20,15 @@ from filtergym.papers import radar_esm_class_fusion as reproduction
 
 ID = "filtergym/RadarEsmTracking-v0"
 WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}
-NEVER_REFUSED = {"association_error": 1e-12}
 
 
 # --- the paper's experiment at 20000 episodes
-
-
-@pytest.fixture(scope="module")
-def paper():
-    """The paper's algorithm on 20000 targets of any class."""
-    return evaluate(ID, ["quasi-optimal"], "paper", 20000, seed=2008).isel(policy=0)
 
 
 def root(mean_squares):
     """Root of the mean, and its standard error."""
     value = math.sqrt(mean_squares.mean())
     return value, mean_squares.std() / math.sqrt(len(mean_squares)) / (2.0 * value)
-
-
-@pytest.mark.claims
-def test_errors_by_class(paper):
-    """Published RMSE (M = 20000) and its standard error, windows 0.5-10, 10-30 and 30-60 s."""
-    table = {
-        (0, 1): ((9.04, 0.02), (7.06, 0.02), (6.85, 0.01)),
-        (0, 2): ((2.83, 0.01), (1.33, 0.005), (1.29, 0.005)),
-        (1, 1): ((11.22, 0.02), (9.91, 0.02), (9.84, 0.01)),
-        (1, 2): ((6.06, 0.02), (4.17, 0.01), (4.12, 0.01)),
-        (2, 1): ((13.80, 0.02), (13.19, 0.02), (13.13, 0.01)),
-        (2, 2): ((13.46, 0.03), (11.75, 0.01), (11.72, 0.01)),
-    }
-    true_class = paper["true_class"].values[:, 0]
-    squares = paper["error"].values ** 2
-    for (s, component), row in table.items():
-        for (first, last), (expected, published) in zip(WINDOWS.values(), row, strict=True):
-            value, error = root(squares[true_class == s, first - 1 : last, component].mean(axis=1))
-            assert abs(value - expected) < 4.0 * math.hypot(error, published), (s, component, first, value)
-    for (first, last), expected in zip(WINDOWS.values(), (1091.0, 492.3, 325.3), strict=True):
-        value, error = root(squares[:, first - 1 : last, 0].mean(axis=1))
-        assert abs(value - expected) < 4.0 * error
-
-
-@pytest.mark.claims
-def test_recognition_by_class(paper):
-    table = (
-        (0.747, 0.862, 0.963, 0.996, 0.999),
-        (0.628, 0.738, 0.897, 0.980, 0.996),
-        (0.668, 0.785, 0.917, 0.985, 0.997),
-    )
-    true_class = paper["true_class"].values[:, 0]
-    for s, row in enumerate(table):
-        P = paper["true_class_probability"].values[true_class == s]
-        for second, expected in zip((2, 5, 10, 20, 30), row, strict=True):
-            at = P[:, 2 * second - 1]
-            # Published with M = 20000 and rounded to 0.001.
-            error = math.hypot(at.std() / math.sqrt(len(at)), at.std() / math.sqrt(20000)) + 0.0005
-            assert abs(at.mean() - expected) < 4.0 * error, (s, second, at.mean())
-        first = 0.5 * ((P >= 0.9).argmax(axis=1) + 1)
-        for share, published in ((0.5, (4.0, 5.5, 4.0)[s]), (0.9, (8.0, 12.5, 11.0)[s])):
-            # On a grid of 0.5 s: so many flights are decided at the published quantile, fewer one step before.
-            error = math.sqrt(share * (1.0 - share) * (1.0 / len(first) + 3.0 / 20000))
-            assert (first <= published).mean() > share - 4.0 * error
-            assert (first <= published - 0.5).mean() < share + 4.0 * error
-
-
-@pytest.mark.claims
-def test_calibration(paper):
-    """Classes and types drawn as assumed: mean square error over mean reported variance is 1."""
-    for i, component in enumerate(("range", "range_rate", "acceleration")):
-        for first, last in WINDOWS.values():
-            squares = paper["error"].values[:, first - 1 : last, i] ** 2
-            ratio = squares.mean() / paper[f"variance_{component}"].values[:, first - 1 : last].mean()
-            assert ratio == pytest.approx(1.0, abs=0.03)
-
-
-@pytest.mark.claims
-def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_its_repair():
-    dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 1500)
-    records = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
-    assert records["quasi-optimal", "sure_and_wrong", ""].low > 0.1
-    assert records["joint-type", "sure_and_wrong", ""].high < 0.02
-    cheaper = records["joint-type", "relative_cost_difference", ""]
-    assert cheaper.high < 0.0
 
 
 # --- exact errors
@@ -303,33 +231,6 @@ def test_policies_fit_other_numbers_of_classes_and_types():
     }  # fmt: skip
     dataset = evaluate(ID, list(baselines_of(ID).names), "random", 4, horizon=20, **two)
     assert numpy.isfinite(dataset["cost"].values[:-1]).all()
-
-
-# --- no leak: what is optimal is not beaten
-
-
-def significance(dataset, name, optimum):
-    """Mean cost above the optimum's on the same episodes, in standard errors."""
-    cost = dataset["cost"].mean("time")
-    difference = (cost.sel(policy=name) - cost.sel(policy=optimum)).values
-    return difference.mean() / (difference.std() / math.sqrt(len(difference)) + 1e-300)
-
-
-@pytest.mark.claims
-def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
-    """Types redrawn, nothing refused: posterior weights minimise the mean square error."""
-    names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "paper", 600, **NEVER_REFUSED)
-    for name in names:
-        assert significance(dataset, name, "quasi-optimal") > -3.0, name
-
-
-@pytest.mark.claims
-def test_nothing_beats_the_joint_posterior_for_one_type():
-    names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "fixed-type", 600, **NEVER_REFUSED)
-    for name in names:
-        assert significance(dataset, name, "joint-type") > -3.0, name
 
 
 # --- metrics

@@ -7,12 +7,11 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.envs.contract.model import Model
 from filtergym.envs.drawing import estimate_picture, rendering
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
+from filtergym.envs.maneuvering_target.picture import ellipse_axes
 from filtergym.evaluation.figures.animation import episode_frames, write_animation
 
 from filtergym import evaluate
@@ -137,16 +136,6 @@ def test_history_is_what_info_reports():
     assert not env.picture.history
 
 
-def test_the_covariance_is_drawn_in_square_kilometres():
-    env = TaskEnv(ID, "weights", scenario="paper", render_mode="rgb_array", detailed_info=True)
-    env.reset(seed=2)
-    for _ in range(3):
-        info = env.step(env.action_space.high)[4]
-    assert info["covariance"][0, 1] != 0.0
-    for name, place in {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}.items():
-        assert env.picture.history[f"covariance_{name}"][-1] == info["covariance"][place] / 1e6
-
-
 def test_manoeuvres_are_marked_where_they_are_flown():
     env = played(0, scenario="paper")
     assert env.picture.picture.shading() == [(49.5, 55.5)]
@@ -175,13 +164,6 @@ def test_ellipse_axes_of_a_turned_covariance():
 )
 def test_limits_grow_on_a_ladder(limits, low, high, expected):
     assert rendering.grown(limits, low, high) == pytest.approx(expected, rel=1e-12)
-
-
-def test_task_without_a_picture_of_its_own_gets_the_general_one():
-    model = TaskEnv(ID).model
-    assert isinstance(rendering.picture_of(model), ManeuveringTargetPicture)
-    stranger = type("Stranger", (type(model.task),), {"picture": lambda self, model: None})
-    assert type(rendering.picture_of(Model(stranger(model.task.parameters), "gain"))) is rendering.Picture
 
 
 @pytest.mark.parametrize(("face", "many"), [(TaskEnv, {}), (TaskVectorEnv, {"num_envs": 2})])
