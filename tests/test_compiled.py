@@ -1,7 +1,6 @@
 """Compiled steps: as near to NumPy's as rounding allows, the same bits for every N, everywhere that NumPy goes."""
 
 import multiprocessing
-import pickle
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,12 +10,10 @@ import numpy as np
 import pytest
 from filtergym.envs.engine import compiled as compiled_tasks
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.engine.compiled import CompiledModel
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
-from filtergym.evaluation.running.recording import NoFilter
 from models import KINDS, make_model
 from rounding import assert_same, flown_side_by_side
 
@@ -245,19 +242,6 @@ def test_a_report_that_cannot_be_traced_is_made_with_numpy():
     assert found["largest"][0] == found["cost"].max()
     with pytest.warns(UserWarning, match="is not compiled"):
         model.run(lambda model, episode: float(episode.max()), np.ones((2, 8)))
-
-
-def test_the_task_is_still_what_it_was():
-    model = make_model(MANEUVERING.id, "evidence")
-    fast = CompiledModel(model.task, "evidence")
-    assert fast.task is model.task
-    assert fast.backend == "compiled"
-    assert fast.under("gain").backend == "compiled"
-    assert fast.under("gain").control == "gain"
-    assert fast.fields == model.fields
-    assert fast.on_numpy().backend == "numpy"
-    assert fast.with_filter(lambda other: NoFilter(other.task)).fields == ()
-    assert pickle.loads(pickle.dumps(fast)).backend == "compiled"
 
 
 def test_two_scenarios_share_their_code(tmp_path, monkeypatch):

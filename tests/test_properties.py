@@ -1,119 +1,14 @@
-"""Properties that hold for any sequence of calls, any improbable mode and any flight; examples by hypothesis.
+"""Properties that hold for any improbable mode and any flight; examples by hypothesis.
 
 The profile in ``conftest.py`` draws the same examples in every run.
 """
 
-import functools
-
-import gymnasium as gym
 import numpy as np
-import pytest
 from filtergym.envs.data.trajectory import Trajectory
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
-from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from models import KINDS, make_model
-
-import filtergym  # noqa: F401  (registers the environments)
-
-# --- sequences of reset, masked reset and step against single environments
-
-COUNT = 3
-SEEDS = st.integers(0, 2**31 - COUNT)
-MASKS = st.lists(st.booleans(), min_size=COUNT, max_size=COUNT).filter(any).map(np.array)
-STEPS = st.lists(st.sampled_from(["random", "low", "high"]), min_size=1, max_size=5)
-ROUNDS = st.lists(st.tuples(STEPS, MASKS | st.none(), st.none() | SEEDS), min_size=1, max_size=4)
-"""Some steps, then a reset of some or all, and so on."""
-
-
-def environment_keywords(env_id):
-    """Episodes of two decisions, of two measurements at most."""
-    interval = min(make_model(env_id).task.decision_interval, 2)
-    return {"horizon": 2 * interval, "decision_interval": interval}
-
-
-class Singles:
-    """What a vector environment is: single environments and a rule for those that have finished."""
-
-    def __init__(self, env_id, mode):
-        keywords = environment_keywords(env_id)
-        self.lanes = [gym.make(env_id, disable_env_checker=True, **keywords) for _ in range(COUNT)]
-        self.mode, self.finished, self.shown = mode, np.zeros(COUNT, dtype=bool), [None] * COUNT
-
-    def reset(self, mask, seed):
-        for i, env in enumerate(self.lanes):
-            if mask is None or mask[i]:
-                self.shown[i] = env.reset(seed=None if seed is None else seed + i)[0]
-                self.finished[i] = False
-        return np.stack(self.shown)
-
-    def step(self, actions):
-        """Observations, rewards, who has finished, and the last observations of finished episodes."""
-        paid, truncated, last = np.zeros(COUNT), np.zeros(COUNT, dtype=bool), [None] * COUNT
-        for i, env in enumerate(self.lanes):
-            if self.finished[i]:
-                self.shown[i] = env.reset()[0]
-                continue
-            self.shown[i], paid[i], _, truncated[i], _ = env.step(actions[i])
-            if truncated[i] and self.mode is AutoresetMode.SAME_STEP:
-                last[i], self.shown[i] = self.shown[i], env.reset()[0]
-        self.finished = truncated & (self.mode is not AutoresetMode.SAME_STEP)
-        return np.stack(self.shown), paid, truncated, last
-
-
-@functools.cache
-def both(env_id, mode):
-    """The native vector and its single environments, made once; every example begins with a seeded reset."""
-    keywords = environment_keywords(env_id)
-    native = gym.make_vec(env_id, num_envs=COUNT, autoreset_mode=mode, **keywords)
-    return native, Singles(env_id, mode)
-
-
-def actions_of(kind, space, step):
-    """One action for each environment: at an edge of the space, or random."""
-    if kind == "random":
-        space.seed(step)
-        return np.stack([space.sample() for _ in range(COUNT)])
-    if isinstance(space, gym.spaces.Discrete):
-        return np.full(COUNT, 0 if kind == "low" else space.n - 1)
-    return np.stack([space.low if kind == "low" else space.high] * COUNT)
-
-
-@pytest.mark.parametrize("env_id", KINDS[:2])
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-@settings(max_examples=10)
-@given(seed=SEEDS, rounds=ROUNDS)
-def test_any_sequence_of_calls_equals_single_environments(env_id, mode, seed, rounds):
-    native, singles = both(env_id, mode)
-    np.testing.assert_array_equal(native.reset(seed=seed)[0], singles.reset(None, seed))
-    for kinds, reset_mask, new_seed in rounds:
-        for step, kind in enumerate(kinds):
-            assert_same_step(native, singles, actions_of(kind, native.single_action_space, step))
-        options = {} if reset_mask is None else {"reset_mask": reset_mask.copy()}
-        shown, _ = native.reset(seed=new_seed, options=options)
-        np.testing.assert_array_equal(shown, singles.reset(reset_mask, new_seed))
-    assert_same_step(native, singles, actions_of("random", native.single_action_space, 0))
-
-
-def assert_same_step(native, singles, actions):
-    """Step both, after the reset that has to come first where nothing is reset by itself."""
-    if singles.mode is AutoresetMode.DISABLED and singles.finished.any():
-        with pytest.raises(gym.error.ResetNeeded):
-            native.step(actions)
-        mask = singles.finished.copy()
-        shown, _ = native.reset(options={"reset_mask": mask})
-        np.testing.assert_array_equal(shown, singles.reset(mask, None))
-    shown, paid, terminated, truncated, info = native.step(actions)
-    expected, rewards, finished, last = singles.step(actions)
-    np.testing.assert_array_equal(shown, expected)
-    np.testing.assert_array_equal(paid, rewards)
-    np.testing.assert_array_equal(truncated, finished)
-    assert not terminated.any()
-    for i in np.flatnonzero(finished) if singles.mode is AutoresetMode.SAME_STEP else ():
-        np.testing.assert_array_equal(info["final_obs"][i], last[i])
-
 
 # --- modes of no probability
 
