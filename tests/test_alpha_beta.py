@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 from filtergym.filters import alpha_beta
-from filtergym.filters.alpha_beta import Covariance, ErrorMoments
+from filtergym.filters.alpha_beta import Covariance
+from filtergym.papers.imm_alpha_beta.alpha_beta_errors import (
+    ErrorMoments,
+    propagate_error,
+    variance_reduction,
+)
 
 GAINS = [0.05, 0.3, 0.5, 0.7, 0.95]
 
@@ -31,7 +36,7 @@ def test_benedict_bordner_relation():
 
 
 def test_variance_reduction_golden():
-    ratios = alpha_beta.variance_reduction(0.5, 1 / 6)
+    ratios = variance_reduction(0.5, 1 / 6)
     np.testing.assert_allclose(ratios, [0.4117647, 0.0392157, 0.6470588], rtol=0, atol=5e-8)
 
 
@@ -41,7 +46,7 @@ def test_variance_reduction_is_the_fixed_point_of_the_joseph_recursion(alpha):
     P = Covariance(R, 0.0, 2 * R / T**2)
     for _ in range(2000):
         P = alpha_beta.update_covariance(alpha_beta.predict_covariance(P, T), R, alpha, beta, T)
-    ratios = alpha_beta.variance_reduction(alpha, beta)
+    ratios = variance_reduction(alpha, beta)
     assert P.position == pytest.approx(R * ratios.position, rel=1e-10)
     assert P.velocity == pytest.approx(R * ratios.velocity / T**2, rel=1e-10)
     assert alpha_beta.predict_covariance(P, T).position == pytest.approx(R * ratios.prediction, rel=1e-10)
@@ -57,7 +62,7 @@ def test_acceleration_lag_is_what_a_noiseless_filter_settles_at(alpha):
         truth = 0.5 * a * (k * T) ** 2
         predicted = alpha_beta.predict(position, velocity, T)
         position, velocity = alpha_beta.update(predicted, velocity, truth - predicted, alpha, beta, T)
-        moments = alpha_beta.propagate_error(moments, a * T**2 / 2, a * T, 0.0, alpha, beta, T)
+        moments = propagate_error(moments, a * T**2 / 2, a * T, 0.0, alpha, beta, T)
     assert moments.position == pytest.approx(a * T**2 * (1 - alpha) / beta, rel=1e-12)
     # Positions of 1e7 m leave nine digits behind the point.
     assert truth - position == pytest.approx(a * T**2 * (1 - alpha) / beta, rel=1e-7)
@@ -115,7 +120,7 @@ def test_propagated_error_equals_naive_matrices(seed):
     for _ in range(20):
         a = rng.normal()
         push = np.array([a * T**2 / 2, a * T])
-        moments = alpha_beta.propagate_error(moments, push[0], push[1], R, alpha, beta, T)
+        moments = propagate_error(moments, push[0], push[1], R, alpha, beta, T)
         mean = rest @ (F @ mean + push)
         P = rest @ F @ P @ F.T @ rest.T + R * K @ K.T
         np.testing.assert_allclose([moments.position, moments.velocity], mean, rtol=1e-11, atol=1e-11)

@@ -7,6 +7,10 @@ import numpy
 import pytest
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
+from filtergym.papers.radar_esm_class_fusion.experiment import (
+    channel_error_covariance,
+    information_per_decision,
+)
 
 PARAMETERS = RadarEsmTrackingParameters()
 MODELS, START = RadarEsmTracking.design_models(PARAMETERS)
@@ -133,7 +137,7 @@ def joint_start(target):
 
 def exact_deviations(target, channel):
     channels = class_fusion.design_channels(MODELS, START, 120)
-    errors = class_fusion.channel_error_covariance(MODELS, channels, target, channel, joint_start(target))
+    errors = channel_error_covariance(MODELS, channels, target, channel, joint_start(target))
     return numpy.sqrt(numpy.stack([errors[i, i] for i in range(3)]))
 
 
@@ -168,7 +172,7 @@ def test_exact_errors_in_the_windows():
 def test_a_matched_filter_reports_its_error():
     channels = class_fusion.design_channels(MODELS, START, 40)
     for s in range(3):
-        exact = class_fusion.channel_error_covariance(MODELS, channels, s, s, joint_start(s))
+        exact = channel_error_covariance(MODELS, channels, s, s, joint_start(s))
         assert exact == pytest.approx(channels.covariance[:, :, s], rel=1e-9)
 
 
@@ -180,7 +184,7 @@ def test_information_per_decision():
         numpy.array(PARAMETERS.recognition), numpy.array(PARAMETERS.composition)
     )
     assert probabilities == pytest.approx(1 / 30 + 26 / 30 * numpy.array(PARAMETERS.composition), rel=1e-12)
-    information = class_fusion.information_per_decision(probabilities)
+    information = information_per_decision(probabilities)
     pairs = [information[0, 1], information[0, 2], information[1, 2], information[2, 1]]
     assert pairs == pytest.approx([1.21, 1.47, 0.66, 0.64], abs=0.0055)
 

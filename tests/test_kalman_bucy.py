@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.filters import kalman_bucy, linear_systems
+from filtergym.filters import linear_systems
+from filtergym.papers.kalman_bucy_ins_gnss import kalman_bucy
 from scipy.linalg import solve_continuous_lyapunov
 
 SEEDS = range(5)
