@@ -61,6 +61,7 @@ def shows_what_lies_in_its_space(subject):
         assert (low <= observation).all()
         assert (observation <= high).all()
         if isinstance(env.single_action_space, gym.spaces.Box):
+            assert (env.action_space.low < env.action_space.high).all()
             edge = np.where(rng.random(actions.shape) < 0.5, env.action_space.low, env.action_space.high)
             actions = edge.astype(actions.dtype)
         observation, *_ = env.step(actions)

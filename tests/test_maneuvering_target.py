@@ -390,6 +390,24 @@ def test_gain_action_sets_alpha():
         assert info["alpha"] == pytest.approx(alpha, rel=1e-12)
 
 
+def test_one_filter_says_how_likely_each_measurement_was():
+    model = make_model(ID, "gain", "random", **REGULAR)
+    state, rng = begun(model, 8), np.random.default_rng(1)
+    for _ in range(3):
+        state = model.measure(state, rng.normal(size=(2, 8)))
+        innovation = state.measurement.position - state.filter.predicted
+        S, said = state.filter.innovation_variance, model.records(state)["log_likelihood"]
+        for b in range(8):
+            expected = multivariate_normal.logpdf(innovation[:, b], cov=np.diag(S[:, b]))
+            assert said[b] == pytest.approx(expected, rel=1e-10)
+        state = model.act(state, np.zeros((1, 8)))
+
+
+def test_one_filter_is_no_bank():
+    with pytest.raises(ValueError, match="gains must name at least two filters"):
+        make_model(ID, gains=(0.3,), transition=((1.0,),), initial_probabilities=(1.0,))
+
+
 def test_reward_is_the_compressed_cost_in_units_of_the_papers():
     env = gym.make(ID, control="gain", scenario="paper", reward="cost", detailed_info=True)
     env.reset(seed=0)

@@ -99,6 +99,9 @@ def test_axes_stay_where_they_are_and_hold_the_track():
         if scan in (20, 100):
             env.render()
             assert places() == first
+    numpy.testing.assert_allclose(
+        numpy.ravel(picture.arrived.get_data()), env.fleet.only.state.measurement.position[:, 0] / 1e3
+    )
     left, bottom, right, top = picture.track.viewLim.extents
     x, y = env.picture.history["true_x"], env.picture.history["true_y"]
     assert left < min(x)
