@@ -62,10 +62,8 @@ class InPython(Kalman):
     traceable = False
 
 
-def test_every_shipped_estimator_reference_and_bound_is_traced(env_id, monkeypatch):
-    monkeypatch.setattr(
-        programs, "PROGRAM_CACHE_SIZE", 1
-    )  # those of TightlyCoupledNavigation take 300 MB together
+def test_shipped_estimators_references_and_bounds_are_traced(env_id):
+    """All; of TightlyCoupledNavigation, where they take 300 MB together, every third."""
     known, usual = baselines_of(env_id), SHORT.get(env_id, {"horizon": 40})
     groups = {"estimator": known.estimators, "reference": known.references, "bound": known.bounds}
     for kind, group in groups.items():
