@@ -102,6 +102,10 @@ class Problem:
         """Names of its policies, estimators, smoothers, references and bounds, and of policies that were tuned."""
         return [*self.baselines.names, *self.tuned_policies]
 
+    def has(self, name: str) -> bool:
+        """Whether a name is one of ``names``; what was tuned is read only for a name that ends so."""
+        return name in self.baselines.names or (name.endswith("-tuned") and name in self.tuned_policies)
+
     def competitor(self, name: str) -> Any:
         """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds.
 

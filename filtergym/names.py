@@ -80,7 +80,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))
-    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned_policies):
+    if problem.has(name):
         return problem.competitor(name)
     learned = find_learned_policy(problem.task, name, trust)
     if learned is not None:
@@ -138,7 +138,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     """
 
     def is_module(name: str) -> bool:
-        return name not in problem.names and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
+        return not problem.has(name) and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
 
     for name in names:
         if name.startswith(GATED) and is_module(name.removeprefix(GATED)):
@@ -150,7 +150,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)
-    if inner in problem.names or inner.endswith(SUFFIX):
+    if problem.has(inner) or inner.endswith(SUFFIX):
         return False
     return inner in pretrained_agents(problem.id) or ":" not in inner
 
@@ -251,26 +251,20 @@ def competitors_of(
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     for name, entry in named.items():
-        if _is_competitor(problem, name) and not _is_same(entry, name, find_competitor(problem, name)):
-            raise ValueError(
-                f"{name!r} is the name of what {problem.id} has already: call your own something else"
-            )
+        if type(entry) is str and entry == name:
+            continue
+        if problem.has(name) or name in pretrained_agents(problem.id):
+            known = find_competitor(problem, name)
+            if type(entry) is not type(known) or not bool(entry == known):
+                raise ValueError(
+                    f"{name!r} is the name of what {problem.id} has already: call your own something else"
+                )
     return {
         name: find_competitor(problem, entry, trust)
         if isinstance(entry, str | Path)
         else with_normalisation(entry)
         for name, entry in named.items()
     }
-
-
-def _is_same(entry: Any, *known: Any) -> bool:
-    """Whether what a user gives under a name is one of what the name stands for already."""
-    return any(type(entry) is type(one) and bool(entry == one) for one in known)
-
-
-def _is_competitor(problem: Problem, name: str) -> bool:
-    """Whether a name is that of a competitor of the environment."""
-    return name in problem.names or name in pretrained_agents(problem.id)
 
 
 def evaluation_requests(

@@ -119,10 +119,14 @@ def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
     """Return a dataset with these windows, in place of those that it has."""
+    dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
+    return dataset.assign_coords(window_coords(windows))
+
+
+def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    """Return the coordinates that say what the windows are."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
-    return dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore").assign_coords(
-        window=list(windows), window_first=("window", first), window_last=("window", last)
-    )
+    return {"window": list(windows), "window_first": ("window", first), "window_last": ("window", last)}
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
