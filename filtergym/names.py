@@ -80,13 +80,14 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))
-    if problem.has(name):
-        return problem.competitor(name)
+    own = problem.find(name)
+    if own is not None:
+        return own
     learned = find_learned_policy(problem.task, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
-        return problem.competitor(name)  # says why there is none
+        return problem.competitor(name)  # refuses it
     module, colon, attribute = name.partition(":")
     if not colon:
         for ending in (".zip", ".safetensors", SUFFIX):
@@ -138,7 +139,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     """
 
     def is_module(name: str) -> bool:
-        return not problem.has(name) and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
+        return problem.find(name) is None and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
 
     for name in names:
         if name.startswith(GATED) and is_module(name.removeprefix(GATED)):
@@ -150,7 +151,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)
-    if problem.has(inner) or inner.endswith(SUFFIX):
+    if problem.find(inner) is not None or inner.endswith(SUFFIX):
         return False
     return inner in pretrained_agents(problem.id) or ":" not in inner
 
@@ -253,8 +254,9 @@ def competitors_of(
     for name, entry in named.items():
         if type(entry) is str and entry == name:
             continue
-        if problem.has(name) or name in pretrained_agents(problem.id):
-            known = find_competitor(problem, name)
+        known = problem.find(name)
+        if known is not None or name in pretrained_agents(problem.id):
+            known = find_competitor(problem, name) if known is None else known
             if type(entry) is not type(known) or not bool(entry == known):
                 raise ValueError(
                     f"{name!r} is the name of what {problem.id} has already: call your own something else"

@@ -207,7 +207,7 @@ def run_experiment(
     ]
     if not workers.alone:
         check_sendable(experiment.task, competitors)
-    sizes = [piece.measurements for piece in pieces]
+    sizes = [len(piece.seeds) * piece.horizon for piece in pieces]
     chunks = workers.results(run_piece, pieces, sizes, progress)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     count = len(chunks) // len(competitors)
@@ -235,11 +235,6 @@ class Piece(NamedTuple):
     model: Model | None
     """That was made already, in this process."""
 
-    @property
-    def measurements(self) -> int:
-        """How many there are."""
-        return len(self.seeds) * self.horizon
-
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 """What few estimators and references say: how likely a measurement was."""
@@ -264,18 +259,13 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     if experiment.strict and "lost" in arrays:
         _refuse_losses(piece, arrays["lost"])
     if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
-        arrays["action"] = _limit_actions(model.action_space, flown.action)
+        box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
+        arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
             if name in arrays and numpy.isnan(arrays[name]).all():
                 del arrays[name]
     return arrays
-
-
-def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
-    """Return the actions that are applied, within the limits of their box, ``(episodes, time, A)``."""
-    bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
-    return bounded.reshape(*action.shape[:2], -1)
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
