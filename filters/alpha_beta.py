@@ -146,8 +146,7 @@ class ErrorMoments(NamedTuple):
 
 def propagate_error(
     moments: ErrorMoments,
-    displacement: Array,
-    increment: Array,
+    acceleration: Array,
     R: Array,
     alpha: Array,
     beta: Array,
@@ -157,19 +156,18 @@ def propagate_error(
 
     The error of the filter is linear in its initial error, the measurement noise and what the target does
     beyond straight flight, so its mean and covariance follow without Monte Carlo:
-    ``e(k|k) = (I - K H) (F e + [displacement, increment]) - K v``.
+    ``e(k|k) = (I - K H) (F e + [a T^2 / 2, a T]) - K v``.
 
     Args:
         moments: of the error after the previous update.
-        displacement: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``).
-        increment: what it adds to the velocity, m/s (``a T``).
+        acceleration: a of the manoeuvre, constant in this scan, m/s^2.
         R: variance of the measurement noise, m^2.
         alpha: position gain of this scan.
         beta: velocity gain of this scan.
         T: sampling interval, s.
     """
-    position = moments.position + T * moments.velocity + displacement
-    velocity = moments.velocity + increment
+    position = moments.position + T * moments.velocity + acceleration * T**2 / 2
+    velocity = moments.velocity + acceleration * T
     covariance = update_covariance(predict_covariance(moments.covariance, T), R, alpha, beta, T)
     return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)
 

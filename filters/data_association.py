@@ -81,9 +81,7 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
 def update_position(
     mean: Array,
     covariance: Array,
-    plots: Array,
-    variances: Array,
-    available: Array,
+    plots: tuple[Array, Array, Array],
     detection_probability: float,
     density: Array,
 ) -> Update:
@@ -92,9 +90,8 @@ def update_position(
     Args:
         mean: predicted, ``(n, ...)``.
         covariance: predicted, ``(n, n, ...)``.
-        plots: positions, ``(2, K, ...)``; those that are not available may be anything, NaN too.
-        variances: R of their errors, which are independent, ``(2, K, ...)``.
-        available: above zero where there is a plot, ``(K, ...)``.
+        plots: their positions, ``(2, K, ...)``, where none is anything, NaN too; variances R of their errors, which are
+            independent, ``(2, K, ...)``; and availability, above zero where there is a plot, ``(K, ...)``.
         detection_probability: P_D.
         density: lambda, false plots per unit of area, ``(...)``.
 
@@ -102,14 +99,14 @@ def update_position(
         The update; ``log_likelihood`` is that of the ratio, the squared distance is the mean of those of the plots by
         their beta.
     """
-    xp = namespace(mean)
+    xp, (positions, variances, available) = namespace(mean), plots
     none = math.log(1.0 - detection_probability) + 0.0 * covariance[0, 0]
     # Density is of plots, of their ratio to it the unit is none.
     ratio = math.log(detection_probability / (2.0 * math.pi)) - xp.log(density)
     logarithms, inverses, scaled, distances = [none], [], [], []
-    for i in range(plots.shape[1]):
+    for i in range(positions.shape[1]):
         there = available[i] > 0.0
-        nu = xp.where(there, plots[:, i] - mean[:2], 0.0)
+        nu = xp.where(there, positions[:, i] - mean[:2], 0.0)
         xx, yy = (covariance[j, j] + variances[j, i] for j in range(2))
         inverse, determinant = _invert(xx, covariance[1, 0], yy)
         applied = apply(inverse, nu)
@@ -121,7 +118,7 @@ def update_position(
         distances.append(distance)
     stacked = xp.stack(logarithms)
     beta = imm.softmax(stacked)
-    weights = [beta[i + 1] for i in range(plots.shape[1])]
+    weights = [beta[i + 1] for i in range(positions.shape[1])]
     d = ordered_sum(b * applied for b, applied in zip(weights, scaled, strict=True))
     information = outer(d, d) + ordered_sum(
         b * (inverse - outer(applied, applied))

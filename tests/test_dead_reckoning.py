@@ -76,10 +76,7 @@ def test_filter_is_least_squares_over_the_whole_log():
             d[k][:, None],
             np.ones(1),
             T[[k]],
-            drift=q,
-            acceleration=1.0,
-            correlation_time=tau,
-            deviation=s,
+            dead_reckoning.Noise(q, 1.0, tau, s),
         )
         S = H @ covariance[:, :, 0] @ H.T + r**2 * np.eye(2)
         gain, nu = covariance[:, :, 0] @ H.T @ np.linalg.inv(S), z[k] - H @ mean[:, 0]
@@ -118,10 +115,7 @@ def test_what_the_odometry_does_not_say_is_coasting():
         np.full((2, 1), 99.0),
         np.zeros(1),
         np.array([T]),
-        drift=1.0,
-        acceleration=a,
-        correlation_time=tau,
-        deviation=s,
+        dead_reckoning.Noise(1.0, a, tau, s),
     )
     F = np.eye(6) + T * np.eye(6, k=2)
     F[2:4, 4:] = 0.0

@@ -38,7 +38,7 @@ class AllPlots(KalmanModel):
         if plots is None:
             return super().update_estimate(predicted, measurement, H)
         density = self.density(plots)
-        return data_association.update_position(*predicted, *plots, self.detection_probability, density)
+        return data_association.update_position(*predicted, plots, self.detection_probability, density)
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
         """Tell how well one plot was predicted, nothing of several: densities of different numbers of plots cannot be
@@ -76,5 +76,5 @@ class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
         each = Plots(plots.position[:, :, None], plots.variance[:, :, None], plots.available[:, None])
         density = self.density(plots)
         return data_association.update_position(
-            table.mean, table.covariance, *each, self.detection_probability, density
+            table.mean, table.covariance, each, self.detection_probability, density
         )

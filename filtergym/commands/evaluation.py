@@ -371,11 +371,8 @@ def write(
     if outputs.folder is not None and outcome.curves is not None:
         if outcome.has_truth:
             settings = settings_of(command_line())
-            results = [
-                result_of(
-                    problem, outcome.dataset, outcome.records, outcome.curves, learned, explained, worst
-                )
-            ]
+            found = result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned, explained)
+            results = [found._replace(worst=list(worst))]
         whole = outcome.dataset.drop_dims(
             "drawn_episode", errors="ignore"
         )  # the track is for the report alone
