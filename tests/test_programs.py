@@ -75,14 +75,17 @@ for k, line in enumerate(sys.stdin):
             print("debugging")
         if how == "twice":
             print(json.dumps(own))
-        if how == "flood":
-            while True:
-                print("x" * 10_000, end="")
         if how == "errors":
             print("e" * 1_000_000, file=sys.stderr)
         if how == "one track":
             own["mean"][0][0] = None
+        if how == "flood":
+            while True:
+                print("x" * 10_000, end="")
     tell(own)
+    if k == 3 and how == "afterwards":
+        time.sleep(0.1)
+        tell(own)
 """
 
 
@@ -109,6 +112,7 @@ def hold(tmp_path):
 def run(command, steps=4, N=8, **limits):
     """Ask a program about some measurements; returns means ``(steps, 2, N)``, and the estimator."""
     estimator = Program(command, Limits(**limits))(task_of())
+    estimator.last = steps
     initial, measurement = given(N)
     memory, means = estimator.start(initial, N), []
     for _ in range(steps):
@@ -164,6 +168,7 @@ def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
         ("words", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
         ("prints", WRONG, 2, "it has answered with no object of JSON: 'debugging"),
         ("twice", WRONG, 3, "it has written more than an answer"),
+        ("afterwards", WRONG, 3, "it has written more than an answer"),
         ("flood", WRONG, 2, "it has answered with a line of more than"),
         ("no hello", WRONG, 0, "it has answered with no object of JSON: 'welcome"),
         ("no licence", ENDED, 0, "it has ended with exit status 1: RuntimeError: no licence"),

@@ -118,7 +118,7 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
         )
     if answers_by_track(competitor):
         competitor = competitor.of_episodes(model.task, seeds)
-    return put_in_loop(model, competitor, kind, name, len(seeds))
+    return put_in_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
 
 
 def _smoothed_estimates(
