@@ -308,7 +308,7 @@ def looped(policy, seeds, begin=True, **keywords):
 class TestMadePolicy:
     @pytest.mark.parametrize(
         "name",
-        ["imm", "adaptive", "fixed-best", "random", "imm-tuned", "adaptive-rearm-tuned", "ppo", "bptt"],
+        ["imm", "adaptive", "random", "adaptive-rearm-tuned", "ppo"],
     )
     def test_a_loop_costs_what_an_evaluation_says(self, name):
         dataset = evaluate(ID, [name], episodes=3, **SHORT)
