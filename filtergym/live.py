@@ -78,7 +78,7 @@ def online(
             None if log is None else log.plane,
         ),
     )
-    own = control_of(maker, kind, control, problem.task, name)
+    own = control_of(maker, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
     range = training_range(problem.task, maker)
     if range is None:

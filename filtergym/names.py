@@ -333,7 +333,7 @@ def make_policy(
     if control is not None or scenario is not None or keywords:
         raise ValueError("control, scenario and parameters are the environment's own: leave them out")
     name, maker = _named_policy(problem, policy, trust)
-    control_of(maker, "policy", model.control, problem.task, name)
+    control_of(maker, model.control, problem.task, name)
     keywords = getattr(maker, "task_keywords", {})
     for parameter, value in keywords.items():
         own = getattr(model.task.parameters, parameter)
@@ -355,7 +355,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
         trust: likewise.
     """
     name, maker = _named_policy(problem, policy, trust)
-    control = control_of(maker, "policy", experiment.control, problem.task, name)
+    control = control_of(maker, experiment.control, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
     model = make_model(problem.task, control, experiment.scenario, backend=experiment.backend, **keywords)
     return _stepping(name, maker, model, experiment.scenario, keywords)

@@ -37,12 +37,11 @@ if TYPE_CHECKING:
     import xarray
 
 
-def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
     """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
 
     Args:
         maker: of the competitor, or the competitor itself.
-        kind: what it is.
         control: that is demanded; None demands none.
         cls: the environment.
         name: of the competitor, in errors.
@@ -52,7 +51,7 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     """
     if control is not None and not isinstance(control, str):  # an array equals no word, and no truth
         raise nearest("control", control, cls.controls)
-    if kind != "policy":
+    if kind_of(maker) != "policy":
         return cls.controls[0]
     own = getattr(maker, "control", None)
     space = getattr(maker, "action_space", None)
@@ -395,7 +394,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
-        controls[name] = control_of(maker, kinds[name], control, cls, name)
+        controls[name] = control_of(maker, control, cls, name)
         models[name] = experiment.make_model(maker, controls[name])
     for name, model in models.items():
         check_observation(model, competitors[name], name)
