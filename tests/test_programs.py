@@ -434,19 +434,6 @@ def test_the_filter_in_cpp_is_the_one_in_numpy(tmp_path, examples):
 
 
 @pytest.mark.slow
-def test_the_node_of_ros_is_typed(tmp_path):
-    api = pytest.importorskip("mypy.api")
-    words = [
-        "--ignore-missing-imports",
-        "--check-untyped-defs",
-        "--follow-imports=silent",
-        f"--cache-dir={tmp_path}",
-    ]
-    said, errors, code = api.run([*words, str(CLIENTS / "ros2_bridge.py")])
-    assert code == 0, said + errors
-
-
-@pytest.mark.slow
 def test_jobs_run_a_process_each_and_find_the_same(tmp_path):
     """A script that imports what lies beside it, in processes that begin without their folder on the path."""
     shutil.copy(CLIENTS / "client.py", tmp_path)

@@ -186,6 +186,8 @@ def test_episodes_go_on_in_another_process(id, short, elsewhere):
         continued(env, actions[:2])
         there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
         assert_all_equal(continued(env, actions[2:]), there)
+        again = elsewhere.submit(make, env.spec if make is gym.make else id).result(timeout=120)
+        assert again.unwrapped.task.id == id
 
 
 # --- keywords
@@ -411,16 +413,3 @@ def test_copies_of_what_is_wrapped(way):
     other = WAYS[way](env)
     assert other.spec == env.spec
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-
-
-@pytest.mark.slow
-def test_specs_are_enough_for_spawned_processes():
-    here = gym.make(ID, scenario=FLIGHT, dtype="float32", horizon=4)
-    make = functools.partial(gym.make, here.spec)
-    there = gym.vector.AsyncVectorEnv([make], context="spawn")
-    try:
-        together, _ = there.reset(seed=8)
-        assert together.dtype == np.float32
-        np.testing.assert_array_equal(together[0], here.reset(seed=8)[0])
-    finally:
-        there.close()

@@ -93,16 +93,6 @@ def test_an_honest_submission_holds(name, honest, command):
     assert f"SHA-256 {digest}" in shown
 
 
-@pytest.mark.slow
-def test_what_runs_is_the_text_wherever_it_runs(honest):
-    """The module that was packed is not there any more; two processes find what one has found."""
-    assert "own_filter" not in sys.modules
-    alone = verify(honest / "source.json", trust=True)
-    with Workers(2) as workers:
-        shared = verify(honest / "source.json", trust=True, workers=workers)
-    assert alone.deviation.size == shared.deviation.size == 0.0
-
-
 def test_results_are_those_of_an_evaluation(honest):
     from filtergym import evaluate, tidy_records
 
@@ -183,18 +173,11 @@ def test_rounding_holds_and_times_are_not_compared(honest):
     slower = [msgspec.structs.replace(f, value=3.0 * f.value) if f.metric == TIME else f for f in known]
     assert slower != list(known)
     assert deviation(slower, known) == (0.0, "")
-
-
-def test_what_is_no_number_never_holds(found):
-    import msgspec
-
     for number in (math.nan, None):
         for name in ("value", "low"):
-            odd = [msgspec.structs.replace(f, **{name: number}) for f in found]
-            assert not deviation(found, odd).holds
-    assert not deviation(odd, found).holds
-    nothing = [msgspec.structs.replace(f, value=None, low=None, high=None) for f in found]
-    assert not deviation(nothing, nothing).holds
+            odd = [msgspec.structs.replace(f, **{name: number}) for f in known]
+            assert not deviation(known, odd).holds
+            assert not deviation(odd, known).holds
 
 
 # --- arrays swapped
@@ -388,8 +371,6 @@ def test_what_is_packed_or_large_is_refused(command, tmp_path):
     with large.open("wb") as file:
         file.truncate(100 * MOST_BYTES)  # takes no room on the disk
     assert "is larger than 8 MB" in refused(command, large)
-    (tmp_path / "deep.json").write_bytes(b"[" * 1_000_000)
-    assert "holds no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "deep.json").write_bytes(b'{"card":' + b'{"title":' * 100_000)
     assert "holds no submission" in refused(command, tmp_path / "deep.json")
     (tmp_path / "named.json").write_text(json.dumps({"x" * 10_000: 0}))
