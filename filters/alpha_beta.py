@@ -146,7 +146,7 @@ class ErrorMoments(NamedTuple):
 
 def propagate_error(
     moments: ErrorMoments,
-    acceleration: Array,
+    push: tuple[Array, Array],
     R: Array,
     alpha: Array,
     beta: Array,
@@ -156,18 +156,19 @@ def propagate_error(
 
     The error of the filter is linear in its initial error, the measurement noise and what the target does
     beyond straight flight, so its mean and covariance follow without Monte Carlo:
-    ``e(k|k) = (I - K H) (F e + [a T^2 / 2, a T]) - K v``.
+    ``e(k|k) = (I - K H) (F e + push) - K v``.
 
     Args:
         moments: of the error after the previous update.
-        acceleration: a of the manoeuvre, constant in this scan, m/s^2.
+        push: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``), and to the velocity, m/s
+            (``a T``).
         R: variance of the measurement noise, m^2.
         alpha: position gain of this scan.
         beta: velocity gain of this scan.
         T: sampling interval, s.
     """
-    position = moments.position + T * moments.velocity + acceleration * T**2 / 2
-    velocity = moments.velocity + acceleration * T
+    position = moments.position + T * moments.velocity + push[0]
+    velocity = moments.velocity + push[1]
     covariance = update_covariance(predict_covariance(moments.covariance, T), R, alpha, beta, T)
     return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)
 

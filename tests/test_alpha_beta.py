@@ -123,7 +123,7 @@ def test_propagated_error_equals_naive_matrices(seed):
     for _ in range(20):
         a = rng.normal()
         push = np.array([a * T**2 / 2, a * T])
-        moments = alpha_beta.propagate_error(moments, a, R, alpha, beta, T)
+        moments = alpha_beta.propagate_error(moments, push, R, alpha, beta, T)
         mean = rest @ (F @ mean + push)
         P = rest @ F @ P @ F.T @ rest.T + R * K @ K.T
         np.testing.assert_allclose([moments.position, moments.velocity], mean, rtol=1e-11, atol=1e-11)
@@ -143,7 +143,7 @@ def test_propagated_error_equals_simulation():
         predicted = alpha_beta.predict(position, velocity, T)
         z = truth + np.sqrt(R) * rng.normal(size=runs)
         position, velocity = alpha_beta.update(predicted, velocity, z - predicted, alpha, beta, T)
-        moments = alpha_beta.propagate_error(moments, a, R, alpha, beta, T)
+        moments = alpha_beta.propagate_error(moments, (a * T**2 / 2, a * T), R, alpha, beta, T)
     errors = np.stack([truth - position, rate - velocity])
     covariance = as_matrix(moments.covariance)
     standard_error = np.sqrt(np.diag(covariance) / runs)

@@ -258,7 +258,7 @@ def exact_mean_squares(alpha):
     squares = []
     for k in range(1, 101):
         a = -2.775 if 50 <= k <= 55 else 0.0
-        moments = alpha_beta.propagate_error(moments, a, R[k], alpha, beta, T)
+        moments = alpha_beta.propagate_error(moments, (a * T**2 / 2, a * T), R[k], alpha, beta, T)
         P = moments.covariance
         squares.append((moments.position**2 + P.position, moments.velocity**2 + P.velocity))
     return np.array(squares)

@@ -58,7 +58,7 @@ CALLS = [
     (alpha_beta.variance_reduction, (ALPHA, BETA)),
     (
         alpha_beta.propagate_error,
-        (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),
+        (alpha_beta.ErrorMoments(Z2, Z2, P2), (Z2, Z2), np.abs(Z2), ALPHA, BETA, 6.0),
     ),
     (alpha_beta.left_by_acceleration, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
