@@ -31,7 +31,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from pictures import draw_differences, draw_learning_curves
+from pictures import draw_learning_curves
 from records import read_benchmark, recorded_environments
 
 from filtergym import evaluate, record
@@ -126,12 +126,11 @@ def test_kinds_always_look_the_same(curves):
             for name in set(other) & set(look)
             for key in ("color", "linestyle")
         )
-    for _, figure in evaluation_figures(curves, highlight=list(dashes)):
-        for axis in figure.axes:
-            for label, line in named(axis).items():
-                name = label.partition(" = ")[0]
-                if name in dashes:
-                    assert line.get_linestyle() == dashes[name]
+    drawn = {
+        label.partition(" = ")[0]: line.get_linestyle()
+        for label, line in named(draw_error_over_time(curves, look).axes[0]).items()
+    }
+    assert drawn == dashes
 
 
 def test_who_is_told_apart_may_be_asked_for(curves):
@@ -265,15 +264,6 @@ def test_svg_holds_text_and_pdf_its_fonts(curves, tmp_path):
     with pytest.raises(ValueError, match="written as png, svg or pdf, got 'gif'"):
         save(figure, tmp_path / "a.gif")
     assert not (tmp_path / "a.gif").exists()
-
-
-def test_other_figures_are_as_wide(tmp_path):
-    curve = {"ppo": [([1e5, 1e6], [1.0, -0.1])]}
-    differences = {"paper": {"ppo": (-10.0, -12.0, -8.0)}}
-    for columns in (1, 2):
-        learning = draw_learning_curves(curve, "title", "imm", columns=columns)
-        compared = draw_differences(differences, ["ppo"], ["ppo"], [], "title", "imm", columns=columns)
-        assert learning.get_figwidth() == compared.get_figwidth() == WIDTHS[columns]
 
 
 def test_learning_curves_are_median_and_range_over_runs():

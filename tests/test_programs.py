@@ -25,12 +25,10 @@ from filtergym.evaluation.competitors.programs import (
     limit_programs,
     rows_of,
 )
-from filtergym.evaluation.running.parallel import Workers
 from filtergym.evaluation.running.rollout import measure_time, rollout, start_lanes
 from filtergym.evaluation.storage.dataset import FAULTS
 from models import make_model
 
-import filtergym
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -431,19 +429,3 @@ def test_the_filter_in_cpp_is_the_one_in_numpy(tmp_path, examples):
     ]
     subprocess.run([*words, "-o", tmp_path / "kalman"], check=True)
     agree(Program(str(tmp_path / "kalman")), examples("mine:Mine"))
-
-
-@pytest.mark.slow
-def test_jobs_run_a_process_each_and_find_the_same(tmp_path):
-    """A script that imports what lies beside it, in processes that begin without their folder on the path."""
-    shutil.copy(CLIENTS / "client.py", tmp_path)
-    (tmp_path / "hold.py").write_text(
-        "from client import serve\n"
-        "serve(lambda hello, initial: lambda measurement: (initial['mean'], initial['covariance']))\n"
-    )
-    program = {"hold": Program(f"{sys.executable} {tmp_path / 'hold.py'}"), "imm": "imm"}
-    alone = filtergym.evaluate(ID, program, episodes=600, horizon=3)
-    with Workers(2) as workers:
-        shared = filtergym.evaluate(ID, program, episodes=600, horizon=3, workers=workers)
-    assert not np.nan_to_num(alone["lost"]).any()
-    assert shared.identical(alone)
