@@ -83,18 +83,13 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
     return Losses(int(lost.sum()), i, int(losses[i, 0]), int(losses[i, 1]))
 
 
-def fits_classic(dataset: "xarray.Dataset") -> bool:
-    """Whether NetCDF's classic format, which needs nothing but SciPy, has room for every variable."""
-    return all(variable.nbytes <= MOST_BYTES for variable in dataset.variables.values())
-
-
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
     """Write an evaluation in NetCDF's classic format with 64-bit offsets, which R, MATLAB and most others open.
 
     Raises:
         ValueError: if a variable is too large for it, or the file cannot be written.
     """
-    if not fits_classic(dataset):
+    if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(
             f"a variable is larger than {MOST_BYTES:,} bytes, what NetCDF's classic format takes"
         )
