@@ -120,7 +120,7 @@ def test_propagated_error_equals_naive_matrices(seed):
     for _ in range(20):
         a = rng.normal()
         push = np.array([a * T**2 / 2, a * T])
-        moments = propagate_error(moments, push[0], push[1], R, alpha, beta, T)
+        moments = propagate_error(moments, push, R, alpha, beta, T)
         mean = rest @ (F @ mean + push)
         P = rest @ F @ P @ F.T @ rest.T + R * K @ K.T
         np.testing.assert_allclose([moments.position, moments.velocity], mean, rtol=1e-11, atol=1e-11)

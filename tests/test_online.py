@@ -53,7 +53,7 @@ def test_the_same_measurements_give_the_same_bits(id, name, options, monkeypatch
     keywords.pop("scenario", None)
     kind = kind_of(maker)
     model = make_model(
-        problem.task, control_of(maker, kind, None, problem.task, name), scenario, backend="auto", **keywords
+        problem.task, control_of(maker, None, problem.task, name), scenario, backend="auto", **keywords
     )
     flown = run_competitor(model, maker, kind, seeds, with_measurement)
     begun = []

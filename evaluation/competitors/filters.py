@@ -480,7 +480,9 @@ def _can_be_traced(maker: Any, own: Filter) -> bool:
     return True
 
 
-def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int) -> Model:
+def put_in_loop(
+    model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
+) -> Model:
     """Return a model whose filter is a competitor.
 
     Args:
@@ -489,6 +491,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
         kind: what it is.
         name: of it, in errors.
         count: number of episodes.
+        last: number of their last measurement; None: not known.
 
     Raises:
         ValueError: if it cannot be made, or has not the methods of its kind.
@@ -496,7 +499,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
     if isinstance(own, ProgramEstimator):
-        own.tracks = count
+        own.tracks, own.last = count, last
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:
