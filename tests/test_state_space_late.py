@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import scipy
-from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended, InteractingKalman, Unscented
 from filtergym.envs.contract.filter import Input
 from filtergym.envs.engine.backend import make_model
@@ -102,11 +101,3 @@ def test_every_backend_and_the_reference_take_in_what_comes_late(make):
     np.testing.assert_allclose(imm, extended, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(known, extended, rtol=1e-9, atol=1e-9)
     assert np.abs(dropped - extended).max() > 0.1
-
-
-def test_without_late_measurements_nothing_is_kept(make):
-    task = make_model(make(), backend="numpy").task
-    start, kept = simulate(make(), 1, 2)
-    assert kept[0][1].late is None
-    assert Extended(task).start(start.measurement)._fields == ("mean", "covariance", "likelihood")
-    assert "late" in problem_of(make().id).task.scenarios
