@@ -119,6 +119,9 @@ def test_alignment_finds_attitude_and_bias(pyins):
     assert np.linalg.norm(left) == pytest.approx(geodesy.EARTH_RATE, rel=0.01)
 
 
+BACKWARD = "rate_x", "rate_y", "acceleration_x", "acceleration_y"
+
+
 def changed(table, columns, change):
     """A copy of a table, some columns of it replaced."""
     columns = [*columns]
@@ -130,23 +133,11 @@ def changed(table, columns, change):
     [
         (lambda t: changed(t, ACCELERATIONS, lambda a: a / 9.80665), "at rest is 0.995 m/s.2 .* units of g"),
         (lambda t: changed(t, ["acceleration_z"], lambda a: a + 9.8), "gravity was taken out"),
-        (
-            lambda t: changed(t, RATES, lambda a: 180.0 / np.pi * a),
-            "mean rate at rest is 13.* check the unit",
-        ),
-        (
-            lambda t: changed(t, RATES, np.radians),
-            "a turn of 1 the fixes have one of 60: check the unit of the rates",
-        ),
-        (
-            lambda t: changed(t, ["acceleration_y", "acceleration_z"], lambda a: -a),
-            r"mounting, \(180, 0, 0\)",
-        ),
+        (lambda t: changed(t, RATES, lambda a: 180.0 / np.pi * a), "mean rate at rest is 13.* check the unit"),
+        (lambda t: changed(t, RATES, np.radians), "a turn of 1 the fixes have one of 60: check the unit of the rates"),
+        (lambda t: changed(t, ["acceleration_y", "acceleration_z"], lambda a: -a), r"mounting, \(180, 0, 0\)"),
         (lambda t: changed(t, ["rate_z"], lambda a: -a), "a turn of 1 the fixes have one of -1"),
-        (
-            lambda t: changed(t, ["rate_x", "rate_y", "acceleration_x", "acceleration_y"], lambda a: -a),
-            "a change of speed of 1 the fixes have one of -0.99",
-        ),
+        (lambda t: changed(t, BACKWARD, lambda a: -a), "a change of speed of 1 the fixes have one of -0.99"),
         (lambda t: changed(t, ["time"], lambda a: a + 1e5), "they need one clock"),
         (lambda t: changed(t, ["time"], lambda a: 1e3 * a), "25 s apart .* milliseconds"),
         (lambda t: changed(t, ["time"], lambda a: a[::-1].to_numpy()), "times of the .* IMU must increase"),
@@ -154,12 +145,9 @@ def changed(table, columns, change):
         (lambda t: t[t["time"] > 7.0], "standstill of 5 s at the beginning"),
         (lambda t: t[t["time"] < 8.0], "nothing between the standstill and the last fix"),
         (lambda t: t.drop(columns="rate_x"), "lack the column rate_x"),
-        (
-            lambda t: changed(t, ["rate_x"], lambda a: a.where(a.index != 7)),
-            "row 7 of the IMU has a cell without",
-        ),
+        (lambda t: changed(t, ["rate_x"], lambda a: a.where(a.index != 7)), "row 7 of the IMU has a cell without"),
     ],
-)
+)  # fmt: skip
 def test_what_no_imu_says_is_refused(pyins, log, change, sentence):
     imu, fixes, _ = log
     with pytest.raises(ValueError, match=sentence):
