@@ -81,14 +81,12 @@ def flown_ways(folder, command):
     with xarray.open_dataset(folder / "own.nc", engine="scipy") as data:
         data = data.load()
     names = data.assign_coords(recording=("episode", np.array([CLASS, NAME])))
+    words = dict.fromkeys(("environment", "parameters", "source", "licence", "history"), NAME)
+    parameters = json.dumps({"horizon": NAME, NAME: NAME})
     contents = {
         "environment": data.assign_attrs(environment=NAME),
-        "every": names.assign_attrs(
-            dict.fromkeys(("environment", "parameters", "source", "licence", "history"), NAME)
-        ),
-        "parameters": names.assign_attrs(
-            parameters=json.dumps({"horizon": NAME, NAME: NAME}), source=NAME, control=CLASS
-        ),
+        "every": names.assign_attrs(words),
+        "parameters": names.assign_attrs(parameters=parameters, source=NAME, control=CLASS),
     }
     paths = []
     for name, content in contents.items():
@@ -101,9 +99,8 @@ def flown_ways(folder, command):
         "environment": [NAME] * 8,
         "recording": [NAME] * 8,
     }
-    tracks = {name: plots[name] for name in ("time", "x", "y")} | {
-        name: [NAME] * 8 for name in ("flight", "callsign", "icao24", "environment")
-    }
+    tracks = {name: plots[name] for name in ("time", "x", "y")}
+    tracks |= dict.fromkeys(("flight", "callsign", "icao24", "environment"), [NAME] * 8)
     for table in (plots, tracks):
         for suffix in (".csv", ".json", ".parquet"):
             paths.append(folder / f"{len(table)}{suffix}")
@@ -137,13 +134,11 @@ def flown_ways(folder, command):
     yield "recording from JSON", lambda: gym.make(ENV, scenario={"measurements": {}, "environment": NAME})
 
 
-def spec_ways(folder):
+def spec_ways(folder, command):
     """Specifications of environments, as data sets of Minari hold them."""
     text = gym.make(ENV, horizon=8).spec.to_json()
-    for said in (
-        text.replace(f'"task": "{ENV}"', f'"task": "{NAME}"'),
-        text.replace(f'"{ENV}"', f'"{NAME}"'),
-    ):
+    task = text.replace(f'"task": "{ENV}"', f'"task": "{NAME}"')
+    for said in (task, text.replace(f'"{ENV}"', f'"{NAME}"')):
         assert said != text
         spec = gym.envs.registration.EnvSpec.from_json(said)
         yield "gym.make(spec)", lambda spec=spec: gym.make(spec)
@@ -211,11 +206,8 @@ def agent_ways(folder, command):
         if path.suffix:
             yield f"read_arrays {path.name}", lambda path=path: read_arrays(path)
             continue
-        for words in (
-            ("export", path),
-            ("seeds", path, *SHORT[:2]),
-            ("train", ENV, "--out", path, "--algo", "bptt", "--resume"),
-        ):
+        resumed = ("train", ENV, "--out", path, "--algo", "bptt", "--resume")
+        for words in (("export", path), ("seeds", path, *SHORT[:2]), resumed):
             yield f"{words[0]} {path.name}", lambda words=words: command(*words)
         yield f"load_run {path.name}", lambda path=path: load_run(path)
 
@@ -269,11 +261,8 @@ def results_ways(folder, command):
         yield f"read_results {i}", lambda path=path: read_results(path)
     with xarray.open_dataset(folder / "out" / "results.nc", engine="scipy") as data:
         data = data.load()
-    for attrs in (
-        {"environment": NAME},
-        dict.fromkeys(data.attrs, NAME),
-        {"paper": CLASS, "reference": CLASS},
-    ):
+    others = dict.fromkeys(data.attrs, NAME), {"paper": CLASS, "reference": CLASS}
+    for attrs in ({"environment": NAME}, *others):
         yield "tidy_records", lambda attrs=attrs: tidy_records(data.assign_attrs(attrs))
         data.assign_attrs(attrs).to_netcdf(folder / "told.nc", engine="scipy", format="NETCDF3_64BIT")
         yield "an evaluation as scenario", lambda: gym.make(ENV, scenario=str(folder / "told.nc"))
@@ -282,11 +271,8 @@ def results_ways(folder, command):
     store.write(work, 1.0)
     [kept] = (folder / "kept").iterdir()
     named = {"name": CLASS, "kind": CLASS, "control": NAME, "head": CLASS}
-    for content in (
-        pickle.dumps(Executed()),
-        msgspec.msgpack.encode(named),
-        msgspec.msgpack.encode([CLASS] * 4),
-    ):
+    packed = [msgspec.msgpack.encode(each) for each in (named, [CLASS] * 4)]
+    for content in (pickle.dumps(Executed()), *packed):
         kept.write_bytes(content)
         yield "what a store keeps", lambda: store.read(work, Summary)
     name = "unfinished/ManeuveringTarget-v0.paper.2.test0.json"
@@ -300,8 +286,8 @@ def results_ways(folder, command):
 def test_a_name_that_was_read_from_a_file_imports_nothing(folder, command, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "sets"))
     tried, executed = 0, []
-    for ways in (flown_ways, minari_ways, agent_ways, settings_ways, results_ways, None):
-        for name, way in spec_ways(folder) if ways is None else ways(folder, command):
+    for ways in (flown_ways, minari_ways, agent_ways, settings_ways, results_ways, spec_ways):
+        for name, way in ways(folder, command):
             with suppress(Exception), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 way()
@@ -319,7 +305,7 @@ def test_a_name_that_was_read_from_a_file_imports_nothing(folder, command, monke
     assert sentence in command("evaluate", "--recording", "environment.nc", "--policy", "imm")[2]
 
 
-@pytest.mark.parametrize("words", [("-m", "filtergym"), ("-mfiltergym",), ("-bmfiltergym",)])
+@pytest.mark.parametrize("words", [("-m", "filtergym"), ("-bmfiltergym",)])
 def test_the_module_imports_nothing_of_the_working_directory(tmp_path, words):
     """As the command: libraries that the package imports before the first line of its ``__main__``, too."""
     for name in ("numpy", "gymnasium", "typing", "ast", "typer", "rich"):

@@ -86,9 +86,8 @@ def test_free_ins_stays_near_the_truth(pyins, tmp_path):
     # 50 m of 20 s are 12 m of 10 s.
     assert abs(recorded.measurements["ins"] - recorded.truth).max() < 4.0
     assert abs(recorded.measurements["ins"] - recorded.truth)[:, 0].max() < 0.1
-    noise = (recorded.measurements["fix"] - recorded.truth) / recorded.measurements["reported_deviation"][
-        ..., None
-    ]
+    stated = recorded.measurements["reported_deviation"][..., None]
+    noise = (recorded.measurements["fix"] - recorded.truth) / stated
     assert noise.std() == pytest.approx(1.0, abs=0.3)  # three deviations of 42 numbers
     path = Drive(SECONDS)
     known = np.stack([path.east, path.north], axis=1)[:: round(0.5 * RATE)][49:71]
