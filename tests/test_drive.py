@@ -10,7 +10,6 @@ import xarray
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
 from filtergym.envs.data import strapdown
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
-from filtergym.filters import loosely_coupled as ins_gnss
 from models import make_model
 
 from filtergym import evaluate, read_recording
@@ -55,39 +54,6 @@ def test_free_ins_of_a_constant_acceleration_error(pyins):
     np.testing.assert_allclose([east, north], expected, atol=0.1)
     down = 0.5 * error * (times - times[0]) ** 2
     np.testing.assert_allclose(found["alt"], HEIGHT - down, atol=0.1)
-
-
-LEVELS = {"drift": 0.3, "coloured": 0.5, "correlation_time": 4.0, "white_intensity": 0.02}
-
-
-def test_modelled_error_is_the_filters_own():
-    levels = {**drive.PARAMETERS, **LEVELS}
-    p = make_model("filtergym/LooselyCoupledNavigation-v0", scenario="paper", **levels).task.parameters
-    covariance, expected = p.prior_covariance(np.zeros(())), []
-    for _ in range(81):
-        covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.variance_growth)
-        expected.append(covariance.position)
-    found = drive.modelled(0.25 * np.arange(1, 82), LEVELS)
-    np.testing.assert_allclose(np.diag(found), expected, rtol=1e-9)
-    assert np.linalg.eigvalsh(found).min() > 0.0
-
-
-def test_likeliest_levels_are_those_of_the_model():
-    """Of 400 windows drawn from it: what a filter sees, the growth of the error, is met."""
-    time = 0.25 * np.arange(1, 82)
-    factor = np.linalg.cholesky(drive.modelled(time, LEVELS))
-    generator = np.random.default_rng(5)
-    error = (factor @ generator.standard_normal((81, 800))).T.reshape(400, 2, 81).transpose(0, 2, 1)
-    truth = np.zeros((400, 82, 2))
-    ins = np.concatenate([np.zeros((400, 1, 2)), error], axis=1)
-    fix = 1.414 * generator.standard_normal((400, 81, 2))
-    recorded = drive.dataset(truth, ins, fix, 1.414, np.arange(400.0))
-    levels, likelihood = drive.likeliest(recorded)
-    found, expected = (np.diag(drive.modelled(time, each))[[3, 19, 80]] for each in (levels, LEVELS))
-    assert abs(np.log(found / expected)).max() < 0.2
-    worse = drive.likeliest(recorded, 0.2)
-    assert worse[0]["correlation_time"] == pytest.approx(0.2)
-    assert worse[1] < likelihood
 
 
 @pytest.fixture(scope="module")
