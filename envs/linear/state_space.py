@@ -27,7 +27,7 @@ from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
-from .equations import Equations, Passage, StateSpaceDefinition
+from .equations import Equations, Measurement, Passage, StateSpaceDefinition
 from .inputs import InputCourses
 from .live import StateSpaceInput
 from .logs import state_space_log_format
@@ -77,19 +77,6 @@ class Truth(NamedTuple):
     """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
     sensors: SensorStates | None = None
     """Where the sensors stand; None where nothing is to be remembered."""
-
-
-class Measurement(NamedTuple):
-    """What the sensors say."""
-
-    values: Array
-    """``(m, N)``; zero where nothing was received, where an estimator gets NaN."""
-    available: Array
-    """1 where a value was received, 0 where not, ``(m, N)``."""
-    interval: Array | None = None
-    """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
-    inputs: Array | None = None
-    """What is told of the inputs that acted in that time, ``(p, N)``; None where the model has none."""
 
 
 class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
