@@ -163,7 +163,7 @@ def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flo
 
 def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ValueError, match="is not installed; .* pip install --no-deps"):
+    with pytest.raises(ValueError, match=r"is not installed; .* pip install --no-deps"):
         make_model(ID, scenario="traffic:quickstart")
     folder = tmp_path / "traffic" / "data" / "samples" / "collections"
     folder.mkdir(parents=True)
@@ -487,12 +487,6 @@ def test_flights_of_the_same_name_are_not_pieces_of_one():
     assert set(evaluate(ID, ["zero"], [one, two, three_], 3)["flight"].values) == {
         f"trajectory {i}" for i in (1, 2, 3)
     }
-
-
-def test_one_flight_of_a_file_is_the_trajectory_itself(tmp_path):
-    flight_file(tmp_path / "one.csv")
-    model = make_model(ID, scenario=tmp_path / "one.csv")
-    assert model.task.parameters == make_model(ID, scenario=Trajectory(FIVE, weave(FIVE))).task.parameters
 
 
 def test_a_horizon_ends_every_flight_and_decisions_that_hold_fit():

@@ -2,7 +2,6 @@
 
 import json
 import random
-import shutil
 import warnings
 
 import commands
@@ -151,19 +150,6 @@ def test_results(tmp_path, command):
         command("record", file, "--into", tmp_path / "records", program=commands.main)
         if i % 3 == 0:
             command("report", file, "--out", tmp_path / "report.html")
-
-
-def test_records_of_training(tmp_path, command):
-    rng, folder = random.Random(4), tmp_path / "run"
-    (folder / "best").mkdir(parents=True)
-    source = PRETRAINED / "ManeuveringTarget-v0" / "bptt"
-    shutil.copyfile(source.with_suffix(".safetensors"), folder / "best" / "agent.safetensors")
-    whole = source.with_suffix(".json").read_bytes()
-    for i in range(10):
-        (folder / "run.json").write_bytes(whole)
-        (folder / "run.json").write_bytes(broken_json(folder / "run.json", rng))
-        curves = () if i % WHOLE else ("--curves", tmp_path / "curves.png")
-        command("seeds", folder, "--policy", "imm", *episodes(i), *curves, program=commands.main)
 
 
 def test_settings(command):

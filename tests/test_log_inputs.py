@@ -1,6 +1,5 @@
 """Logs as they come: truth of positions only, latitude and longitude, decimal commas, gaps, duplicates and clocks."""
 
-import csv
 import dataclasses
 
 import gymnasium as gym
@@ -361,21 +360,6 @@ def test_estimates_can_be_joined_with_the_log(tmp_path):
         joined = estimates.merge(log, left_on="log_time", right_on="time")
         assert len(joined) == 2 * (COUNT - 2 - 6)
         np.testing.assert_array_equal(joined["truth_position_x_x"], joined["truth_position_x_y"])
-
-
-def test_estimates_of_several_logs_have_their_own_times(tmp_path):
-    log = untold()
-    log.assign(time=[t.isoformat() for t in PARIS]).to_csv(tmp_path / "a.csv", index=False)
-    log.iloc[:30].assign(time=TIME[:30] + 0.5).to_csv(tmp_path / "b.csv", index=False)
-    dataset = evaluate(TARGET, ["imm"], scenario=read_recording(tmp_path, TARGET), tracks=True)
-    write_estimates(tmp_path / "estimates.csv", dataset)
-    with (tmp_path / "estimates.csv").open() as lines:
-        rows = [(row["recording"], row["log_time"], float(row["seconds"])) for row in csv.DictReader(lines)]
-    assert rows[0] == ("a", PARIS[2].isoformat(), 10.0)
-    assert rows[COUNT - 2] == ("b", "10.5", 10.0)
-    write_estimates(tmp_path / "tracks.tum", dataset)
-    for episode in range(2):
-        assert np.loadtxt(tmp_path / "tracks.tum" / f"imm.{episode}.tum")[0, 0] == 10.0
 
 
 # --- agents are shown deviations over the log's own

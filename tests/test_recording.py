@@ -575,16 +575,6 @@ def test_wrong_netcdf_is_one_sentence(change, sentence, recordings, tmp_path):
     assert "\n" not in str(refusal.value)
 
 
-def test_files_say_what_they_hold(recordings):
-    data = recordings[LOOSE].dataset
-    assert data["ins"].dims[:2] == data["seconds"].dims == ("episode", "time")
-    assert data["truth"].dims == ("episode", "time", "component")
-    assert data["initial_covariance"].dims == ("episode", "component", "other_component")
-    assert data.attrs["environment"] == LOOSE
-    assert json.loads(data.attrs["parameters"])["axes"] == 2
-    assert data["recording"].values.tolist() == ["0", "1", "2"]
-
-
 def test_recordings_of_another_environment_are_refused(recordings):
     with pytest.raises(
         ValueError, match="is of filtergym/ManeuveringTarget-v0, not of filtergym/RadarEsmTracking-v0"
