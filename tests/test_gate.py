@@ -1,6 +1,7 @@
 """Gates and alarms: silent where nothing is wrong, heard where something is, and the same in training as outside."""
 
 import pickle
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from filtergym.agents.gate import Gate, Gated, GatedMaker, PaperAction, excess_cost
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.problem import problem_of
+from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy
 from models import make_model
 from scipy.stats import norm
@@ -348,12 +349,14 @@ def test_gates_that_cannot_be(make, control, message):
         make(make_model(ID, control))
 
 
-def test_an_environment_brings_an_alarm_or_has_the_general_one():
-    radar, aircraft = (make_model(f"filtergym/{name}-v0") for name in ("ManeuveringTarget", "UavAutopilot"))
-    assert type(Gate(radar).trust.alarm) is baselines_of(ID).alarm
-    assert type(Gate(aircraft).trust.alarm) is InnovationAlarm
-    assert Gate(aircraft).trust.window == InnovationAlarm.window
-    assert Gate(aircraft, alarm=Scripted).trust.window == 3
+def test_an_environment_brings_an_alarm_or_has_the_general_one(monkeypatch):
+    problem, model = problem_of(ID), make_model(ID, "gain")
+    assert type(Gate(model).trust.alarm) is problem.baselines.alarm
+    assert Gate(model, alarm=Scripted).trust.window == 3
+    without = replace(problem, baselines=replace(problem.baselines, alarm=None))
+    monkeypatch.setattr(Problem, "of", lambda cls: without)
+    assert type(Gate(model).trust.alarm) is InnovationAlarm
+    assert Gate(model).trust.window == InnovationAlarm.window
 
 
 # --- in training
