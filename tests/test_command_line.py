@@ -400,14 +400,6 @@ def test_the_quick_benchmark_runs_a_tuned_one_in_the_place_of_what_it_was_and_on
     assert names.index("kalman-imm-tuned") < names.index("semi-markov") < names.index("semi-markov-pda")
 
 
-def test_curves_in_a_format_that_nobody_writes_are_refused_first(make_page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    code, _, errors = make_page("seeds", "nowhere", "--curves", "curves.gif")
-    assert code == 2
-    assert "written as png, svg or pdf, got 'gif'" in errors
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("name", "learned"),
     [
