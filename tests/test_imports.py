@@ -173,6 +173,13 @@ def test_listing_brings_no_library_that_computes_or_draws() -> None:
     assert brought - TASKS.keys() <= {"typer", "rich", "llvmlite"}
 
 
+def test_completion_brings_no_library_that_learns_or_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = f"filtergym evaluate {next(iter(TASKS.values()))} --policy p"
+    for name, value in (("_FILTERGYM_COMPLETE", "complete_bash"), ("COMP_CWORD", "4"), ("COMP_WORDS", words)):
+        monkeypatch.setenv(name, value)
+    assert not imported_by(COMMAND) & {"torch", "stable_baselines3", "matplotlib", "plotly"}
+
+
 def test_an_evaluation_brings_one_environment_and_draws_nothing_that_nobody_keeps() -> None:
     task, id = next(iter(TASKS.items()))
     brought = imported_by(COMMAND, "evaluate", id, "--policy", "random", "--episodes", "8")
