@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, load_policy, pretrained_path
-from filtergym.agents.residual import ResidualActions, ResidualPolicy
+from filtergym.agents.residual import ResidualPolicy
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.task import named_arrays
@@ -245,34 +245,6 @@ def test_layers_by_hand():
     np.testing.assert_allclose(action[:, 0], [0.1, 0.6, 1.0], rtol=1e-6)
 
 
-def paid(env, actions):
-    shown, _ = env.reset(seed=3)
-    rows = [shown]
-    for action in actions:
-        shown, reward, _, truncated, _ = env.step(action(shown))
-        rows += [shown, reward]
-        assert not truncated
-    return rows
-
-
-def test_zero_correction_is_exactly_the_policy():
-    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
-    env = ResidualActions(gymnasium.make(ID, control="gain"), policy)
-    memory = None
-
-    def alone(shown):
-        nonlocal memory
-        action, memory = policy.predict(shown[None], memory, np.array([memory is None]))
-        return action[0]
-
-    expected = paid(gymnasium.make(ID, control="gain"), [alone] * 60)
-    for _ in range(2):  # twice: the policy's memory starts anew with the episode
-        for one, other in zip(paid(env, [lambda _: np.zeros(1, np.float32)] * 60), expected, strict=True):
-            np.testing.assert_array_equal(one, other)
-    corrected = paid(env, [lambda _: np.full(1, 0.2)] * 60)
-    assert corrected[2] != expected[2]
-
-
 def test_zero_correction_is_exactly_the_policy_in_an_evaluation():
     def corrected(task):
         return ResidualPolicy(task, competitor(ID, "adaptive")(task), Correction(task))
@@ -303,16 +275,6 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
         other = env.step(np.zeros((5, 1), np.float32))
         np.testing.assert_array_equal(other[0], shown)
         np.testing.assert_array_equal(other[1], reward)
-
-
-def test_residuals_that_cannot_be():
-    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
-    with pytest.raises(ValueError, match="made for control 'gain', but the environment has 'weights'"):
-        ResidualActions(gymnasium.make(ID, control="weights"), policy)
-    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
-        ResidualActions(gymnasium.make(ID, control="mode"), policy)
-    with pytest.raises(ValueError, match="takes an environment of filtergym"):
-        ResidualActions(gymnasium.make("CartPole-v1"), policy)
 
 
 def test_shipped_agents_need_no_torch():

@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.world import World
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.interface.privileged import context_shapes
@@ -263,24 +264,17 @@ def test_wrong_keywords_are_told(keywords, message):
 def test_a_policy_that_is_corrected_sees_the_observation_only():
     pytest.importorskip("torch")
     pytest.importorskip("sb3_contrib")
-    from filtergym.agents import ResidualActions, to_sb3
-    from filtergym.baselines.problem import problem_of
+    from filtergym.agents import to_sb3
 
     model = make_model(ID, "weights")
-    policy = problem_of(ID).competitor("imm")(model)
-    keywords = {"control": "weights", "horizon": 4}
+    policy, zero = problem_of(ID).competitor("imm")(model), np.zeros((1, *model.action_space.shape))
+    keywords = {"control": "weights", "horizon": 4, "num_envs": 1, "autoreset_mode": "SameStep"}
     paid = []
     for observation in ("measured", "asymmetric"):
-        env = ResidualActions(gymnasium.make(ID, observation=observation, **keywords), policy)
-        env.reset(seed=0)
-        many = gymnasium.make_vec(
-            ID, num_envs=1, autoreset_mode="SameStep", observation=observation, **keywords
-        )
-        vector = to_sb3(many, residual_to=policy)
+        vector = to_sb3(gymnasium.make_vec(ID, observation=observation, **keywords), residual_to=policy)
         vector.seed(0)
         vector.reset()
-        zero = np.zeros(model.action_space.shape)
-        paid.append([(env.step(zero)[1], vector.step(zero[None])[1][0]) for _ in range(4)])
+        paid.append([vector.step(zero)[1][0] for _ in range(4)])
     assert paid[0] == paid[1]
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 
-import filtergym
 from filtergym import evaluate, make_policy
 from filtergym.names import competitor
 
@@ -378,9 +377,6 @@ class TestMadePolicy:
         policy = make_policy(ID, "adaptive")
         own, made = costs({"adaptive": "adaptive", "made": policy})
         assert own == made
-        wrapped = filtergym.agents.ResidualActions(gymnasium.make(ID, **policy.keywords, **SHORT), policy)
-        wrapped.reset(seed=0)
-        wrapped.step(np.zeros(1))
 
     def test_an_environment_says_what_there_is(self):
         env = gymnasium.make(ID, control="weights")
