@@ -427,14 +427,6 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
             )
 
 
-def say_departures(
-    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
-) -> None:
-    """Say what :func:`departure_lines` says."""
-    for line in departure_lines(problem, data, learned, keywords, trust):
-        print_sentence(line)
-
-
 def departure_lines(
     problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
 ) -> Iterator[str]:
