@@ -28,8 +28,9 @@ def package_of(id: str) -> ModuleType | None:
 
 
 def baselines_of(id: str) -> Baselines:
-    """Return what the environment of a Gymnasium id is compared with: where it brings nothing, the paper's algorithm that
-    its class declares, and random actions.
+    """Return what the environment of a Gymnasium id is compared with.
+
+    Where it brings nothing: the paper's algorithm that its class declares, and random actions.
     """
     package = package_of(id)
     if package is not None:
