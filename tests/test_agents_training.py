@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 from filtergym import evaluate
 from filtergym.names import competitor, tidy_records
@@ -25,7 +24,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
-from filtergym.agents.bptt import Descent, NetworkPolicy, descend_episodes, train_bptt
+from filtergym.agents.bptt import Descent, NetworkPolicy, train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_arrays, write_arrays
 from filtergym.agents.network_arrays import network_arrays
@@ -299,46 +298,6 @@ def test_networks_that_there_are_not_are_refused():
         NetworkPolicy(4, space, 8, fields_kept=0)
 
 
-def gradient_of_bias(truncation, horizon=6):
-    env = TaskVectorEnv(ID, 3, "gain", horizon=horizon, backend="torch", autoreset_mode="Disabled")
-    env.reset(seed=1)
-    torch.manual_seed(0)
-    policy = NetworkPolicy(len(env.model.fields), env.model.action_space, 4).double()
-    # Observations are cut to float32 by the policy; here in double, for differences.
-    policy.forward = lambda shown, hidden: double_forward(policy, shown, hidden)
-
-    def cost(shift):
-        env.reset(seed=2)
-        state = [g.bit_generator.state for g in env.fleet.generators]
-        policy.zero_grad()
-        policy.head.bias.data += shift
-        value = descend_episodes(env, policy, truncation, descend=lambda: None)
-        policy.head.bias.data -= shift
-        for generator, kept in zip(env.fleet.generators, state, strict=True):
-            generator.bit_generator.state = kept
-        return value, float(policy.head.bias.grad)
-
-    value, gradient = cost(0.0)
-    difference = (cost(1e-5)[0] - cost(-1e-5)[0]) / 2e-5
-    return value, gradient, difference
-
-
-def double_forward(policy, shown, hidden):
-    hidden = policy.gru(shown.double(), hidden.double())
-    return torch.tanh(policy.head(hidden)), hidden
-
-
-def test_gradient_through_the_episode_is_that_of_the_cost():
-    value, gradient, difference = gradient_of_bias(truncation=6)
-    # Nothing descends between the windows here, so the gradients of all of them add up.
-    # Central differences of a smooth function with step 1e-5: about 1e-8 relative, plus rounding.
-    assert gradient == pytest.approx(difference, rel=1e-5)
-    same_value, cut, _ = gradient_of_bias(truncation=2)
-    assert same_value == pytest.approx(value, rel=1e-12)
-    # Each of the three windows gives the gradient of its own mean.
-    assert abs(cut / 3.0 / gradient - 1.0) > 0.01
-
-
 @pytest.mark.parametrize(
     ("algorithm", "control", "message"),
     [
@@ -373,19 +332,6 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"cannot read .*run\.json"):
         resume_run(tmp_path, run)
-
-
-def test_normalisation_is_found_where_rl_zoo3_puts_it(tmp_path):
-    train(small_run("ppo", 240), tmp_path)
-    best = tmp_path / "best"
-    folder = tmp_path / "filtergym-ManeuveringTarget-v0_1"
-    (folder / "filtergym-ManeuveringTarget-v0").mkdir(parents=True)
-    model = shutil.copy(best / "model.zip", folder / "filtergym-ManeuveringTarget-v0.zip")
-    shutil.copy(best / "vecnormalize.pkl", folder / "filtergym-ManeuveringTarget-v0")
-    statistics = [
-        load_sb3_policy(path, trust=True).normalisation.obs_rms.mean for path in (best / "model.zip", model)
-    ]
-    np.testing.assert_array_equal(*statistics)
 
 
 def test_files_that_are_no_policies(tmp_path):
@@ -472,14 +418,6 @@ def test_seeds_of_stable_baselines3_are_resumed_with_trust(command, tmp_path):
     assert not (tmp_path / "x-1" / "run.json").exists()
     assert command(*words, "--seeds", "0", "--steps", 480, "--trust")[0] == 0
     assert load_run(folder).steps_done == 480
-
-
-def test_wrong_input_writes_nothing(command, tmp_path):
-    code, _, errors = command("train", ID, "--scenario", "paper", "--out", tmp_path / "x")
-    assert code == 2
-    assert errors.startswith("Error: scenario 'paper' is held out")
-    assert command("export", tmp_path / "x")[0] == 2
-    assert not (tmp_path / "x").exists()
 
 
 def test_export_refuses_what_is_no_file_for_it(command, tmp_path):
