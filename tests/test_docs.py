@@ -118,27 +118,6 @@ def test_page_of_the_command_line_holds_what_help_says(command):
         assert set(re.findall(r"(?<![\w-])--[a-z-]+(?= |$)", shown)) - {"--help"} <= known
 
 
-def test_first_page_shows_the_result_and_the_commands_of_the_readme():
-    """They are included, so that they stand in one place."""
-    readme, index = (
-        page.read_text(encoding="utf-8") for page in (DOCS.parent / "README.md", DOCS / "index.md")
-    )
-    for marker, words in (
-        (
-            "headline",
-            ("<!-- value: ManeuveringTarget/random/", "docs/records/benchmark/ManeuveringTarget.json"),
-        ),
-        ("two commands", ("make benchmark", "make test")),
-    ):
-        assert re.search(
-            f"```{{include}} ../README.md\n:start-after: .<!-- {marker}: begin -->.\n"
-            f":end-before: .<!-- {marker}: end -->.\n",
-            index,
-        )
-        [text] = re.findall(f"<!-- {marker}: begin -->(.*?)<!-- {marker}: end -->", readme, re.S)
-        assert all(word in text for word in words)
-
-
 def words_by_hand(text: str) -> int:
     """Count the words of a page outside blocks, tables and headings."""
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)
@@ -148,18 +127,6 @@ def words_by_hand(text: str) -> int:
 def test_pages_are_short():
     pages = [file for file in DOCS.rglob("*.md") if "reproductions" not in file.parts]
     assert sum(words_by_hand(file.read_text(encoding="utf-8")) for file in pages) <= MOST_WORDS
-
-
-def test_every_page_of_results_says_what_makes_it():
-    for name, words in (
-        ("comparison.md", "python docs/make record results/results.json"),
-        ("training_seeds.md", "--into docs/records"),
-        ("compiled.md", "python benchmarks/throughput.py"),
-    ):
-        assert words in (DOCS / name).read_text(encoding="utf-8"), name
-    for report in (DOCS / "reproductions").glob("*/report.md"):
-        made = f"\nMade by `filtergym reproduce {report.parent.name} --out DIR`.\n"
-        assert made in report.read_text(encoding="utf-8"), report
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make")

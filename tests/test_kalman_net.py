@@ -307,16 +307,6 @@ def test_the_estimator_is_the_policy_in_its_bank(id, name):
                 np.testing.assert_array_equal(values, told[name])
 
 
-@pytest.mark.parametrize("id", [FUSION, ESM, AIRCRAFT])
-def test_an_evaluation_keeps_how_well_a_network_inside_a_filter_predicted(id):
-    """Log-likelihood and normalised innovation squared of every measurement that was received."""
-    found = filtergym.evaluate(id, {"net": EstimatorMaker(NAME, network)}, episodes=16, **SHORT.get(id, {}))
-    told = found[["log_likelihood", "nis", "nis_degrees"]].to_array().values
-    received = found["nis_degrees"].values > 0.0
-    assert received.any()
-    assert np.isfinite(told[:, received]).all()
-
-
 def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
     from filtergym.agents.training_run import RunOptions, new_run
 

@@ -20,7 +20,6 @@ ESM = "filtergym/RadarEsmTracking-v0"
 TIGHT = "filtergym/TightlyCoupledNavigation-v0"
 UAV = "filtergym/UavAutopilot-v0"
 ON_TIME = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
-NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 
 
 def rollout(id, steps, seed=0, **keywords):
@@ -117,39 +116,27 @@ def test_levels_are_those_of_the_times():
         assert context["level"] == start["levels"][part]
 
 
-@pytest.mark.parametrize(("backend", "mode"), [("compiled", "NextStep"), ("torch", "SameStep")])
-def test_context_of_a_vector_is_that_of_single_environments(backend, mode):
-    pytest.importorskip(NEEDED[backend])
+def test_context_of_a_vector_is_that_of_single_environments():
+    pytest.importorskip("torch")
     keywords = {"horizon": 3, "decision_interval": 1, "context": True}
-    many = gymnasium.make_vec(LOOSE, num_envs=3, backend=backend, autoreset_mode=mode, **keywords)
-    alone = [gymnasium.make(LOOSE, backend="numpy", **keywords) for _ in range(3)]
-    told = [many.reset(seed=4)[1]] + [
-        many.step(np.zeros((3, *many.single_action_space.shape)))[4] for _ in range(8)
-    ]
-    finals = 0
-    for lane, env in enumerate(alone):
-        own, over = [env.reset(seed=4 + lane)[1]], False
-        for step in range(1, 9):
-            if over and mode == "NextStep":
-                own.append(env.reset()[1])
-                over = False
-                continue
-            _, _, _, over, info = env.step(np.zeros(env.action_space.shape))
-            if over and mode == "SameStep":
-                final = told[step]["final_info"]["context"]
-                for name, values in info["context"].items():
-                    np.testing.assert_allclose(np.asarray(final[name])[lane], values, rtol=1e-12, atol=1e-12)
-                finals += 1
-                info, over = env.reset()[1], False
-            own.append(info)
-        for one, info in zip(told, own, strict=True):
-            assert bool(one["_context"][lane])
-            for name, values in info["context"].items():
-                assert bool(one["context"][f"_{name}"][lane])
-                np.testing.assert_allclose(
-                    np.asarray(one["context"][name])[lane], values, rtol=1e-12, atol=1e-12
-                )
-    assert finals == (6 if mode == "SameStep" else 0)
+    many = gymnasium.make_vec(LOOSE, num_envs=3, backend="torch", autoreset_mode="SameStep", **keywords)
+    told = [many.reset(seed=4)[1]]
+    told += [many.step(np.zeros((3, *many.single_action_space.shape)))[4] for _ in range(5)]
+    for lane in range(3):
+        env = gymnasium.make(LOOSE, backend="numpy", **keywords)
+        own = env.reset(seed=4 + lane)[1]
+        for step, info in enumerate(told):
+            assert bool(info["_context"][lane])
+            _assert_context(info["context"], lane, own["context"])
+            _, _, _, over, own = env.step(np.zeros(env.action_space.shape))
+            if over and step < len(told) - 1:
+                _assert_context(told[step + 1]["final_info"]["context"], lane, own["context"])
+                own = env.reset()[1]
+
+
+def _assert_context(found, lane, expected):
+    for name, values in expected.items():
+        np.testing.assert_allclose(np.asarray(found[name])[lane], values, rtol=1e-12, atol=1e-12)
 
 
 def test_context_of_a_vector_has_gymnasiums_form():
@@ -193,34 +180,27 @@ def test_privileged_observations_are_context_and_error(env_id, short):
         np.testing.assert_allclose(shown["privileged"][-components:], other[4]["error"] / sigma, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("backend", "scenario"), [("numpy", "random"), ("torch", {"random": 0.5, "quiet": 0.5})]
-)
-def test_privileged_vectors_are_those_of_single_environments(backend, scenario):
-    pytest.importorskip(NEEDED[backend])
-    keywords = {"observation": "asymmetric", "scenario": scenario, "reward": "relative"}
+def test_privileged_vectors_are_those_of_single_environments():
+    pytest.importorskip("torch")
+    keywords = {"observation": "asymmetric", "scenario": {"random": 0.5, "quiet": 0.5}, "reward": "relative"}
     keywords |= {"horizon": 3, "decision_interval": 1}
-    many = gymnasium.make_vec(LOOSE, num_envs=4, backend=backend, autoreset_mode="SameStep", **keywords)
+    many = gymnasium.make_vec(LOOSE, num_envs=4, backend="torch", autoreset_mode="SameStep", **keywords)
     shown = [many.reset(seed=0)[0]]
     action = np.full((4, *many.single_action_space.shape), 0.1)
     steps = [many.step(action) for _ in range(5)]
+    shown += [step[0] for step in steps]
     for lane in range(4):
         env = gymnasium.make(LOOSE, backend="numpy", **keywords)
         own = env.reset(seed=lane)[0]
-        for step, (_, paid, _, over, info) in enumerate(steps):
-            before = (shown + [s[0] for s in steps])[step]
+        for before, (_, paid, _, over, info) in zip(shown, steps, strict=False):
             for name in own:
                 np.testing.assert_allclose(np.asarray(before[name])[lane], own[name], rtol=1e-9, atol=1e-9)
             own, earned, _, truncated, _ = env.step(action[lane])
             assert float(paid[lane]) == pytest.approx(earned, abs=1e-9)
             assert bool(over[lane]) == truncated
             if truncated:
-                final = (
-                    info["final_obs"]["privileged"][lane]
-                    if backend == "torch"
-                    else info["final_obs"][lane]["privileged"]
-                )
-                np.testing.assert_allclose(np.asarray(final), own["privileged"], rtol=1e-9, atol=1e-9)
+                final = np.asarray(info["final_obs"]["privileged"][lane])
+                np.testing.assert_allclose(final, own["privileged"], rtol=1e-9, atol=1e-9)
                 own = env.reset()[0]
 
 
