@@ -255,4 +255,4 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     for array in arrays:
         table += [address_of(array), array.strides[0] // array.itemsize]
     table += [normals, len(rows) - normals]
-    return Call(Code(numbers_code()), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
+    return Call(Code(numbers_code), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))

@@ -193,7 +193,7 @@ def test_random_programs_have_the_bits_of_compiled_code(seed, random_programs):
     table = np.array(
         [code.constants.ctypes.data] + [n for a in (given, expected) for n in (a.ctypes.data, a.shape[1])]
     )
-    native.native(code, [False, False])(table.ctypes.data, 0, 32)
+    native.native(code, [False, False]).expect(32)(table.ctypes.data, 0, 32)
     result = run_lanes(library, f"program_{seed}", [given, np.empty_like(expected)])
     np.testing.assert_array_equal(result, expected)
 

@@ -52,7 +52,7 @@ def computed(name, arrays, library=None, constant=None):
     table = np.array(
         [code.constants.ctypes.data] + [n for a in padded for n in (a.ctypes.data, 0)], dtype=np.int64
     )
-    native.native(code, [False] * len(padded), library)(table.ctypes.data, 0, len(padded[0]))
+    native.native(code, [False] * len(padded), library).expect(8)(table.ctypes.data, 0, len(padded[0]))
     return padded[-1][:count]
 
 

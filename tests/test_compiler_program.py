@@ -359,11 +359,18 @@ def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
     assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
 
 
-def test_what_is_timed_is_optimised_at_once(monkeypatch):
-    first, better = named(quick_setting(native.processor()[1], False)), named(OPTIMISED)
+def test_code_is_made_when_it_runs_and_what_is_timed_is_optimised_at_once():
+    made = []
+    code = native.Code(lambda: made.append("quick"), lambda: made.append("better"), hot=100)
+    assert not made
     with native.optimised_code():
-        assert settings_used(monkeypatch, chain(7), runs=2) == [better]
-    assert settings_used(monkeypatch, chain(8), runs=2) == [first]
+        code.expect(8)
+        assert made == ["quick"]  # the start of an episode is not timed
+        code.expect(8, in_sequence=True)
+        assert made == ["quick", "better"]
+    other = native.Code(lambda: made.append("one"), lambda: made.append("other"), hot=100)
+    other.expect(8, in_sequence=True)
+    assert made == ["quick", "better", "one"]
 
 
 def test_long_programs_stay_as_they_are(monkeypatch):

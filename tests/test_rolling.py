@@ -276,7 +276,7 @@ def programs_of(monkeypatch, environment, names):
                     ctypes.memset(start + 8 * (lane * stride + row), 0, 8)
 
         found[native._text_of(code), *lane_first] = code, lane_first
-        return native.Code(native.NATIVE(clear))
+        return native.Code(lambda: native.NATIVE(clear))
 
     monkeypatch.setattr(functions, "native", collect)
     for name in names:

@@ -459,14 +459,12 @@ class Writer:
 
     def table(self, replayed: Replay) -> str:
         """Text of a table of measurements, as main.c reads it."""
-        first = len(self.columns("initial"))
         lines = [",".join([*self.columns("initial"), *self.columns("measurement")])]
-        for episode in range(replayed.initial.shape[1]):
-            for k, measured in enumerate(replayed.measurements[:, :, episode]):
-                initial = replayed.initial[:, episode] if k == 0 else [""] * first
-                lines.append(
-                    ",".join(str(x) if isinstance(x, str) else repr(float(x)) for x in [*initial, *measured])
-                )
+        blank = "," * len(self.columns("initial"))
+        for episode, initial in enumerate(replayed.initial.T.tolist()):
+            rows = [",".join(map(repr, row)) for row in replayed.measurements[:, :, episode].tolist()]
+            lines.append(",".join([*map(repr, initial), rows[0]]))
+            lines += [blank + row for row in rows[1:]]
         return "\n".join([*lines, ""])
 
 
