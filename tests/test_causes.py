@@ -24,7 +24,7 @@ from filtergym.evaluation.statistics.cause_split import (
 )
 
 import filtergym
-from filtergym.reports.tables.lines import fill
+from filtergym.commands.terminal import fill
 from filtergym.reports.tables.reasons import (
     explained_by_default,
     largest_reasons,

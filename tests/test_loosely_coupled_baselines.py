@@ -14,9 +14,9 @@ from filtergym.baselines.loosely_coupled_navigation.metrics import (
     recovery_times,
 )
 from filtergym.evaluation.running.rollout import rollout
-from filtergym.filters import kalman_bucy, loosely_coupled
+from filtergym.filters import loosely_coupled
 from filtergym.filters.linear_systems import van_loan
-from filtergym.papers.kalman_bucy_ins_gnss import experiment
+from filtergym.papers.kalman_bucy_ins_gnss import experiment, kalman_bucy
 from models import make_model
 
 import filtergym  # noqa: F401  # registers the environments

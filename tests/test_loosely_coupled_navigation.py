@@ -9,7 +9,8 @@ from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.model import Model
 from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
 from filtergym.envs.loosely_coupled_navigation.task import TASK
-from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
+from filtergym.filters import linear_systems, loosely_coupled
+from filtergym.papers.kalman_bucy_ins_gnss import kalman_bucy
 from models import make_model
 
 MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])

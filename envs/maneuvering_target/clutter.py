@@ -28,17 +28,6 @@ class Track(NamedTuple):
     """``(4, 4, N)``."""
 
 
-class Plots(NamedTuple):
-    """All plots of a scan in the window of a track, in random order."""
-
-    position: Array
-    """x and y, m, ``(2, K, N)``; zero where there is none, where an estimator gets NaN."""
-    variance: Array
-    """Variances of their errors, evaluated at the plots, m^2, ``(2, K, N)``."""
-    available: Array
-    """1 where there is a plot, 0 where not, ``(K, N)``."""
-
-
 class Echo(NamedTuple):
     """The plot of the target itself, which no competitor is told."""
 
@@ -135,7 +124,7 @@ class Clutter(Disturbance):
             variance=variance,
             available=available,
             elapsed=elapsed,
-            plots=Plots(positions, variances, there),
+            plots=data_association.Plots(positions, variances, there),
         )
 
     def predict(self, track: Track, interval: Array, elapsed: Array) -> tuple[Array, Array]:

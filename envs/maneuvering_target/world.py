@@ -4,13 +4,14 @@ import math
 from typing import Any, NamedTuple
 
 from ...filters import polar
+from ...filters.data_association import Plots
 from ..contract.draws import Draws
 from ..contract.faults import Disturbances
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
 from ..contract.world import World
-from .clutter import Plots, Track
+from .clutter import Track
 from .courses import course_of
 from .disturbances import DISTURBANCES
 from .parameters import ManeuveringTargetParameters

@@ -501,7 +501,9 @@ def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
             )
 
 
-def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int) -> Model:
+def put_in_loop(
+    model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
+) -> Model:
     """Return a model whose filter is a competitor.
 
     Args:
@@ -510,6 +512,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
         kind: what it is.
         name: of it, in errors.
         count: number of episodes.
+        last: number of their last measurement; None: not known.
 
     Raises:
         ValueError: if it cannot be made, has not the methods of its kind, or is a reference that knows not all that may
@@ -520,7 +523,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
     if kind in TOLD_MORE:
         check_knowledge(name, own, kind, model.task)
     if isinstance(own, ProgramEstimator):
-        own.tracks = count
+        own.tracks, own.last = count, last
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:
