@@ -281,3 +281,4 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
 )
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoiseChanges,)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""

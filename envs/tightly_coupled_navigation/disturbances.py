@@ -412,3 +412,4 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
 )
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoisyRate, StuckAccelerometers, LostRates, HiddenSatellites, Ramp, Reflections, Aperture)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""

@@ -199,3 +199,4 @@ class SensorColour(ColouredErrors):
 DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""
