@@ -1,6 +1,5 @@
 """Figures of an evaluation: who is told apart, how kinds look, what the files hold, and what stands on the axes."""
 
-import dataclasses
 import itertools
 import re
 
@@ -34,7 +33,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pictures import draw_learning_curves
 from records import read_benchmark, recorded_environments
 
-from filtergym import evaluate, record
+from filtergym import evaluate
 
 ENV, UAV = "filtergym/ManeuveringTarget-v0", "filtergym/UavAutopilot-v0"
 NAMES = [
@@ -284,12 +283,6 @@ def test_learning_curves_are_median_and_range_over_runs():
         assert (ends.min(), ends.max()) == pytest.approx((low, high))
     assert "millions" in axis.get_xlabel()
     assert "%" in axis.get_ylabel()
-
-
-def test_recordings_without_truth_have_figures_too():
-    recording = dataclasses.replace(record(ENV, "paper", 3, horizon=40), truth=None)
-    found = curves_of(evaluate(ENV, ["imm", "adaptive"], recording))
-    assert list(dict(evaluation_figures(found))) == ["consistency", "mode_probabilities"]
 
 
 @pytest.mark.filterwarnings("error")
