@@ -38,14 +38,6 @@ def test_dataset_has_named_axes_and_units(dataset):
     assert windows_of(dataset)["turn"] == (50, 55)
 
 
-def test_results_do_not_depend_on_company_or_number():
-    alone = evaluate(ENV, ["imm"], scenario="random", episodes=5)
-    among = evaluate(ENV, ["adaptive", "imm"], scenario="random", episodes=12)
-    np.testing.assert_array_equal(
-        alone["error"].sel(policy="imm").values, among["error"].sel(policy="imm").values[:5]
-    )
-
-
 def test_splits_and_seeds_share_no_episode():
     seen = [
         set(episode_seeds(split, seed, 500)) for split in ("train", "validation", "test") for seed in range(3)
