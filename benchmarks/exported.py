@@ -192,7 +192,7 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
     for array in arrays:
         table += [array.__array_interface__["data"][0], array.strides[0] // 8]
     addresses = numpy.array(table, dtype=numpy.int64)
-    code = native(program, [False] * len(arrays))
+    code = native(program, [False] * len(arrays)).expect(LANES)
     return least_time(lambda: code(addresses.ctypes.data, 0, LANES), 5) / LANES
 
 

@@ -32,6 +32,19 @@ CREEP = 0.01
 """m/s, by which the way that dead reckoning may err over grows at a standstill; ours."""
 
 
+class Noise(NamedTuple):
+    """Constants of the filter."""
+
+    drift: float | Array
+    """q, m over the root of a metre."""
+    acceleration: float | Array
+    """Deviation of a where there is no displacement, m/s^2."""
+    correlation_time: float | Array
+    """tau, s."""
+    deviation: float | Array
+    """s, m."""
+
+
 def _both_axes(block: list[list[Array]]) -> Array:
     """Put a matrix ``(3, 3)`` of one axis, entries ``(N,)``, into that of both, ``(6, 6, N)``."""
     xp, zero = namespace(block[0][0]), 0.0 * block[0][0]
@@ -74,21 +87,13 @@ def calibrate(displacement: Array, scale: float | Array, heading_offset: float |
     return xp.stack([cosine * x + sine * y, cosine * y - sine * x])
 
 
-class Noise(NamedTuple):
-    """How strong what is random is, and how long the errors last."""
-
-    drift: float | Array
-    """q, m over the root of a metre."""
-    acceleration: float | Array
-    """Deviation of a where there is no displacement, m/s^2."""
-    correlation_time: float | Array
-    """tau, s."""
-    deviation: float | Array
-    """s, m."""
-
-
 def predict_position(
-    mean: Array, covariance: Array, displacement: Array, available: Array, T: Array, noise: Noise
+    mean: Array,
+    covariance: Array,
+    displacement: Array,
+    available: Array,
+    T: Array,
+    noise: Noise,
 ) -> tuple[Array, Array]:
     """Time update.
 
@@ -98,19 +103,19 @@ def predict_position(
         displacement: calibrated, m, ``(2, N)``.
         available: above zero where there is one, ``(N,)``.
         T: s, ``(N,)``.
-        noise: of the motion and of the errors.
+        noise: constants of the filter.
     """
     xp = namespace(mean)
     known = available > 0.0
     zero, one = 0.0 * T, 1.0 + 0.0 * T
     way = xp.sqrt(displacement[0] ** 2 + displacement[1] ** 2) + CREEP * T
     # In either case one number a both axes alike drives position and velocity.
-    intensity = xp.where(known, noise.drift**2 * way, noise.acceleration**2 + zero)
+    driving = xp.where(known, noise.drift**2 * way, noise.acceleration**2 + zero)
     by_noise = xp.where(known, one, 0.5 * T**2), xp.where(known, 1.0 / T, T)
     fading = xp.exp(-T / noise.correlation_time)
     coasting = xp.where(known, zero, T), xp.where(known, zero, one)
     F = _both_axes([[one, coasting[0], zero], [zero, coasting[1], zero], [zero, zero, fading]])
-    pp, pv, vv = (intensity * by_noise[i] * by_noise[j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    pp, pv, vv = (driving * by_noise[i] * by_noise[j] for i, j in ((0, 0), (0, 1), (1, 1)))
     ee = noise.deviation**2 * (1.0 - fading**2)
     Q = _both_axes([[pp, pv, zero], [pv, vv, zero], [zero, zero, ee]])
     moved = xp.where(known, displacement, 0.0)

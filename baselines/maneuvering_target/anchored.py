@@ -44,13 +44,13 @@ class DeadReckoning(KalmanModel):
         heading_offset: float = 0.0,
     ) -> None:
         super().__init__(task)
-        self.noise = dead_reckoning.Noise(drift, self.acceleration, correlation_time, error_deviation)
+        self.deviation, self.correlation_time, self.drift = error_deviation, correlation_time, drift
         self.scale, self.heading_offset = scale, DEGREE * heading_offset
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> Track:
         """Start where everyone starts, off by an unknown error."""
-        return super().start(Initial(*dead_reckoning.start(*initial[:2], self.noise.deviation)))
+        return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
     def update(self, state: Track, given: Input) -> Track:
         """Move by the odometry and update with the measured position."""
@@ -67,7 +67,7 @@ class DeadReckoning(KalmanModel):
             dead_reckoning.calibrate(odometry.displacement, self.scale, self.heading_offset),
             odometry.available,
             measurement.interval,
-            self.noise,
+            dead_reckoning.Noise(self.drift, self.acceleration, self.correlation_time, self.deviation),
         )
         return self.track(measurement, self.update_estimate(predicted, measurement))
 

@@ -8,8 +8,9 @@ from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.semi_markov import SemiMarkov
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.maneuvering_target.world import Measurement, Plots
+from ...envs.maneuvering_target.world import Measurement
 from ...filters import data_association, kalman
+from ...filters.data_association import Plots
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses
 from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel

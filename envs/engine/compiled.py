@@ -188,9 +188,8 @@ def _name_of(function: Callable[..., Any]) -> str:
 def warn_of(what: str, error: BaseException) -> None:
     """Warn that something runs with NumPy, and name the line that is to blame."""
     found: BaseException = error.__cause__ or error
-    frames = [
-        f for f in traceback.extract_tb(found.__traceback__) if "compiler" not in Path(f.filename).parts
-    ]
+    own = Path(namespace.__file__).parent
+    frames = [f for f in traceback.extract_tb(found.__traceback__) if Path(f.filename).parent != own]
     line = (
         f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line})" if frames else ""
     )

@@ -11,6 +11,7 @@ import cloudpickle
 import gymnasium
 import numpy
 
+from ...compiler.native import optimised_code
 from ...envs.contract.model import Model
 from ...envs.contract.parameters import check_integer, quote_shortened
 from ...envs.contract.task import Scenario, Task
@@ -251,7 +252,9 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
-    flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    # What is timed afterwards is optimised then: nothing need be compiled in two ways.
+    with optimised_code(experiment.timed):
+        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)

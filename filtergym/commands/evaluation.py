@@ -37,10 +37,9 @@ from ..evaluation.storage.files import whole_files, writable_file, writable_fold
 from ..evaluation.storage.store import UNFINISHED, Store
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
-from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
+from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
 from ..reports.tables.reasons import explained_by_default, reason_sentences
 from ..reports.tables.recording_tables import recording_tables
-from ..reports.tables.records import write_records
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.work import work_of
@@ -436,14 +435,6 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
                 f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; the last "
                 "estimate before each, or the initial one, is held"
             )
-
-
-def say_departures(
-    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
-) -> None:
-    """Say what :func:`departure_lines` says."""
-    for line in departure_lines(problem, data, learned, keywords, trust):
-        print_sentence(line)
 
 
 def departure_lines(

@@ -134,7 +134,8 @@ def export(
 
 def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
     """Write a filter as C99, and say what it costs."""
-    from ..exports.c_source import export_c, file_stem
+    from ..exports.c_filter import file_stem
+    from ..exports.c_source import export_c
     from ..exports.figures import operation_words
 
     stem = file_stem(request.name)

@@ -32,11 +32,11 @@ from .evaluation import (
     FileOptions,
     Outputs,
     check_explained,
+    departure_lines,
     find_data,
     find_names,
     keeps_predictions,
     run,
-    say_departures,
     write,
 )
 from .protocol import check_options, evaluate_protocol
@@ -66,6 +66,7 @@ from .terminal import (
     import_environments,
     one_of,
     parse_settings,
+    print_sentence,
     print_table,
     progress_bar,
 )
@@ -241,7 +242,8 @@ def evaluate_policies(
             else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
         )
     write(problem, outcome, outputs, learned, explained, worst)
-    say_departures(problem, data, learned, keywords, trust)
+    for sentence in departure_lines(problem, data, learned, keywords, trust):
+        print_sentence(sentence)
 
 
 def record_scenario(

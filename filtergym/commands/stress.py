@@ -12,7 +12,7 @@ from ..evaluation.stress.alterations import ALTERATIONS
 from ..evaluation.stress.crash_test import CrashTest, Finding
 from ..names import FILE, find_competitor
 from ..reports.pages.crash_report import crash_page, crash_table
-from ..reports.tables.records import write_records
+from ..reports.tables.export import write_records
 from .terminal import (
     Backend,
     Environment,

@@ -3,8 +3,10 @@
 import ast
 import io
 import os
+import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +17,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..reports.tables.lines import fill
 from .progress import progress_bar as progress_bar
 
 if TYPE_CHECKING:
@@ -224,6 +225,12 @@ def output_width() -> int | None:
 
 # No markup: names and paths are printed as they are.
 console = Output(width=output_width(), markup=False, emoji=False)
+
+
+def fill(sentence: str, width: int) -> str:
+    """Break a sentence into lines, no number from its unit and no interval apart."""
+    kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
+    return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy
 from numpy.typing import ArrayLike
 
-from .linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
+from ...filters.linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
 
 
 def _times(times: ArrayLike) -> Matrix:
