@@ -17,7 +17,7 @@ from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit
+from gymnasium.wrappers import TimeAwareObservation, TimeLimit
 from models import KINDS
 
 import filtergym  # noqa: F401  (registers the environments)
@@ -387,8 +387,6 @@ def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_m
 
 # --- copies
 
-WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
-
 
 def test_copies_of_vectors_are_drawn_alike(monkeypatch):
     monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
@@ -402,14 +400,3 @@ def test_copies_of_vectors_are_drawn_alike(monkeypatch):
     again = pickle.loads(pickle.dumps(env))
     np.testing.assert_array_equal(again.render(), drawn)
     np.testing.assert_array_equal(copy.deepcopy(again).render(), drawn)
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_copies_of_what_is_wrapped(way):
-    env = RecordEpisodeStatistics(gym.make(ID, max_episode_steps=4, horizon=9))
-    env.reset(seed=3)
-    actions = actions_for(env, 4)
-    continued(env, actions[:2])
-    other = WAYS[way](env)
-    assert other.spec == env.spec
-    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
