@@ -51,6 +51,7 @@ def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.setattr(
         "filtergym.commands.evaluation.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
     )
+    monkeypatch.setattr("filtergym.reports.pages.html_report.report_html", lambda *_, **__: "<html></html>")
 
     def command(*words, output=None, program=main):
         if output is not None:
