@@ -148,7 +148,6 @@ ALGORITHMS = [
     ("DDPG", "gain", {"learning_starts": 8}),
     ("ARS", "mode", {"policy": "LinearPolicy", "n_delta": 1}),
     ("DQN", "mode", {"learning_starts": 8}),
-    ("QRDQN", "mode", {"learning_starts": 8}),
 ]
 """One of each form: on and off its policy, recurrent, linear, with discrete actions, saved under another name."""
 
