@@ -289,7 +289,7 @@ def test_cost_less_that_of_another_over_time_by_a_loop(dataset):
     assert np.isnan(curves["cost_minus_paper"].sel(policy="known-input-bound").values).all()
 
 
-@pytest.mark.parametrize("times", [1, 7, 100, 101, 600, 2999])
+@pytest.mark.parametrize("times", [1, 101, 2999])
 def test_stretches_cover_an_episode(times):
     stretches = stretches_of(times)
     assert len(stretches) <= 100

@@ -265,10 +265,24 @@ class Outcome(NamedTuple):
         """Return what is printed in so many columns, widest first."""
         tables = [flights_table(self.dataset, flights, self.records, width)] if flights else []
         if self.has_truth:
-            tables += results_tables(self.records, problem.knows, width)
+            compared = results_tables(self.records, problem.knows, width)
+            paper = self.dataset.attrs["paper"]
+            if paper not in {record.policy for record in self.records}:
+                compared[-1].caption = f"{_without_costs(paper)}\n{compared[-1].caption}"
+            tables += compared
         if self.dataset.attrs["recorded"]:
             tables += recording_tables(self.records, differences, self.has_truth, width)
         return tables
+
+
+def _without_costs(paper: str) -> str:
+    """Say why no competitor has a cost, and what to do, where the paper's algorithm of this name did not take part."""
+    if not paper:
+        return "No cost is shown: the environment names no paper's algorithm to compare it with."
+    return (
+        f"No cost is shown: it is compared with that of the paper's algorithm, which did not take part; add --policy "
+        f"{paper}."
+    )
 
 
 def run(

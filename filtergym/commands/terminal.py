@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,6 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 from .progress import progress_bar as progress_bar
+
+if TYPE_CHECKING:
+    from ..envs.contract.task import Task
 
 # --- what a shell completes; imports wait until it asks
 
@@ -142,6 +145,9 @@ RenameOption = Annotated[
     ),
 ]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
+Speeds = Annotated[
+    str, typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest.")
+]
 Backend = Annotated[
     str,
     typer.Option(
@@ -316,10 +322,15 @@ def command_line() -> str:
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 
-def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
+def parse_settings(settings: list[str] | None, task: type["Task"] | None = None) -> dict[str, Any]:
+    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word.
+
+    Args:
+        settings: as they were typed; None: none.
+        task: whose parameters they must be; None: anything.
+    """
     keywords: dict[str, Any] = {}
-    for setting in settings:
+    for setting in settings or []:
         name, equals, text = setting.partition("=")
         if not equals or not name.strip().isidentifier() or not text.strip():
             raise ValueError(f"--set needs name=value, such as --set horizon=50, got {setting!r}")
@@ -329,4 +340,8 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
             if not text.strip().replace("-", "_").isidentifier():
                 raise ValueError(f"--set {name}: cannot read the value {text!r}") from error
             keywords[name.strip()] = text.strip()
+    if task is not None:
+        from ..envs.engine.catalogue import check_names
+
+        check_names(task, keywords)
     return keywords
