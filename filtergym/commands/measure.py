@@ -412,9 +412,10 @@ def benchmark(
     console.print()
     make_report(results, settings_of(options.command), out / REPORT)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    console.print(
-        "what the environments are, and who competes in them: filtergym list, docs/environments.md\n"
+    print_sentence(
+        "what the environments are, and who competes in them: filtergym list, docs/environments.md"
     )
+    console.print()
     print_headline(results)
 
 
