@@ -114,7 +114,7 @@ def test_torch_equals_numpy(id, control, device):
         assert_close(part(runs, name), name)
 
 
-@pytest.mark.parametrize(("id", "mode"), zip(KINDS, MODES, strict=True))
+@pytest.mark.parametrize(("id", "mode"), list(zip(KINDS, MODES, strict=True)))
 def test_autoreset_equals_numpy(id, mode):
     last = 2
     restarted = numpy.array([True, False, True, False, True])
