@@ -200,7 +200,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
     """Of the competitor itself on NumPy's arrays, one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
-    plain = make_model(problem.task, control_of(maker, kind, None, problem.task, name), **keywords)
+    plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
     seeds = episode_seeds("test", 0, 1)
     started: list[Any] = []
     start_lanes(plain, seeds, lambda episode: started.append(one_lane(episode.measurement)))

@@ -141,6 +141,26 @@ class CompiledModel(Model):
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
 
+def compiled_model(
+    cls: type[Task], parameters: Any, control: str, recording: Any = None, threads: int = 1
+) -> CompiledModel:
+    """Return the compiled model of a task with these parameters; nothing in it changes, so that the last ones are kept.
+
+    Raises:
+        NotTraceable: if a step is no straight line of arithmetic.
+        ImportError: without llvmlite.
+    """
+    make = _make_once if _hashes(parameters) else _make
+    return make(cls, parameters, control, recording, threads)
+
+
+def _make(cls: type[Task], parameters: Any, control: str, recording: Any, threads: int) -> CompiledModel:
+    return CompiledModel(cls(parameters, recording=recording), control, threads)
+
+
+_make_once = functools.lru_cache(PROGRAM_CACHE_SIZE)(_make)
+
+
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
     graph = Graph(loops=True)
     with namespace.tracing(graph):

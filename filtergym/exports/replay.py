@@ -96,7 +96,7 @@ def replay(
     """
     problem, name, maker, scenario, keywords = request[:5]
     kind = kind_of(maker)
-    control = control_of(maker, kind, None, problem.task, name)
+    control = control_of(maker, None, problem.task, name)
     given = {**getattr(maker, "task_keywords", {}), **keywords}
     plain = make_model(problem.task, control, scenario, **given)
     model = make_model(problem.task, control, scenario, backend="auto", **given)
