@@ -119,18 +119,7 @@ def run(monkeypatch, *words):
 
 def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    words = (
-        "evaluate",
-        ENV,
-        "--scenario",
-        "paper",
-        "--policy",
-        "imm",
-        "--policy",
-        "adaptive",
-        "--episodes",
-        4,
-    )
+    words = f"evaluate {ENV} --scenario paper --policy imm --policy adaptive --episodes 4".split()
     options = ("--format", "svg", "--columns", 1)
     # All figures are drawn by a test of the command line.
     drawn = evaluation.evaluation_figures
