@@ -45,11 +45,10 @@ claims: $(VENV)/.dev  ## test what is said of results: tables, rankings, limits,
 test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
-fuzz: $(VENV)/.dev  ## every reader of foreign files, coverage-guided, so many seconds each, and odd calls; for the night
+fuzz: $(VENV)/.dev  ## every reader of foreign files, coverage-guided, so many seconds each; for the night
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt atheris
 	for reader in $$($(BIN)/python tests/fuzz_readers.py); do \
-	  OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz_readers.py $$reader $(FUZZ_SECONDS) || failed=1; done; \
-	  OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz_calls.py 2000 $$(date +%s) || failed=1; exit $${failed:-0}
+	  OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz_readers.py $$reader $(FUZZ_SECONDS) || failed=1; done; exit $${failed:-0}
 
 coverage: $(VENV)/.dev  ## run them all, and show the lines that no test reaches
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term

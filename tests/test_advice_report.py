@@ -149,21 +149,20 @@ def test_nothing_that_a_log_says_runs(advice):
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())
-@pytest.mark.parametrize("width", [1200, 700, 400])
-def test_every_picture_is_drawn_and_nothing_complains(page, tmp_path, width):
+def test_every_picture_is_drawn_and_nothing_complains(page, tmp_path):
     from selenium.webdriver.support.ui import WebDriverWait
 
     path = tmp_path / "advice.html"
     path.write_text(page, encoding="utf-8")
-    with browser.opened(path, width) as driver:
-        WebDriverWait(driver, 60.0).until(
-            lambda d: d.execute_script("return document.body.dataset.drawn === 'done'")
-        )
-        drawn = driver.execute_script(
-            "return [...document.querySelectorAll('figure')].map(f => f.querySelectorAll('.main-svg').length)"
-        )
-        assert len(drawn) == 4
-        assert all(drawn)
+    drawn = "return document.body.dataset.drawn === 'done'"
+    graphics = (
+        "return [...document.querySelectorAll('figure')].map(f => f.querySelectorAll('.main-svg').length)"
+    )
+    with browser.opened(path, 400) as driver:
+        WebDriverWait(driver, 60.0).until(lambda d: d.execute_script(drawn))
+        counts = driver.execute_script(graphics)
+        assert len(counts) == 4
+        assert all(counts)
         assert not [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
         assert driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
 

@@ -62,10 +62,8 @@ def write_log(path, names, missed=0.0, outliers=0.0, jitter=0.0, speed=200.0, si
 
 LOGS = {
     "radar": {"names": POLAR, "missed": 0.2, "outliers": 0.05},
-    "walk": {"names": PLANE, "speed": 1.4, "sigma": 1.0, "T": 0.25, "jitter": 0.02},
-    "no deviations": {"names": PLANE[:2], "sigma": 30.0},
-    "latitude": {"names": PLACE, "missed": 0.2, "outliers": 0.05},
-    "latitude only": {"names": PLACE[:2], "jitter": 0.2},
+    "no deviations": {"names": PLANE[:2], "sigma": 30.0, "jitter": 0.02},
+    "latitude": {"names": PLACE, "missed": 0.2, "outliers": 0.05, "jitter": 0.2},
 }
 
 
@@ -82,9 +80,8 @@ def mean_of_evaluation(path, log):
 def mean_of_online(path, log):
     """The same, row by row."""
     named = {old: new for new, old in find_log_setup(PROBLEM, path).columns.items()}
-    rows = [
-        {named[k]: float(v) for k, v in row.items() if "truth" not in k} for row in csv.DictReader(log.open())
-    ]
+    table = csv.DictReader(log.open())
+    rows = [{named[k]: float(v) for k, v in row.items() if "truth" not in k} for row in table]
     running = filtergym.online(ID, str(path))
     running.start_from(*rows[:2])
     return np.array([running.update(**row).mean[:2] for row in rows[2:]])
@@ -228,9 +225,8 @@ def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
 def test_outliers_are_found_where_there_are_some_and_only_there(tmp_path):
     for outliers in (0.0, 0.05):
         recording = read_recording(write_log(tmp_path / "log.csv", PLANE, outliers=outliers), ID)
-        tunable, found, _ = fit_all(
-            FittedLog(PROBLEM, recording), log_families(recording)["constant-velocity"]
-        )
+        family = log_families(recording)["constant-velocity"]
+        tunable, found, _ = fit_all(FittedLog(PROBLEM, recording), family)
         assert (OUTLIER_SHARE in found.values) == (outliers > 0.0)
         named = find_outliers(make_task(PROBLEM.task, None), recording, tunable, found)
         error = recording.measurements["position"][0] - recording.truth[0][:, :2]

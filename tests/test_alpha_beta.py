@@ -62,7 +62,7 @@ def test_acceleration_lag_is_what_a_noiseless_filter_settles_at(alpha):
         truth = 0.5 * a * (k * T) ** 2
         predicted = alpha_beta.predict(position, velocity, T)
         position, velocity = alpha_beta.update(predicted, velocity, truth - predicted, alpha, beta, T)
-        moments = propagate_error(moments, a * T**2 / 2, a * T, 0.0, alpha, beta, T)
+        moments = propagate_error(moments, (a * T**2 / 2, a * T), 0.0, alpha, beta, T)
     assert moments.position == pytest.approx(a * T**2 * (1 - alpha) / beta, rel=1e-12)
     # Positions of 1e7 m leave nine digits behind the point.
     assert truth - position == pytest.approx(a * T**2 * (1 - alpha) / beta, rel=1e-7)
@@ -120,7 +120,7 @@ def test_propagated_error_equals_naive_matrices(seed):
     for _ in range(20):
         a = rng.normal()
         push = np.array([a * T**2 / 2, a * T])
-        moments = propagate_error(moments, push[0], push[1], R, alpha, beta, T)
+        moments = propagate_error(moments, push, R, alpha, beta, T)
         mean = rest @ (F @ mean + push)
         P = rest @ F @ P @ F.T @ rest.T + R * K @ K.T
         np.testing.assert_allclose([moments.position, moments.velocity], mean, rtol=1e-11, atol=1e-11)

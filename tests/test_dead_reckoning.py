@@ -11,7 +11,7 @@ import pandas
 import pytest
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.fitted_filters import families_of, read_artefact, write_advised
-from filtergym.baselines.maneuvering_target.anchored import DeadReckoning, regress_odometry
+from filtergym.baselines.maneuvering_target.anchored import regress_odometry
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording, join_recordings
@@ -144,15 +144,12 @@ def test_displacements_are_read_and_divided_over_scans_without_a_row(tmp_path):
     found = read(holes, tmp_path).measurements
     moved, there = found["odometry_displacement"][0], found["odometry_available"][0]
     # The first two rows make the start; row 22 holds what was moved since row 19, as it is written.
-    np.testing.assert_array_equal(moved[:18], table[["odometry_x", "odometry_y"]].to_numpy()[2:20])
-    np.testing.assert_allclose(
-        moved[18:21], np.tile(table.loc[22, ["odometry_x", "odometry_y"]] / 3.0, (3, 1))
-    )
-    assert there[30] == 0.0
+    written = table[["odometry_x", "odometry_y"]].to_numpy()
+    np.testing.assert_array_equal(moved[:18], written[2:20])
+    np.testing.assert_allclose(moved[18:21], np.tile(written[22] / 3.0, (3, 1)))
+    assert np.flatnonzero(there == 0.0).tolist() == [30]
     assert (moved[30] == 0.0).all()
-    assert there.sum() == len(there) - 1
     assert found["available"][0].sum() == len(there) - 4  # two rows and two fixes are missing
-    assert (there[40:42] == 1.0).all()
 
 
 def test_speed_and_heading_are_displacements(tmp_path):
@@ -171,13 +168,10 @@ def test_speed_and_heading_are_displacements(tmp_path):
     ("change", "message"),
     [
         (lambda t: t.drop(columns="odometry_y"), "lacks the column odometry_y"),
-        (
-            lambda t: t.assign(odometry_speed=1.0, odometry_heading=0.0),
-            "odometry_x and odometry_speed: leave one",
-        ),
+        (lambda t: t.assign(odometry_speed=1.0, odometry_heading=0.0), "odometry_x and odometry_speed: leave one"),
         (lambda t: t.assign(odometry_x=np.nan, odometry_y=np.nan), "columns of the odometry are empty"),
     ],
-)
+)  # fmt: skip
 def test_odometry_that_cannot_be_is_refused(change, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         read(change(drive(count=40)), tmp_path)
@@ -186,7 +180,7 @@ def test_odometry_that_cannot_be_is_refused(change, message, tmp_path):
 def test_nobody_else_is_shown_it(tmp_path):
     """Every number of banks, estimators and agents is the same with it and without."""
     table = drive(count=80)
-    names = ["imm", "kalman-imm-turn", "bptt", "kalman-net"]
+    names = ["imm", "kalman-imm-turn", "bptt"]
     found = evaluate(ID, names, read(table, tmp_path), tracks=True)
     plain = evaluate(ID, names, read(table.drop(columns=["odometry_x", "odometry_y"]), tmp_path), tracks=True)
     np.testing.assert_array_equal(found["estimate"].values, plain["estimate"].values)
@@ -277,16 +271,10 @@ def test_it_is_said_what_its_likelihood_is_of(advice):
 def test_a_second_sensor_that_does_not_help_is_said_so(advice):
     """As where its displacements are of something else."""
     fitted = next(c for c in advice.competitors if c.name == "constant-velocity")
-    worse = advice._replace(
-        fitted=fitted,
-        anchor=advice.anchor._replace(gain=-0.5),
-        profiles={fitted.name: {}},
-    )
+    anchor = advice.anchor._replace(gain=-0.5)
+    worse = advice._replace(fitted=fitted, anchor=anchor, profiles={fitted.name: {}})
     text = "\n".join(advice_lines(worse, []))
-    assert (
-        "The second sensor does not help here: by dead-reckoning measurements 10 s apart are less likely by"
-        in text
-    )
+    assert "The second sensor does not help here: by dead-reckoning measurements 10 s apart are less" in text
     assert "0.50 nats each than by constant-velocity" in text
     assert "times as large as stated, if they are white" in text
 
@@ -294,10 +282,8 @@ def test_a_second_sensor_that_does_not_help_is_said_so(advice):
 @pytest.mark.filterwarnings("ignore:.*is not compiled")  # the code that refuses is not
 def test_its_file_runs_on_such_logs_alone(advice, tmp_path):
     path = tmp_path / "mine.filter.json"
-    name = "dead-reckoning"
-    write_advised(
-        path, PROBLEM, name, advice.recording, advice.fits[name], advice.intervals, "filtergym advise"
-    )
+    fitted = advice.fits["dead-reckoning"]
+    write_advised(path, PROBLEM, "dead-reckoning", advice.recording, fitted, advice.intervals, "test")
     read_artefact(path, PROBLEM)
     recording, table = read(drive(count=200), tmp_path), pandas.read_csv(tmp_path / "drive.csv")
     found = evaluate(ID, [str(path)], recording, tracks=True)
@@ -312,45 +298,27 @@ def test_its_file_runs_on_such_logs_alone(advice, tmp_path):
         evaluate(ID, [str(path)], plain)
 
 
-def test_compiled_code_and_numpy_agree(tmp_path):
-    recording = read(drive(count=120), tmp_path)
-    runs = [
-        evaluate(ID, {"mine": DeadReckoning}, recording, backend=backend, tracks=True)
-        for backend in ("numpy", "auto")
-    ]
-    np.testing.assert_allclose(runs[0]["estimate"].values, runs[1]["estimate"].values, rtol=1e-9)
-
-
 def test_a_log_too_short_for_errors_that_last_has_no_anchor(tmp_path):
     found = advise_of_two(read(drive(count=100), tmp_path))
     assert found.anchor is None
     assert "dead-reckoning" not in found.fits
-
-
-def test_it_is_fitted_only_where_there_is_a_second_sensor(tmp_path):
     plain = read(drive(count=60).drop(columns=["odometry_x", "odometry_y"]), tmp_path)
     assert "dead-reckoning" not in families_of(PROBLEM, plain)
-    assert "dead-reckoning" in families_of(PROBLEM)
 
 
-def test_drives_of_the_public_data_become_logs_with_odometry(tmp_path):
-    torch = pytest.importorskip("torch")
+def test_drives_of_the_public_data_become_logs_with_odometry(tmp_path, torch):
     example = runpy.run_path(str(Path(__file__).parent.parent / "docs" / "examples" / "nclt_odometry.py"))
     table = drive(count=30)
-    speed, heading = (
-        np.hypot(table.odometry_x, table.odometry_y),
-        np.arctan2(table.odometry_y, table.odometry_x),
-    )
+    speed = np.hypot(table.odometry_x, table.odometry_y)
+    heading = np.arctan2(table.odometry_y, table.odometry_x)
     parts = {
         "gps": table[["x", "y"]],
         "ground_truth": table[["truth_position_x", "truth_position_y"]],
         "wheel": np.stack([speed - 0.1, speed + 0.1, heading], axis=1),
     }
-    drives = [
-        {name: torch.tensor(np.asarray(values)) for name, values in parts.items()} | {"data_date": "day"}
-    ]
+    one = {name: torch.tensor(np.asarray(values)) for name, values in parts.items()} | {"data_date": "day"}
     for part in ("test", "val"):
-        torch.save(drives, tmp_path / f"{part}.pt")
+        torch.save([one], tmp_path / f"{part}.pt")
     example["write_drives"](tmp_path, tmp_path / "logs")
     recording = read_recording(tmp_path / "logs" / "day.csv", ID, speeds=(0.0, 100.0))
     moved = recording.measurements["odometry_displacement"][0]

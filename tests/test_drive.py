@@ -1,9 +1,6 @@
-"""The drive of benchmarks/drive.py: reader, alignment, strapdown and levels against known answers; the shipped file."""
+"""The drive of benchmarks/drive.py: strapdown and levels against known answers; the shipped file."""
 
 import importlib.util
-import json
-import struct
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +8,6 @@ import pytest
 import xarray
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
 from filtergym.envs.data import strapdown
-from filtergym.envs.loosely_coupled_navigation.world import Measurement
-from filtergym.filters import loosely_coupled as ins_gnss
-from models import make_model
-from scipy.spatial.transform import Rotation
 
 from filtergym import evaluate, read_recording
 
@@ -23,102 +16,19 @@ spec = importlib.util.spec_from_file_location("drive", ROOT / "benchmarks" / "dr
 drive = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(drive)
 
-BEGIN = datetime(2025, 7, 8, 19, 34, 18, tzinfo=UTC).timestamp()
-
-
-class Circle(CircularDrive):
-    """Written as the repository has its log."""
-
-    def write(self, folder, rate_bias=(0.0, 0.0, 0.0), force_bias=(0.0, 0.0, 0.0)):
-        """Write the log as the repository has it; biases of the vehicle's axes, rad/s and m/s^2."""
-        rates, forces = self.inertial()
-        mounting = Rotation.from_euler("xyz", drive.MOUNTING, degrees=True)
-        measured = mounting.apply(np.concatenate([forces + force_bias, rates + rate_bias]))
-        half = len(self.time)
-        # The logger's clock runs fast by a thousandth, and writes 0.125 s late.
-        rows = np.column_stack(
-            [measured[:half] / 9.80665, np.degrees(measured[half:]), 1000.0 + 1001.0 * self.time]
-        )
-        file = folder / drive.INERTIAL
-        file.parent.mkdir(parents=True)
-        lines = [",".join(f"{value:.9f}" for value in row) for row in rows]
-        # The first line belongs to what was before, the last one is cut.
-        file.write_text("\n".join(["0,0", *lines, lines[-1][:20]]))
-        last = round(1000.0 * self.time[-1])
-        header = b"TIMETAG RTKLIB demo5".ljust(60, b"\0") + struct.pack("<IId", 7, int(BEGIN), drive.DELAY)
-        file.with_name(f"{file.name}.tag").write_bytes(header + struct.pack("<IIII", 5, 60, last, 999))
-        lines = ["%  GPST latitude(deg) ..."]
-        velocity = self.velocity + 0.0
-        every = round(0.25 * RATE)
-        for i in range(0, half, every):
-            at = datetime.fromtimestamp(BEGIN + self.time[i], UTC).strftime("%Y/%m/%d %H:%M:%S.%f")
-            B, L, h = (values[i] for values in self.position())
-            north, east, down = velocity[i]
-            lines.append(
-                f"{at} {B:.10f} {L:.10f} {h:.4f} 1 20 "
-                + "0.01 " * 8
-                + f"{north:.6f} {east:.6f} {-down:.6f} "
-                + "0 " * 6
-            )
-        (folder / drive.FIXES).write_text("\n".join(lines) + "\n")
-        return folder
-
-
-@pytest.fixture(autouse=True)
-def antenna_at_the_imu(monkeypatch):
-    """The circle is driven by a point."""
-    monkeypatch.setattr(drive, "LEVER", (0.0, 0.0, 0.0))
-
 
 @pytest.fixture
 def pyins():
     return pytest.importorskip("pyins", reason="python-ins is in filtergym[dev]")
 
 
-def test_log_is_read(tmp_path, pyins):
-    path = Circle(30.0)
-    path.write(tmp_path)
-    inertial = drive.read_inertial(tmp_path / drive.INERTIAL)
-    np.testing.assert_allclose(inertial.index - BEGIN, path.time, atol=1e-6)
-    rates, forces = path.inertial()
-    np.testing.assert_allclose(inertial.to_numpy(), np.hstack([rates, forces]), atol=1e-7)
-    fixes = drive.read_fixes(tmp_path / drive.FIXES)
-    np.testing.assert_allclose(fixes.index - BEGIN, 0.25 * np.arange(120), atol=1e-5)
-    np.testing.assert_allclose(
-        strapdown.tangent_plane(fixes, (LATITUDE, LONGITUDE)),
-        np.stack([path.east, path.north])[:, ::10],
-        atol=0.02,
-    )
-
-
-@pytest.mark.slow
-def test_ins_aligned_by_the_log_follows_the_circle(tmp_path, pyins, monkeypatch):
-    """Biases that the standstill and the turns tell apart do not drive it away: left alone, those make 50 m of 20 s."""
-    monkeypatch.setattr(drive, "ALIGNMENT", 20.0)
-    path = Circle(52.0)
-    path.write(tmp_path, rate_bias=(0.004, -0.003, 0.002), force_bias=(0.05, -0.03, 0.04))
-    fixes, inertial = drive.read_fixes(tmp_path / drive.FIXES), drive.read_inertial(tmp_path / drive.INERTIAL)
-    aligned = drive.aligned(inertial, fixes)  # once: it takes seconds
-    monkeypatch.setattr(drive, "aligned", lambda *_: aligned)
-    recorded = drive.recordings(inertial, fixes, seed=3)
-    assert recorded["recording"].values.tolist() == ["29 s"]
-    assert drive.errors(recorded).shape == (2, 81)
-    assert abs(drive.errors(recorded)).max() < 1.0
-    truth = np.stack([path.east, path.north], axis=1)[10 * 118 : 10 * 199 : 10]
-    origin = recorded["truth"].values[0, 0] - truth[0]
-    np.testing.assert_allclose(recorded["truth"].values[0] - origin, truth, atol=0.05)
-    again = drive.recordings(inertial, fixes, seed=3)
-    np.testing.assert_array_equal(again["fix"], recorded["fix"])
-
-
-@pytest.mark.parametrize("error", [0.0, 0.2])
-def test_free_ins_of_a_constant_acceleration_error(pyins, error):
-    """Without one it follows the circle; with one along the vehicle's down axis the height goes off by b t^2 / 2."""
+def test_free_ins_of_a_constant_acceleration_error(pyins):
+    """East and north follow the circle; along the vehicle's down axis the height goes off by b t^2 / 2."""
     import pandas
     from pyins import strapdown as pyins_strapdown
     from pyins import util
 
-    path = Circle(36.0)
+    path, error = CircularDrive(27.0), 0.2
     rates, forces = path.inertial()
     inertial = pandas.DataFrame(np.hstack([rates, forces]), path.time, [*util.GYRO_COLS, *util.ACCEL_COLS])
     begin = round(15.5 * RATE)  # in the circle
@@ -132,52 +42,15 @@ def test_free_ins_of_a_constant_acceleration_error(pyins, error):
     known = strapdown.AidedInertial(
         pandas.DataFrame(columns, path.time, util.TRAJECTORY_COLS), biases, increments, innovations={}
     )
-    times = path.time[begin : begin + 801 : 10]
+    times = path.time[begin : begin + 401 : 10]
     found = strapdown.free_inertial(known, times)
     east, north = strapdown.tangent_plane(found, (LATITUDE, LONGITUDE))
     expected = strapdown.tangent_plane(
-        pandas.DataFrame(position[begin : begin + 801 : 10], times, util.LLA_COLS), (LATITUDE, LONGITUDE)
+        pandas.DataFrame(position[begin : begin + 401 : 10], times, util.LLA_COLS), (LATITUDE, LONGITUDE)
     )
     np.testing.assert_allclose([east, north], expected, atol=0.1)
     down = 0.5 * error * (times - times[0]) ** 2
     np.testing.assert_allclose(found["alt"], HEIGHT - down, atol=0.1)
-
-
-LEVELS = {"drift": 0.3, "coloured": 0.5, "correlation_time": 4.0, "white_intensity": 0.02}
-
-
-def test_modelled_error_is_the_filters_own():
-    p = make_model(
-        "filtergym/LooselyCoupledNavigation-v0", scenario="paper", **{**drive.PARAMETERS, **LEVELS}
-    ).task.parameters
-    covariance, expected = p.prior_covariance(np.zeros(())), []
-    for _ in range(81):
-        covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.variance_growth)
-        expected.append(covariance.position)
-    found = drive.modelled(0.25 * np.arange(1, 82), LEVELS)
-    np.testing.assert_allclose(np.diag(found), expected, rtol=1e-9)
-    assert np.linalg.eigvalsh(found).min() > 0.0
-
-
-def test_likeliest_levels_are_those_of_the_model():
-    """Of 400 windows drawn from it: what a filter sees, the growth of the error, is met."""
-    time = 0.25 * np.arange(1, 82)
-    factor = np.linalg.cholesky(drive.modelled(time, LEVELS))
-    generator = np.random.default_rng(5)
-    error = (factor @ generator.standard_normal((81, 800))).T.reshape(400, 2, 81).transpose(0, 2, 1)
-    truth = np.zeros((400, 82, 2))
-    ins = np.concatenate([np.zeros((400, 1, 2)), error], axis=1)
-    fix = 1.414 * generator.standard_normal((400, 81, 2))
-    recorded = drive.dataset(truth, ins, fix, 1.414, np.arange(400.0))
-    levels, likelihood = drive.likeliest(recorded)
-    ratio = (
-        np.diag(drive.modelled(time, levels))[[3, 19, 80]]
-        / np.diag(drive.modelled(time, LEVELS))[[3, 19, 80]]
-    )
-    assert abs(np.log(ratio)).max() < 0.2
-    worse = drive.likeliest(recorded, 0.2)
-    assert worse[0]["correlation_time"] == pytest.approx(0.2)
-    assert worse[1] < likelihood
 
 
 @pytest.fixture(scope="module")
@@ -185,28 +58,13 @@ def shipped():
     return xarray.load_dataset(ROOT / "docs" / "data" / "drive.nc", engine="scipy")
 
 
-def test_shipped_file_is_a_recording(shipped):
-    assert (ROOT / "docs" / "data" / "drive.nc").stat().st_size < 300_000
-    licence = (ROOT / "docs" / "data" / "drive_licence.txt").read_text(encoding="utf-8")
-    assert "BSD 3-Clause License" in licence
-    assert shipped.attrs["source"].split("commit ")[1].split(",")[0] in licence
-    model = make_model(shipped.attrs["environment"], **json.loads(shipped.attrs["parameters"]))
-    assert json.loads(shipped.attrs["parameters"]) == drive.PARAMETERS
-    assert [c.name for c in model.task.components] == shipped["component"].values.tolist()
-    for name in (*Measurement._fields, "seconds", "truth", "initial_mean", "initial_covariance", "length"):
-        assert np.isfinite(shipped[name]).all(), name
-    assert shipped["ins"].shape == (24, 81, 2)
-    assert (shipped["length"] == 80).all()
-
-
 def test_shipped_file_is_a_drive(shipped):
     """Arrays agree with each other, fixes have the noise they report, and the car keeps to the speeds of a town."""
     start = shipped["initial_mean"].values[:, None]
     ins = np.concatenate([start, shipped["ins"].values], axis=1)
     np.testing.assert_array_equal(np.diff(ins, axis=1), shipped["increment"])
-    noise = (shipped["fix"].values - shipped["truth"].values) / shipped["reported_deviation"].values[
-        ..., None
-    ]
+    stated = shipped["reported_deviation"].values[..., None]
+    noise = (shipped["fix"].values - shipped["truth"].values) / stated
     assert noise.std() == pytest.approx(1.0, abs=0.04)  # four deviations of 3888 numbers
     assert abs(noise.mean()) < 0.07
     truth = np.concatenate([start, shipped["truth"].values], axis=1)
@@ -221,6 +79,10 @@ def test_shipped_file_is_a_drive(shipped):
 
 def test_shipped_file_is_replayed_to_every_kind_of_filter():
     read = read_recording(ROOT / "docs" / "data" / "drive.nc")
+    licence = (ROOT / "docs" / "data" / "drive_licence.txt").read_text(encoding="utf-8")
+    assert "BSD 3-Clause License" in licence
+    assert read.source.split("commit ")[1].split(",")[0] in licence
+    assert read.parameters == drive.PARAMETERS
     found = evaluate(read.environment, ["plain-reduced", "augmented", "gnss-only"], scenario=read)
     assert found.sizes["episode"] == 24
     assert np.isfinite(found["error"].values).all()

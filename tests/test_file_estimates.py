@@ -36,7 +36,14 @@ def judged(path, **settings):
 @pytest.mark.parametrize("form", ["csv", "nc", "tum"])
 def test_what_is_written_costs_what_it_has_cost(files, form):
     folder, whole = files
-    found, records = judged(folder / f"imm.{form}")
+    path = folder / f"imm.{form}"
+    if form == "tum":
+        kinds = ("imm", "truth.imm")
+        assert {each.name for each in path.iterdir()} == {f"{k}.{i}.tum" for k in kinds for i in range(6)}
+        rows = np.loadtxt(path / "truth.imm.1.tum")
+        np.testing.assert_allclose(rows[:, 1:3], whole["truth"].values[0, 1, :, :2], atol=1e-9)
+        np.testing.assert_array_equal(rows[:, 3:], np.tile([0.0, 0, 0, 0, 1], (len(rows), 1)))
+    found, records = judged(path)
     # Trajectories have nine decimals.
     np.testing.assert_allclose(found["cost"], whole["cost"], rtol=0.0 if form != "tum" else 1e-9)
     assert records["missing", ""] == records["lost_episodes", ""] == 0.0
@@ -56,9 +63,8 @@ def test_a_covariance_is_taken_as_it_is_stated_beside_whoever_states_it(files):
         for j, b in enumerate(names[: i + 1]):
             table[f"covariance_{a}_{b}"] = whole["covariance"].values[0, :, :, i, j].ravel()
     table.to_csv(folder / "whole.csv", index=False)
-    table[["recording", "seconds", "estimate_position_x", "estimate_position_y", "sigma_position_x"]].to_csv(
-        folder / "part.csv", index=False
-    )
+    some = ["recording", "seconds", "estimate_position_x", "estimate_position_y", "sigma_position_x"]
+    table[some].to_csv(folder / "part.csv", index=False)
     names = ["imm", f"file:{folder / 'whole.csv'}", f"file:{folder / 'part.csv'}"]
     found = evaluate(TARGET, names, **SETTINGS)
     np.testing.assert_allclose(found["nees"][1], whole["nees"][0], rtol=1e-9)  # a root and a square
@@ -113,22 +119,16 @@ def test_a_recording_is_matched_by_its_names_and_its_own_clock(files, tmp_path):
     ("text", "said"),
     [
         ("a,b\n1,2\n", "holds no estimate of position_x"),
-        (
-            "track,seconds,position_x,position_y\nfoo,1,2,3\n",
-            "tracks foo, and those of the evaluation are 0, 1",
-        ),
+        ("track,seconds,position_x,position_y\nfoo,1,2,3\n", "tracks foo, and those of the evaluation are 0, 1"),
         ("seconds,position_x,position_y\n1,2,3\n", "names no tracks"),
         ("track,seconds,velocity_x\n0,1,2\n", "holds no position_x, position_y, velocity_y, without which"),
         ("track,position_x,position_y\n0,2,3\n", "needs a column seconds"),
         ("track,seconds,position_x,position_y\n0,1,x,3\n", "position_x has 'x' in row 0"),
-        (
-            "track,time,position_x,position_y\n0,2024-05-01T00:00:00,1,3\n",
-            "are dates, and those of a simulation",
-        ),
+        ("track,time,position_x,position_y\n0,2024-05-01T00:00:00,1,3\n", "are dates, and those of a simulation"),
         ("policy,track,seconds,position_x\na,0,1,2\nb,0,2,2\n", "several competitors, a, b"),
         (None, "there is no such file"),
     ],
-)
+)  # fmt: skip
 def test_what_belongs_to_no_track_is_refused(tmp_path, text, said):
     if text is not None:
         (tmp_path / "mine.csv").write_text(text)
@@ -137,7 +137,9 @@ def test_what_belongs_to_no_track_is_refused(tmp_path, text, said):
         FileEstimates(tmp_path / "mine.csv").of_tracks(task, {11: "0", 12: "1"})
 
 
-def test_a_closed_loop_is_refused(files):
+def test_what_cannot_be_written_or_judged_is_refused(files):
+    with pytest.raises(ValueError, match=r"estimates are written as \.csv or \.nc"):
+        write_estimates(files[0] / "imm.txt", files[1])
     with pytest.raises(ValueError, match="closed loop"):
         evaluate("filtergym/UavAutopilot-v0", f"file:{files[0] / 'imm.csv'}", episodes=2)
 

@@ -78,15 +78,6 @@ def test_local_tangent_plane_is_that_of_a_geodesy_library():
     np.testing.assert_allclose(found, [east, north], rtol=0, atol=1e-8)
 
 
-def test_local_tangent_plane_by_hand():
-    # On the equator east is the sine of the longitude times the semi-major axis, and height adds to it.
-    angle = np.radians(1.0)
-    found = east_north(np.zeros(1), np.array([angle]), np.array([1000.0]), (0.0, 0.0))
-    np.testing.assert_allclose(
-        found[:, 0], [(6378137.0 + 1000.0) * np.sin(angle), 0.0], rtol=1e-12, atol=1e-8
-    )
-
-
 # --- reading
 
 
@@ -98,20 +89,18 @@ def test_every_form_of_time_and_file_is_the_same_flight(tmp_path):
     nanoseconds = np.array([d.replace(tzinfo=None) for d in dates], dtype="datetime64[ns]")
     table(tmp_path / "iso.csv", time=[d.isoformat() for d in dates], x=x, y=y)
     table(tmp_path / "zulu.csv", Timestamp=[f"{d:%Y-%m-%dT%H:%M:%SZ}" for d in dates], X=x, Y=y)
-    for unit in ("ns", "us", "ms", "s"):
-        columns = {"time": nanoseconds.astype(f"datetime64[{unit}]"), "x": x, "y": y}
-        parquet.write_table(pyarrow.table(columns), tmp_path / f"{unit}.parquet")
     stamped = pyarrow.array(nanoseconds, pyarrow.timestamp("ns", tz="Europe/Paris"))
-    parquet.write_table(pyarrow.table({"time": stamped, "x": x, "y": y}), tmp_path / "zone.parquet")
+    for name, stamps in (("ns", nanoseconds), ("s", nanoseconds.astype("datetime64[s]")), ("zone", stamped)):
+        parquet.write_table(pyarrow.table({"time": stamps, "x": x, "y": y}), tmp_path / f"{name}.parquet")
     data = {"x": ("time", x, {"units": "m"}), "y": ("time", y)}
-    xarray.Dataset(data, {"time": nanoseconds}).to_netcdf(tmp_path / "dates.nc", engine="scipy")
-    xarray.Dataset(data, {"time": FIVE}).to_netcdf(tmp_path / "seconds.nc", engine="scipy")
+    for name, stamps in (("dates", nanoseconds), ("seconds", FIVE)):
+        xarray.Dataset(data, {"time": stamps}).to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
     as_json(tmp_path / "rows.json", timestamp=(1000 * (1_700_000_000 + FIVE)).astype(int), x=x, y=y)
     by_columns = {"time": FIVE + 1.7e9, "x": x, "y": y}
     text = json.dumps({name: dict(enumerate(values.tolist())) for name, values in by_columns.items()})
     (tmp_path / "columns.json").write_text(text)
     found = read_flights(tmp_path)
-    assert len(found.trajectories) == 11
+    assert len(found.trajectories) == 9
     for trajectory in found.trajectories:
         np.testing.assert_allclose(trajectory.time - trajectory.time[0], FIVE, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(trajectory.position, weave(FIVE))
@@ -174,34 +163,23 @@ def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flo
 
 def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(
-        ValueError, match="is not installed; its samples need nothing else: pip install --no-deps"
-    ):
+    with pytest.raises(ValueError, match=r"is not installed; .* pip install --no-deps"):
         make_model(ID, scenario="traffic:quickstart")
     folder = tmp_path / "traffic" / "data" / "samples" / "collections"
     folder.mkdir(parents=True)
     (tmp_path / "traffic" / "__init__.py").write_text("raise ImportError('of a long chain of libraries')")
     _, latitude, longitude, height = geodetic()
-    columns = {
-        "timestamp": (1000 * (1_700_000_000 + FIVE)).astype(int),
-        "latitude": latitude,
-        "longitude": longitude,
-    }
-    as_json(
-        folder / "quickstart.json.gz", **columns, altitude=height / 0.3048, groundspeed=240.0 + 0.0 * FIVE
-    )
+    columns = {"timestamp": (1000 * (1_700_000_000 + FIVE)).astype(int), "latitude": latitude}
+    columns |= {"longitude": longitude, "altitude": height / 0.3048, "groundspeed": 240.0 + 0.0 * FIVE}
+    as_json(folder / "quickstart.json.gz", **columns)
     importlib.invalidate_caches()
     found = read_flights("traffic:quickstart")
     site = (round(float(np.median(latitude)), 2), round(float(np.median(longitude)), 2))
     assert found.sources[0].notes == (f"radar at {site[0]:.2f}, {site[1]:.2f}",)
-    origin = tuple(np.radians(site))
-    expected = east_north(np.radians(latitude), np.radians(longitude), height, origin).T
+    expected = np.stack(pymap3d.geodetic2enu(latitude, longitude, height, *site, 0.0)[:2], axis=1)
     np.testing.assert_allclose(found.trajectories[0].position, expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.diff(found.trajectories[0].time), 5.0, rtol=1e-9)
-    assert make_model(ID, scenario="traffic:quickstart").task.parameters.flight == "track"
-    with pytest.raises(
-        ValueError, match="the package traffic has no sample 'quikstart': did you mean quickstart"
-    ):
+    with pytest.raises(ValueError, match="has no sample 'quikstart': did you mean quickstart"):
         read_flights("traffic:quikstart")
 
 
@@ -246,11 +224,6 @@ def test_smoothing_is_a_parabola_around_each_position(tmp_path):
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.5, 2.0, 60))
     parabola = np.stack([1e4 + 90.0 * time + 0.8 * time**2, 2e4 - 70.0 * time], axis=1)
-    position, velocity = fit_parabolas(time, parabola, 10.0)
-    np.testing.assert_allclose(position, parabola, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(
-        velocity, np.stack([90.0 + 1.6 * time, -70.0 + 0.0 * time], axis=1), rtol=0, atol=1e-8
-    )
     noisy = parabola + rng.normal(0.0, 30.0, parabola.shape)
     position, velocity = fit_parabolas(time, noisy, 7.0)
     for i in (0, 1, 30, 59):
@@ -258,7 +231,7 @@ def test_smoothing_is_a_parabola_around_each_position(tmp_path):
         naive = np.polynomial.polynomial.polyfit(time[near] - time[i], noisy[near], 2)
         np.testing.assert_allclose(position[i], naive[0], rtol=1e-9)
         np.testing.assert_allclose(velocity[i], naive[1], rtol=1e-6, atol=1e-6)
-    few = fit_parabolas(time[::10], parabola[::10], 1.0)[0]
+    few = fit_parabolas(time[::10], parabola[::10], 1.0)[0]  # of neighbours that are farther away
     np.testing.assert_allclose(few, parabola[::10], rtol=0, atol=1e-6)
     (found,) = read_flights(flight_file(tmp_path / "a.csv"), smoothing=20.0).trajectories
     np.testing.assert_array_equal(found.velocity, fit_parabolas(FIVE, weave(FIVE), 20.0)[1])
@@ -281,59 +254,38 @@ def test_the_line_about_a_file(tmp_path):
 ONE = {"time": FIVE, "x": weave(FIVE)[:, 0], "y": weave(FIVE)[:, 1]}
 DEGREES = {"time": FIVE, "latitude": 48.0 + FIVE * 1e-3, "longitude": 2.0 + 0.0 * FIVE}
 V = np.gradient(weave(FIVE), FIVE, axis=0).T
-WRONG = {
-    "kilometres": (
-        ONE | {"x": ONE["x"] / 1e3, "y": ONE["y"] / 1e3},
-        "median speed 0.12 m/s: are x, y kilometres",
-    ),
-    "degrees as metres": (
-        {"time": FIVE, "x": DEGREES["longitude"], "y": DEGREES["latitude"]},
-        "are x, y degrees. then call them longitude and latitude",
-    ),
-    "milliseconds": (ONE | {"time": 1e3 * FIVE}, "are the times milliseconds"),
-    "minutes": (ONE | {"time": FIVE / 60.0}, "median speed 7218 m/s: are the times minutes"),
-    "hours": (ONE | {"time": FIVE / 3600.0}, "are the times hours"),
-    "knots": (ONE | {"vx": 1.944 * V[0], "vy": 1.944 * V[1]}, "vx, vy are 1.94 times .* are they knots"),
-    "km/h": (ONE | {"vx": 3.6 * V[0], "vy": 3.6 * V[1]}, "are they km/h"),
-    "standing": (
-        ONE | {"x": 0.0 * FIVE + 9e3, "y": 0.0 * FIVE + 9e3},
-        "median speed 0 m/s: does it move at all",
-    ),
-    "decreasing": (ONE | {"time": FIVE[::-1]}, "times must increase, but row 1 has 190 s after 195 s"),
-    "duplicate": (
-        ONE | {"time": np.repeat(FIVE[::2], 2)},
-        "times must increase, but row 1 has 0 s after 0 s",
-    ),
-    "all empty": (ONE | {"x": [""] * len(FIVE)}, "at least two positions, got 0"),
-    "infinite": (ONE | {"x": [*ONE["x"][:-1], "inf"]}, "x has a value that is not finite in row 39"),
-    "no time": (ONE | {"time": ["", *FIVE[1:]]}, "time has a value that is not finite in row 0"),
-    "words": (
-        ONE | {"y": [*ONE["y"][:3], "lost", *ONE["y"][4:]]},
-        "y has 'lost' in row 3, which is no number",
-    ),
-    "strange dates": (
-        ONE | {"time": ["1 May", *FIVE[1:]]},
-        "time has '1 May' in row 0, .* neither seconds nor a date",
-    ),
-    "one row": ({n: v[:1] for n, v in ONE.items()}, "at least two positions, got 1"),
-    "other columns": (
-        {"time": FIVE, "speed": FIVE},
-        "lacks the column x, y; it has time, speed and needs time, x, y",
-    ),
-    "no longitude": ({"time": FIVE, "lat": FIVE}, "lacks the column longitude"),
-    "no site": (DEGREES, "give the radar's, --site LATITUDE,LONGITUDE"),
-    "metres as degrees": (
-        DEGREES | {"latitude": 1e3 * FIVE},
-        "latitude reaches 195000, and degrees from -90 to 90 are expected: is it metres",
-    ),
-    "sparse": (ONE | {"time": 20.0 * FIVE}, "positions are 100 s apart, longer than the longest gap of 60 s"),
-    "too fast for any unit": (ONE | {"x": 1e9 * FIVE}, "median speed 1e.09 m/s: .* allow higher speeds"),
-    "short": ({n: v[:10] for n, v in ONE.items()}, "1 piece, 1 dropped .shorter than 10 scans of 6 s."),
-    "far": (ONE | {"x": ONE["x"] + 9e5}, "goes 943 km from the radar, whose range ends at 500 km"),
-}
+STANDING = {"x": np.full(len(FIVE), 9e3), "y": np.full(len(FIVE), 9e3)}
+SWAPPED = {"time": FIVE, "x": DEGREES["longitude"], "y": DEGREES["latitude"]}
+LOST = [*ONE["y"][:3], "lost", *ONE["y"][4:]]
+WRONG = [
+    (ONE | {"x": ONE["x"] / 1e3, "y": ONE["y"] / 1e3}, "median speed 0.12 m/s: are x, y kilometres"),
+    (SWAPPED, "are x, y degrees. then call them longitude and latitude"),
+    (ONE | {"time": 1e3 * FIVE}, "are the times milliseconds"),
+    (ONE | {"time": FIVE / 60.0}, "median speed 7218 m/s: are the times minutes"),
+    (ONE | {"time": FIVE / 3600.0}, "are the times hours"),
+    (ONE | {"vx": 1.944 * V[0], "vy": 1.944 * V[1]}, "vx, vy are 1.94 times .* are they knots"),
+    (ONE | {"vx": 3.6 * V[0], "vy": 3.6 * V[1]}, "are they km/h"),
+    (ONE | STANDING, "median speed 0 m/s: does it move at all"),
+    (ONE | {"time": FIVE[::-1]}, "times must increase, but row 1 has 190 s after 195 s"),
+    (ONE | {"time": np.repeat(FIVE[::2], 2)}, "times must increase, but row 1 has 0 s after 0 s"),
+    (ONE | {"x": [""] * len(FIVE)}, "at least two positions, got 0"),
+    (ONE | {"x": [*ONE["x"][:-1], "inf"]}, "x has a value that is not finite in row 39"),
+    (ONE | {"time": ["", *FIVE[1:]]}, "time has a value that is not finite in row 0"),
+    (ONE | {"y": LOST}, "y has 'lost' in row 3, which is no number"),
+    (ONE | {"time": ["1 May", *FIVE[1:]]}, "time has '1 May' in row 0, .* neither seconds nor a date"),
+    ({n: v[:1] for n, v in ONE.items()}, "at least two positions, got 1"),
+    ({"time": FIVE, "speed": FIVE}, "lacks the column x, y; it has time, speed and needs time, x, y"),
+    ({"time": FIVE, "lat": FIVE}, "lacks the column longitude"),
+    (DEGREES, "give the radar's, --site LATITUDE,LONGITUDE"),
+    (DEGREES | {"latitude": 1e3 * FIVE}, "latitude reaches 195000, and degrees .*: is it metres"),
+    (ONE | {"time": 20.0 * FIVE}, "positions are 100 s apart, longer than the longest gap of 60 s"),
+    (ONE | {"x": 1e9 * FIVE}, "median speed 1e.09 m/s: .* allow higher speeds"),
+    ({n: v[:10] for n, v in ONE.items()}, "1 piece, 1 dropped .shorter than 10 scans of 6 s."),
+    (ONE | {"x": ONE["x"] + 9e5}, "goes 943 km from the radar, whose range ends at 500 km"),
+]
 
 
-@pytest.mark.parametrize(("columns", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("columns", "message"), WRONG, ids=[message for _, message in WRONG])
 def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
     file = table(tmp_path / "wrong.csv", **columns)
     with pytest.raises(ValueError, match=message) as told:
@@ -347,11 +299,9 @@ def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
     [
         ("binary.csv", bytes(range(256)), "it is no text in UTF-8"),
         ("binary.nc", bytes(range(256)), "cannot read trajectory .*binary.nc"),
-        ("binary.parquet", bytes(range(256)), "cannot read trajectory .*binary.parquet"),
         ("empty.csv", b"", "lacks the column time, x, y"),
         ("twice.csv", b"time,x,x,y\n0,1,2,3\n6,2,3,4\n", "it has the column x more than once"),
         ("ragged.csv", b"time,x,y\n0,1,2\n6,2\n", "3 column names but 2 columns in row 1"),
-        ("comma.csv", b"time,x,y\n0,5,1,5,2,5\n", "3 column names but 6 columns in row 0"),
         ("words.txt", b"time,x,y\n", "files of flights end in .csv, .nc, .parquet, .json, .json.gz"),
         ("number.json", b"3", "JSON of flights is a list of rows"),
         ("cut.json.gz", gzip.compress(b"[{}]", mtime=0)[:-9], "cannot read trajectory .*cut.json.gz"),
@@ -427,9 +377,7 @@ def test_environments_without_flights_say_so(tmp_path):
 def test_broken_files_are_left_out_and_named_and_a_set_of_them_is_refused(tmp_path):
     (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
     flight_file(tmp_path / "minutes.csv", FIVE / 60.0, speed=7200.0)
-    with pytest.raises(
-        ValueError, match=r"nothing of .* can be flown: binary.csv: it is no text.*; minutes.csv: median"
-    ):
+    with pytest.raises(ValueError, match=r"nothing of .* can be flown: binary.csv: it is no text.*; minutes"):
         read_flights(tmp_path)
     flight_file(tmp_path / "whole.csv")
     used, lines = read_flights(str(tmp_path / "*.csv")).flyable(6.0, 5e5)
@@ -465,10 +413,9 @@ def test_the_table_of_flights_is_every_flight_on_its_own():
     np.testing.assert_array_equal(model.context(episode)["flight"], [0, 1, 2, 2, 0, 1, 1, 0])
 
 
-@pytest.mark.parametrize("backend", ["compiled", "numpy"])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_vector_and_single_environments_agree_and_end_with_their_flight(backend, mode):
-    keywords = {"scenario": three(), "backend": backend, "control": "gain"}
+def test_vector_and_single_environments_agree_and_end_with_their_flight(mode):
+    keywords = {"scenario": three(), "control": "gain"}
     vector = gym.make_vec(ID, num_envs=4, autoreset_mode=mode, **keywords)
     singles = [gym.make(ID, **keywords) for _ in range(4)]
     shown = vector.reset(seed=5)[0]
@@ -496,21 +443,8 @@ def test_vector_and_single_environments_agree_and_end_with_their_flight(backend,
     assert lengths == {32, 16, 24}
 
 
-def test_snapshots_and_shortened_episodes_know_the_flight():
-    env = gym.make_vec(ID, num_envs=6, scenario=three())
-    env.reset(seed=0)
-    lanes = env.unwrapped.fleet.only
-    kept, lengths = lanes.snapshot(), lanes._lengths.copy()
-    assert set(lengths.tolist()) == {32, 16, 24}
-    env.reset(seed=9)
-    lanes.restore(kept)
-    np.testing.assert_array_equal(lanes._lengths, lengths)
-    env.reset(seed=0, options={"shortened_by": np.full(6, 31)})
-    np.testing.assert_array_equal(env.step(env.action_space.sample())[3], True)
-
-
 def test_an_evaluation_flies_every_flight_as_often_and_what_environments_fly():
-    dataset = evaluate(ID, ["imm", "adaptive", "known-turn", "known-input-bound"], three(), episodes=7)
+    dataset = evaluate(ID, ["imm", "known-turn", "known-input-bound"], three(), episodes=7)
     names, counts = np.unique(dataset["flight"].values, return_counts=True)
     assert names.tolist() == ["flight 0", "flight 1", "flight 2"]
     assert counts.tolist() == [3, 3, 3]
@@ -520,16 +454,14 @@ def test_an_evaluation_flies_every_flight_as_often_and_what_environments_fly():
     for i in range(9):
         last = lengths[str(dataset["flight"].values[i])]
         assert dataset["length"].values[i] == last
-        cost = dataset["cost"].values[:3, i]
-        assert np.isfinite(cost[:, :last]).all()
-        assert np.isnan(cost[:, last:]).all()
+        np.testing.assert_array_equal(np.isfinite(dataset["cost"].values[:2, i]), [np.arange(32) < last] * 2)
         observation, memory, own = env.reset(seed=int(dataset["episode_seed"].values[i]))[0], None, []
         truncated = False
         while not truncated:
             action, memory = policy.predict(observation, memory, np.array([not own]), True)
             observation, _, _, truncated, info = env.step(action)
             own.append(info["cost"])
-        np.testing.assert_array_equal(own, cost[0, :last])
+        np.testing.assert_array_equal(own, dataset["cost"].values[0, i, :last])
 
 
 def test_records_by_hand():
@@ -537,23 +469,16 @@ def test_records_by_hand():
     per_episode = np.nanmean(dataset["cost"].values, axis=-1)
     found = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
     assert found["imm", "cost", ""].value == pytest.approx(per_episode[0].mean(), rel=1e-12)
-    difference = per_episode[1].mean() / per_episode[0].mean() - 1.0
-    assert found["adaptive", "relative_cost_difference", ""].value == pytest.approx(difference, rel=1e-9)
     squares = np.nansum(dataset["error"].values[0, ..., :2] ** 2, axis=-1)
     there = ~np.isnan(dataset["error"].values[0, ..., 0])
     peak = np.sqrt((squares.sum(axis=0) / there.sum(axis=0)).max())
     assert found["imm", "peak_rmse", "position"].value == pytest.approx(peak, rel=1e-12)
-    assert all(
-        r.low is not None and np.isfinite(r.low)
-        for r in found.values()
-        if r.metric not in ("score", "best_share")
-    )
     flown = {(r.scenario, r.policy, r.metric, r.component): r for r in flight_records(dataset)}
     for flight in ("flight 0", "flight 1", "flight 2"):
-        mine = dataset["flight"].values == flight
         record = flown[f"3 flights: {flight}", "imm", "cost", ""]
         assert record.episodes == 2
-        assert record.value == pytest.approx(per_episode[0, mine].mean(), rel=1e-12)
+        mine = per_episode[0, dataset["flight"].values == flight]
+        assert record.value == pytest.approx(mine.mean(), rel=1e-12)
     assert dataset.attrs["scenario"] == "3 flights"
 
 
@@ -562,12 +487,6 @@ def test_flights_of_the_same_name_are_not_pieces_of_one():
     assert set(evaluate(ID, ["zero"], [one, two, three_], 3)["flight"].values) == {
         f"trajectory {i}" for i in (1, 2, 3)
     }
-
-
-def test_one_flight_of_a_file_is_the_trajectory_itself(tmp_path):
-    flight_file(tmp_path / "one.csv")
-    model = make_model(ID, scenario=tmp_path / "one.csv")
-    assert model.task.parameters == make_model(ID, scenario=Trajectory(FIVE, weave(FIVE))).task.parameters
 
 
 def test_a_horizon_ends_every_flight_and_decisions_that_hold_fit():
@@ -650,14 +569,6 @@ def test_the_example_of_the_page_prints_what_it_says(capsys):
     code = page.partition("```python\n")[2].partition("```")[0]
     exec(code, {})
     assert capsys.readouterr().out.strip() == code.strip().rpartition("# ")[2]
-
-
-def test_site_without_flights_is_refused(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["filtergym", "evaluate", ID, "--policy", "imm", "--site", "48,2"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "--site is for flights from files" in capsys.readouterr().err
 
 
 def test_an_aircraft_that_has_landed_flies_another_flight(tmp_path):

@@ -1,8 +1,7 @@
-"""Three hundred broken inputs through the command line: every one is taken, or refused in one sentence."""
+"""Two hundred broken inputs through the command line: every one is taken, or refused in one sentence."""
 
 import json
 import random
-import shutil
 import warnings
 
 import commands
@@ -21,23 +20,8 @@ WHOLE = 10
 """Of so many inputs one runs to the end, if it is taken; the others are refused for zero episodes, after the input was
 read."""
 ODD = (
-    "",
-    "NaN",
-    "-Infinity",
-    "1e999",
-    "null",
-    "true",
-    "[]",
-    "{}",
-    '"x"',
-    "-1",
-    "0",
-    "\\",
-    "\x00",
-    "[[[[",
-    "é",
-    "1e-300",
-)
+    "", "NaN", "-Infinity", "1e999", "null", "true", "[]", "{}", '"x"', "-1", "0", "\\", "\x00", "[[[[", "é", "1e-300",
+)  # fmt: skip
 WORDS = (
     "gains=(0.3,0.7)", "transition=((0.9,0.1),(0.1,0.9))", "range_sigma=100.0", "polar_measurements=True",
     "flight=random", "legs=((10,3),)", "maneuver_steps=(50,55)", "decision_interval=1",
@@ -110,13 +94,6 @@ def flight(path):
             file.createVariable(name, "d", ("time",))[:] = values
 
 
-def run_folder(path):
-    (path / "best").mkdir(parents=True)
-    source = PRETRAINED / "ManeuveringTarget-v0" / "bptt"
-    shutil.copyfile(source.with_suffix(".safetensors"), path / "best" / "agent.safetensors")
-    shutil.copyfile(source.with_suffix(".json"), path / "run.json")
-
-
 def episodes(i):
     return "--episodes", 0 if i % WHOLE else 1
 
@@ -125,7 +102,7 @@ def test_learned_policies(tmp_path, command):
     rng, file = random.Random(0), tmp_path / "agent.safetensors"
     content = (PRETRAINED / "ManeuveringTarget-v0" / "ppo.safetensors").read_bytes()
     size = int.from_bytes(content[:8], "little")
-    for i in range(80):
+    for i in range(50):
         header = mutated(content[8 : 8 + size], rng)
         if rng.random() < 0.5:
             table = json.loads(content[8 : 8 + size])
@@ -145,7 +122,7 @@ def test_tuned_values(tmp_path, monkeypatch, command):
     file.parent.mkdir()
     limits = baselines_of(ID).tunable["imm"].limits
     whole = json.dumps({"imm": {"values": {name: 0.5 * sum(ends) for name, ends in limits.items()}}})
-    for i in range(60):
+    for i in range(40):
         file.write_text(whole)
         file.write_bytes(broken_json(file, rng))
         command("evaluate", ID, "--policy", "imm-tuned", *episodes(i))
@@ -156,7 +133,7 @@ def test_trajectories(suffix, tmp_path, command):
     rng, file = random.Random(2), tmp_path / f"flight{suffix}"
     flight(file)
     whole = file.read_bytes()
-    for i in range(40):
+    for i in range(25):
         file.write_bytes(mutated(whole, rng))
         command("evaluate", ID, "--scenario", file, "--policy", "imm", *episodes(i), "--set", "horizon=10")
 
@@ -167,7 +144,7 @@ def test_results(tmp_path, command):
     records = [r for r in found.records if r.window == "all" and "cost" in r.metric + r.component]
     write_results(file, [found._replace(records=records)], settings_of("filtergym benchmark"))
     whole = file.read_bytes()
-    for i in range(30):
+    for i in range(15):
         file.write_bytes(whole)
         file.write_bytes(broken_json(file, rng))
         command("record", file, "--into", tmp_path / "records", program=commands.main)
@@ -175,32 +152,22 @@ def test_results(tmp_path, command):
             command("report", file, "--out", tmp_path / "report.html")
 
 
-def test_records_of_training(tmp_path, command):
-    rng, folder = random.Random(4), tmp_path / "run"
-    run_folder(folder)
-    whole = (folder / "run.json").read_bytes()
-    for i in range(20):
-        (folder / "run.json").write_bytes(whole)
-        (folder / "run.json").write_bytes(broken_json(folder / "run.json", rng))
-        curves = () if i % WHOLE else ("--curves", tmp_path / "curves.png")
-        command("seeds", folder, "--policy", "imm", *episodes(i), *curves, program=commands.main)
-
-
 def test_settings(command):
     rng = random.Random(5)
     for name in ("scenario", "seed", "episodes", "control", "xp", "device", "trust", "id", "progress"):
         assert command("evaluate", ID, "--policy", "imm", "--set", f"{name}=1") == 2
-    for text in (
+    numbers = (
         "1" + "0" * 400,
-        "(" * 300,
         "-" * 5000 + "1",
-        "{[]: 1}",
-        "b'x'",
         "1j",
         "...",
+        "b'x'",
+        "{[]: 1}",
+        "(" * 300,
         "[" * 90 + "]" * 90,
-    ):
+    )
+    for text in numbers:
         assert command("evaluate", ID, "--policy", "imm", "--set", f"range_sigma={text}") == 2
-    for _ in range(30):
+    for _ in range(20):
         setting = mutated(rng.choice(WORDS).encode(), rng).decode(errors="replace")
         command("evaluate", ID, "--policy", "imm", "--episodes", 1, "--set", "horizon=10", f"--set={setting}")

@@ -29,7 +29,7 @@ def model_of(environment, name, scenario, threads=1, **keywords):
     problem = problem_of(f"filtergym/{environment}-v0")
     maker = problem.competitor(name)
     kind = kind_of(maker)
-    control = control_of(maker, kind, None, problem.task, name)
+    control = control_of(maker, None, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     model = make_model(problem.task, control, scenario, backend="compiled", threads=threads, **keywords)
     return model, maker, kind, limits if kind == "bound" else Kept(tracks=True)

@@ -44,10 +44,6 @@ def machine(request, monkeypatch):
     forget(environment(module))
 
 
-def machine_components(module):
-    return next(cls.components for cls in vars(module).values() if hasattr(cls, "definition"))
-
-
 def environment(module):
     return next(cls.id for cls in vars(module).values() if hasattr(cls, "definition"))
 
@@ -59,11 +55,9 @@ def test_the_log_of_a_machine_fits_its_model(machine, tmp_path):
     assert len((FOLDER / f"{machine.__name__}.py").read_text().splitlines()) <= 40
     recording = read_recording(file, environment(machine))
     assert not [note for note in recording.notes if "not read" in note]
-    run = filtergym.evaluate(
-        environment(machine), ["kalman"], scenario=recording, backend="numpy", tracks=True
-    )
+    run = filtergym.evaluate(environment(machine), ["kalman"], recording, backend="numpy", tracks=True)
     nees = run["nees"].values.ravel()[len(log["time"]) // 2 : len(log["time"])]
-    assert 0.01 < np.mean(nees) / len(machine_components(machine)) < 100.0
+    assert 0.01 < np.mean(nees) / run.sizes["component"] < 100.0
 
 
 @pytest.mark.parametrize("machine", ["late_vision"], indirect=True)

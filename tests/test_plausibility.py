@@ -53,13 +53,10 @@ def drive(**changes):
 def echoes(**changes):
     """Ranges and range rates of an aircraft that comes nearer, with the true ones."""
     time, noise = 0.5 * np.arange(100), np.random.default_rng(3).normal(size=(2, 100))
-    columns = {
-        "time": time,
-        "range": 60e3 - 200.0 * time + 3e3 * noise[0],
-        "range_rate": -200.0 + 50.0 * noise[1],
-    }
-    columns |= {"truth_range": 60e3 - 200.0 * time, "truth_range_rate": np.full(100, -200.0)}
-    return _changed({**columns, "truth_acceleration": np.zeros(100)}, changes)
+    columns = {"time": time, "range": 60e3 - 200.0 * time + 3e3 * noise[0]}
+    columns |= {"range_rate": -200.0 + 50.0 * noise[1], "truth_range": 60e3 - 200.0 * time}
+    columns |= {"truth_range_rate": np.full(100, -200.0), "truth_acceleration": np.zeros(100)}
+    return _changed(columns, changes)
 
 
 def _changed(columns, changes):
@@ -107,74 +104,32 @@ def an_hour_earlier(values):
     return values - 3600.0 * (values >= values[30])
 
 
-RIGHT = {
-    "plots": (TARGET, plots()),
-    "polar": (TARGET, polar()),
-    "drive": (LOOSE, drive()),
-    "echoes": (ESM, echoes()),
-}
+RANGES = "range", "truth_range", "truth_range_rate"
 FAR = {"truth_position_x": kilometres, "truth_position_y": kilometres, "truth_velocity_x": kilometres}
-WRONG = {
-    "plots in kilometres": (TARGET, plots(x=kilometres, y=kilometres), "are x, y kilometres"),
-    "ranges in kilometres": (TARGET, polar(range=kilometres), "are x, y kilometres"),
-    "azimuth in radians": (TARGET, polar(azimuth=np.radians), "azimuth scatters by .* is it radians"),
-    "plots in milliseconds": (
-        TARGET,
-        plots(time=milliseconds),
-        "times are 5000 s apart, .* are they milliseconds",
-    ),
-    "plots in minutes": (TARGET, plots(time=lambda t: t / 60.0), "are the times minutes"),
-    "truth in knots": (TARGET, plots(truth_velocity_x=knots, truth_velocity_y=knots), "1.94 times .* knots"),
-    "truth in kilometres": (
-        TARGET,
-        plots(**FAR, truth_velocity_y=kilometres),
-        "truth lies .* is it kilometres",
-    ),
-    "fixes in kilometres": (
-        LOOSE,
-        drive(ins=kilometres, fix=kilometres),
-        "positions scatter by .* kilometres",
-    ),
-    "fixes alone in kilometres": (LOOSE, drive(fix=kilometres), "ins extends over .* is fix kilometres"),
-    "fixes in milliseconds": (
-        LOOSE,
-        drive(time=milliseconds),
-        "times are 100 s apart, .* are they milliseconds",
-    ),
-    "echoes in kilometres": (
-        ESM,
-        echoes(range=kilometres, truth_range=kilometres, truth_range_rate=kilometres),
-        "positions scatter by .* kilometres",
-    ),
-    "echoes in milliseconds": (
-        ESM,
-        echoes(time=milliseconds),
-        "times are 500 s apart, .* are they milliseconds",
-    ),
-    "true range rate in knots": (
-        ESM,
-        echoes(truth_range_rate=knots),
-        "truth_range_rate are 1.94 times .* knots",
-    ),
-    "one sigma": (TARGET, plots(sigma=np.ones(60)), "column sigma, .* did you mean .*sigma_x"),
-    "another word for sigma": (
-        TARGET,
-        polar(range_std=np.ones(60)),
-        "column range_std, .* did you mean .*range_sigma",
-    ),
-    "a slip of the pen": (
-        TARGET,
-        polar(azimuth_sigme=np.ones(60)),
-        "azimuth_sigme, .* did you mean azimuth_sigma",
-    ),
-    "summer time begins": (TARGET, untold(plots(time=an_hour_later)), "3,605 s pass .* did the clock change"),
-    "summer time ends": (TARGET, plots(time=an_hour_earlier), "time decreases .* in UTC"),
-}
+WRONG = [
+    (TARGET, plots(x=kilometres, y=kilometres), "are x, y kilometres"),
+    (TARGET, polar(range=kilometres), "are x, y kilometres"),
+    (TARGET, polar(azimuth=np.radians), "azimuth scatters by .* is it radians"),
+    (TARGET, plots(time=milliseconds), "times are 5000 s apart, .* are they milliseconds"),
+    (TARGET, plots(time=lambda t: t / 60.0), "are the times minutes"),
+    (TARGET, plots(truth_velocity_x=knots, truth_velocity_y=knots), "1.94 times .* knots"),
+    (TARGET, plots(**FAR, truth_velocity_y=kilometres), "truth lies .* is it kilometres"),
+    (LOOSE, drive(ins=kilometres, fix=kilometres), "positions scatter by .* kilometres"),
+    (LOOSE, drive(fix=kilometres), "ins extends over .* is fix kilometres"),
+    (LOOSE, drive(time=milliseconds), "times are 100 s apart, .* are they milliseconds"),
+    (ESM, echoes(**dict.fromkeys(RANGES, kilometres)), "positions scatter by .* kilometres"),
+    (ESM, echoes(time=milliseconds), "times are 500 s apart, .* are they milliseconds"),
+    (ESM, echoes(truth_range_rate=knots), "truth_range_rate are 1.94 times .* knots"),
+    (TARGET, plots(sigma=np.ones(60)), "column sigma, .* did you mean .*sigma_x"),
+    (TARGET, polar(range_std=np.ones(60)), "column range_std, .* did you mean .*range_sigma"),
+    (TARGET, polar(azimuth_sigme=np.ones(60)), "azimuth_sigme, .* did you mean azimuth_sigma"),
+    (TARGET, untold(plots(time=an_hour_later)), "3,605 s pass .* did the clock change"),
+    (TARGET, plots(time=an_hour_earlier), "time decreases .* in UTC"),
+]
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_cannot_be_is_refused_in_a_sentence(case, tmp_path):
-    env, columns, sentence = WRONG[case]
+@pytest.mark.parametrize(("env", "columns", "sentence"), WRONG, ids=[sentence for *_, sentence in WRONG])
+def test_what_cannot_be_is_refused_in_a_sentence(env, columns, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence) as refusal:
         read_recording(table(tmp_path / "wrong.csv", **columns), env)
     assert "\n" not in str(refusal.value)
@@ -190,54 +145,35 @@ def late(values):
 
 
 STATED = {"sigma_x": np.full(60, 100.0), "sigma_y": np.full(60, 100.0)}
-NOTED = {
-    "an outlier": (TARGET, plots(x=outlier), r"measurement 19 is off the track, by up to 4\d,\d+ m"),
-    "an outlier of a receiver": (LOOSE, drive(fix=outlier), "measurement 20 is off the track"),
-    "an outlier of a radar": (
-        ESM,
-        echoes(range=lambda r: r + 4.0 * (outlier(r) - r)),
-        "measurement 20 is off the track",
-    ),
-    "a target that stands": (
-        TARGET,
-        untold(plots(x=lambda x: x - 150.0 * TIME, y=lambda y: y - 0.02 * TIME**2)) | STATED,
-        r"all positions lie within \d\d\d m, where errors of 141 m are stated: the target stands still",
-    ),
-    "radians with their deviation": (
-        TARGET,
-        polar(
-            azimuth=np.radians, azimuth_sigma=np.full(60, np.radians(0.25)), range_sigma=np.full(60, 100.0)
-        ),
-        "azimuth stays within 2 pi and is taken for degrees, as its deviation",
-    ),
-    "a value twice": (
-        TARGET,
-        plots(**{c: lambda v: np.where(np.arange(60) == 9, v[8], v) for c in "xy"}),
-        "measurement 8 is the same as before",
-    ),
-    "other columns": (
-        TARGET,
-        plots(mode_a=np.ones(60), velocity=np.ones(60)),
-        "not read: columns mode_a, velocity",
-    ),
-    "a long gap": (
-        TARGET,
-        untold(plots(time=late, x=lambda x: x + 150.0 * 600.0 * (np.arange(60) >= 30))),
-        "nothing was received for 605 s between measurements 28 and 149",
-    ),
-}
+IN_RADIANS = {"azimuth": np.radians, "azimuth_sigma": np.full(60, np.radians(0.25))}
+STANDING = untold(plots(x=lambda x: x - 150.0 * TIME, y=lambda y: y - 0.02 * TIME**2)) | STATED
+TWICE = dict.fromkeys("xy", lambda v: np.where(np.arange(60) == 9, v[8], v))
+LOST = untold(plots(time=late, x=lambda x: x + 150.0 * 600.0 * (np.arange(60) >= 30)))
+NOTED = [
+    (TARGET, plots(x=outlier), r"measurement 19 is off the track, by up to 4\d,\d+ m"),
+    (LOOSE, drive(fix=outlier), "measurement 20 is off the track"),
+    (ESM, echoes(range=lambda r: r + 4.0 * (outlier(r) - r)), "measurement 20 is off the track"),
+    (TARGET, STANDING, r"all positions lie within \d\d\d m, where errors of 141 m are stated: the target stands"),
+    (TARGET, polar(**IN_RADIANS, range_sigma=np.full(60, 100.0)), "stays within 2 pi and is taken for degrees"),
+    (TARGET, plots(**TWICE), "measurement 8 is the same as before"),
+    (TARGET, plots(mode_a=np.ones(60), velocity=np.ones(60)), "not read: columns mode_a, velocity"),
+    (TARGET, LOST, "nothing was received for 605 s between measurements 28 and 149"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("case", NOTED)
-def test_what_is_noteworthy_is_said(case, tmp_path):
-    env, columns, sentence = NOTED[case]
+@pytest.mark.parametrize(("env", "columns", "sentence"), NOTED, ids=[sentence for *_, sentence in NOTED])
+def test_what_is_noteworthy_is_said(env, columns, sentence, tmp_path):
     path = table(tmp_path / "log.csv", **columns)
     *others, note = further_notes(read_recording(path, env))
-    assert others == (["120 scans have no row: they missed the target"] if case == "a long gap" else [])
+    assert others == (["120 scans have no row: they missed the target"] if columns is LOST else [])
     assert re.search(sentence, note), note
-    assert note in notes_of(evaluate(env, ["random"], read_recording(path, env)))
     again = table(tmp_path / "again.csv", **columns)
     assert f"again: {note}" in read_recording([path, again], env).notes
+
+
+def test_what_is_noteworthy_goes_with_an_evaluation(tmp_path):
+    recording = read_recording(table(tmp_path / "log.csv", **plots(x=outlier)), TARGET)
+    assert notes_of(evaluate(TARGET, ["random"], recording)) == list(recording.notes)
 
 
 def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
@@ -249,12 +185,6 @@ def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
     assert re.fullmatch(r"Positions span [45],\d{3} m by [1-4]\d\d m, at 1[2-8]\d m/s in the median.", extent)
     said = [*reading_lines(read_recording(table(tmp_path / "sixty.csv", **plots()), TARGET))]
     assert not any("guess" in line for line in said)
-
-
-def test_an_empty_file_is_called_empty(tmp_path):
-    (tmp_path / "empty.csv").write_text("")
-    with pytest.raises(ValueError, match="it is empty: a recording needs a line of columns"):
-        read_recording(tmp_path / "empty.csv", TARGET)
 
 
 @pytest.mark.parametrize(
@@ -273,17 +203,13 @@ def test_files_are_checked_as_tables_are(variable, factor, sentence, tmp_path):
         read_recording(tmp_path / "wrong.nc")
 
 
-@pytest.mark.parametrize("case", RIGHT)
-def test_a_right_table_passes_without_a_note(case, tmp_path):
-    env, columns = RIGHT[case]
-    assert further_notes(read_recording(table(tmp_path / "log.csv", **columns), env)) == []
+def test_a_right_table_passes_without_a_note(tmp_path):
+    for env, columns in ((TARGET, plots()), (TARGET, polar()), (LOOSE, drive()), (ESM, echoes())):
+        assert further_notes(read_recording(table(tmp_path / "log.csv", **columns), env)) == []
 
 
 def test_slow_targets_are_taken_where_somebody_says_so(tmp_path):
-    columns = {
-        name: values for name, values in plots(time=lambda t: 300.0 * t).items() if "truth" not in name
-    }
-    path = table(tmp_path / "slow.csv", **columns)
+    path = table(tmp_path / "slow.csv", **untold(plots(time=lambda t: 300.0 * t)))
     with pytest.raises(ValueError, match="are the times milliseconds"):
         read_recording(path, TARGET, sampling_interval=1500.0)
     slow = read_recording(path, TARGET, speeds=(0.0, 1000.0), sampling_interval=1500.0)
@@ -296,7 +222,7 @@ def test_what_filtergym_writes_passes_without_a_note(id, tmp_path):
     for scenario in catalogue()[id].scenarios:
         if scenario in ("glint", "outliers", "clutter") or ("Tightly" in id and scenario != "urban"):
             continue
-        record(id, scenario, episodes=10, horizon=100).write(tmp_path / "made.nc")
+        record(id, scenario, episodes=5, horizon=60).write(tmp_path / "made.nc")
         assert read_recording(tmp_path / "made.nc").notes == (), scenario
 
 

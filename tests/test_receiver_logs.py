@@ -7,18 +7,14 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
-from filtergym.baselines.fitted_filters import write_advised
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.data.flight_tables import read_table
 from filtergym.filters import geodesy
 
-from filtergym import evaluate, online, read_flights, read_recording
+from filtergym import read_recording
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 COUNT = 40
 TIME = 0.25 * np.arange(COUNT)
 ORIGIN = (40.0966916, -105.1471665, 1601.4)
-KNOWN = ["time", "latitude", "longitude", "altitude", "sigma_x", "sigma_y", "x", "y"]
 
 
 def track():
@@ -37,12 +33,15 @@ def clock(times, start="2025-08-28T23:59:55.000", form="%Y/%m/%d %H:%M:%S.%f"):
     return [(pandas.Timestamp(start) + pandas.Timedelta(seconds=t)).strftime(form)[:23] for t in times]
 
 
+def around_the_first():
+    """East and north of the first place, m, ``(COUNT, 2)``."""
+    return np.stack(pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)[:2], axis=1)
+
+
 def check_positions(recording, tolerance):
     """Compare with the track, of which the first two positions make the start."""
-    first = places()[:2, 0]
-    east, north, _ = pymap3d.geodetic2enu(*places(), *first, 0.0)
     found = recording.measurements["position"][0]
-    np.testing.assert_allclose(found, np.stack([east, north], axis=1)[2:], atol=tolerance)
+    np.testing.assert_allclose(found, around_the_first()[2:], atol=tolerance)
     np.testing.assert_allclose(recording.seconds[0], TIME[2:] - TIME[1], atol=1e-9)
 
 
@@ -63,15 +62,13 @@ def test_earth_fixed_coordinates_and_back():
 
 # --- RTKLIB
 
-FURTHER = "age(s) ratio"
 GEODETIC = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m)"
 EARTH_FIXED = (
-    f"%  GPST  x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) {FURTHER}"
+    "%  GPST  x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s) ratio"
 )
 BASELINE = (
     "%  UTC  e-baseline(m) n-baseline(m) u-baseline(m) Q ns sde(m) sdn(m) sdu(m) sden(m) sdnu(m) sdue(m)"
 )
-BASELINE += f" {FURTHER}"
 
 
 def rtklib(path, header, positions, sigmas=(0.02, 0.03, 0.05, 0.0, 0.0, 0.0), times=None, separator="   "):
@@ -93,7 +90,6 @@ def test_geodetic_solutions(separator, tmp_path):
     assert recording.parameters == {"sampling_interval": 0.25}
     assert recording.notes[:2] == ("quality: 31 fixed, 9 float", "times are GPST")
     assert recording.log_time[0, :2].tolist() == ["2025/08/28 23:59:55.500", "2025/08/28 23:59:55.750"]
-    assert np.isfinite(evaluate(TARGET, ["imm"], recording)["log_likelihood"].values).all()
 
 
 def test_earth_fixed_solutions(tmp_path):
@@ -141,10 +137,7 @@ def test_broken_lines_of_a_solution_are_counted(tmp_path):
     [
         (lambda text: text.replace(GEODETIC, "%"), "lacks RTKLIB's line with the names of its columns"),
         (lambda text: text.replace("(deg)", "(d'\")"), "are degrees, minutes and seconds"),
-        (
-            lambda text: text.replace("latitude", "x").replace("longitude", "y"),
-            "what is read are latitude and",
-        ),
+        (lambda text: text.replace("latitude", "x").replace("longitude", "y"), "what is read are latitude"),
         (lambda text: text.replace("/08/", "-08-"), "40 lines of 40 are no solutions: is it whole"),
         (lambda text: "", "holds no solution of RTKLIB"),
     ],
@@ -156,14 +149,6 @@ def test_what_is_no_solution_is_refused(change, sentence, tmp_path):
         read_recording(path, TARGET)
     assert sentence in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_solutions_are_flights_too(tmp_path):
-    path = rtklib(tmp_path / "drive.pos", GEODETIC, places())
-    flights = read_flights(path, site=ORIGIN[:2], fewest_scans=2)
-    [found] = flights.trajectories
-    expected = pymap3d.geodetic2enu(*places(), *ORIGIN[:2], 0.0)
-    np.testing.assert_allclose(found.position, np.stack(expected[:2], axis=1), atol=2e-4)
 
 
 # --- NMEA
@@ -188,10 +173,8 @@ def nmea(path, deviations=True, dates=True, quality=None):
     lines = []
     times = pandas.Timestamp("2026-05-01T23:59:55") + pandas.to_timedelta(TIME, unit="s")
     for i, (time, (latitude, longitude, height)) in enumerate(zip(times, places().T, strict=True)):
-        now, where = (
-            time.strftime("%H%M%S.%f")[:9],
-            f"{degrees(latitude, 2, 'NS')},{degrees(longitude, 3, 'EW')}",
-        )
+        now = time.strftime("%H%M%S.%f")[:9]
+        where = f"{degrees(latitude, 2, 'NS')},{degrees(longitude, 3, 'EW')}"
         fix = 1 if quality is None else quality[i]
         where = where if fix else ",,,"
         lines.append(sentence(f"GPGGA,{now},{where},{fix},12,0.9,{height + 17.0:.4f},M,-17.0,M,,"))
@@ -213,29 +196,13 @@ def pynmea2():
 def test_sentences(pynmea2, tmp_path):
     recording = read_recording(nmea(tmp_path / "walk.nmea"), TARGET)
     check_positions(recording, 2e-4)  # 1e-7 minutes are 2e-4 m
-    assert np.sqrt(recording.measurements["variance"][0, 2:4]) == pytest.approx(
-        np.array([[2.5, 1.5], [2.6, 1.5]]), rel=1e-12
-    )
+    sigma = np.sqrt(recording.measurements["variance"][0, 2:4])
+    np.testing.assert_allclose(sigma, [[2.5, 1.5], [2.6, 1.5]], rtol=1e-12)
     assert len(recording.notes) == 1
     assert recording.log_time[0, [0, -1]].tolist() == [
         "2026-05-01T23:59:55.500000Z",
         "2026-05-02T00:00:04.750000Z",
     ]
-    assert np.isfinite(evaluate(TARGET, ["imm"], recording)["log_likelihood"].values).all()
-
-
-def test_sentences_run_online_as_they_are_judged(pynmea2, tmp_path):
-    """The file of a filter that was advised for them takes the same positions, and says the same to rounding."""
-    log, path = nmea(tmp_path / "walk.nmea"), tmp_path / "mine.filter.json"
-    recording = read_recording(log, TARGET)
-    write_advised(path, problem_of(TARGET), "kalman-imm", recording, None, {}, "test")
-    judged = evaluate(TARGET, str(path), recording, tracks=True)["estimate"].values.squeeze()
-    table = read_table(log, ["latitude", "longitude", "altitude", "sigma_x", "sigma_y"]).columns
-    rows = table.assign(time=TIME).to_dict("records")
-    running = online(TARGET, str(path))
-    running.start_from(*rows[:2])
-    found = np.array([running.update(**row).mean for row in rows[2:]])
-    np.testing.assert_allclose(found, judged[: len(found)], rtol=0.0, atol=1e-8)  # of coordinates of 6.4e6 m
 
 
 def test_sentences_without_a_date(pynmea2, tmp_path):
@@ -271,20 +238,17 @@ def test_broken_sentences_are_counted(pynmea2, tmp_path):
     assert recording.notes[0] == "2 lines have a wrong checksum or are no sentence: left out"
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (b"", "it holds no sentence GGA or RMC that is whole, and 0 broken ones"),
-        (b"$GPGGA,,,,,,,,,*00\n" * 9, "it holds no sentence GGA or RMC that is whole, and 9 broken ones"),
+def test_what_holds_no_sentence_is_refused(pynmea2, tmp_path):
+    broken = "it holds no sentence GGA or RMC that is whole, and {} broken ones"
+    for content, sentence in (
+        (b"", broken.format(0)),
+        (b"$GPGGA,,,,,,,,,*00\n" * 9, broken.format(9)),
         (b"\x00" * 50_000, "it holds no sentence"),
         (b"$GPGGA," * 50_000, "it holds no sentence"),
-    ],
-)
-def test_what_holds_no_sentence_is_refused(pynmea2, content, sentence, tmp_path):
-    (tmp_path / "walk.nmea").write_bytes(content)
-    with pytest.raises(ValueError, match=r"recording .*walk\.nmea: ") as refusal:
-        read_recording(tmp_path / "walk.nmea", TARGET)
-    assert sentence in str(refusal.value)
+    ):
+        (tmp_path / "walk.nmea").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"recording .*walk\.nmea: {sentence}"):
+            read_recording(tmp_path / "walk.nmea", TARGET)
 
 
 def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
@@ -347,12 +311,10 @@ def test_positions_of_an_autopilot(fields, units, tmp_path):
     recording = read_recording(ulog(tmp_path / "flight.ulg", fields, rows), TARGET)
     assert recording.measurements["available"][0].tolist() == [float(i != 9) for i in range(2, COUNT)]
     there = recording.measurements["available"][0] > 0.0
-    first = places()[:2, 0]
-    east, north, _ = pymap3d.geodetic2enu(*places(), *first, 0.0)
     found = recording.measurements["position"][0][there]
     # 1e-7 degrees are a centimetre; of the first position, too.
     tolerance = 2e-2 if fields is OLD else 1e-7
-    np.testing.assert_allclose(found, np.stack([east, north], axis=1)[2:][there], atol=tolerance)
+    np.testing.assert_allclose(found, around_the_first()[2:][there], atol=tolerance)
     np.testing.assert_allclose(recording.measurements["variance"][0][there], 2.0, rtol=1e-12)
     assert recording.notes[:2] == (
         "positions are of vehicle_gps_position, times seconds since the start of the autopilot",
@@ -386,22 +348,19 @@ def bag(path, covariance_type=2, compression=None, kind="sensor_msgs/msg/NavSatF
         connection = writer.add_connection("/gps/fix", kind, typestore=types)
         other = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=types)
         for i, place in enumerate(places().T):
-            stamp = types.types["builtin_interfaces/msg/Time"](1756402239, round(1e9 * TIME[i]))
-            stamp = type(stamp)(stamp.sec + stamp.nanosec // 10**9, stamp.nanosec % 10**9)
+            time = 1756402239 * 10**9 + round(1e9 * TIME[i])
+            stamp = types.types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
             header = types.types["std_msgs/msg/Header"](i, stamp, "gps")
             status = types.types["sensor_msgs/msg/NavSatStatus"](-1 if i == 9 else 0, 1)
-            covariance = np.diag([4.0, 9.0, 16.0]).ravel()
-            fix = types.types["sensor_msgs/msg/NavSatFix"](
-                header, status, *place, covariance, covariance_type
-            )
+            fields = (header, status, *place, np.diag([4.0, 9.0, 16.0]).ravel(), covariance_type)
             if kind.endswith("NavSatFix"):
-                writer.write(connection, i, types.serialize_ros1(fix, kind))
+                writer.write(connection, i, types.serialize_ros1(types.types[kind](*fields), kind))
             text = types.types["std_msgs/msg/String"]("hello")
             writer.write(other, i, types.serialize_ros1(text, "std_msgs/msg/String"))
     return path
 
 
-def bag2(folder, storage="SQLITE3", compression=False, kinds=("sensor_msgs/msg/NavSatFix",), covariance=4.0):
+def bag2(folder, storage="SQLITE3", compression=False, kinds=("sensor_msgs/msg/NavSatFix",)):
     """Write a bag of ROS 2 and return its storage file; poses go 3 m east and 1 m south of the places."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="not installed: pip install 'filtergym[logs]'")
     from rosbags.typesys import Stores, get_typestore
@@ -411,35 +370,30 @@ def bag2(folder, storage="SQLITE3", compression=False, kinds=("sensor_msgs/msg/N
     def make(kind, *fields):
         return types.types[kind](*fields)
 
-    storages = rosbag2.StoragePlugin
-    writer = rosbag2.Writer(folder, version=9, storage_plugin=storages[storage])
+    writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[storage])
     if compression:
         writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
-    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
     with writer:
         topics = {
             kind: writer.add_connection("/" + kind.split("/")[-1], kind, typestore=types) for kind in kinds
         }
-        for i, place in enumerate(places().T):
+        for i, (place, plane) in enumerate(zip(places().T, around_the_first(), strict=True)):
             time = 1756402239 * 10**9 + round(1e9 * TIME[i])
             stamp = make("builtin_interfaces/msg/Time", time // 10**9, time % 10**9)
             header = make("std_msgs/msg/Header", stamp, "gps")
             status = make("sensor_msgs/msg/NavSatStatus", -1 if i == 9 else 0, 1)
-            point = make("geometry_msgs/msg/Point", east[i] + 3.0, north[i] - 1.0, 0.0)
+            point = make("geometry_msgs/msg/Point", plane[0] + 3.0, plane[1] - 1.0, 0.0)
             pose = make(
                 "geometry_msgs/msg/Pose", point, make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
             )
             vector = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
             twist = make("geometry_msgs/msg/Twist", vector, vector)
-            C = np.diag([covariance, 9.0, 1.0, 1.0, 1.0, 1.0]).ravel()
+            C = np.diag([4.0, 9.0, 1.0, 1.0, 1.0, 1.0]).ravel()
+            stated = make("geometry_msgs/msg/PoseWithCovariance", pose, C)
+            moving = make("geometry_msgs/msg/TwistWithCovariance", twist, C)
             messages = {
                 "sensor_msgs/msg/NavSatFix": (header, status, *place, np.diag([4.0, 9.0, 16.0]).ravel(), 2),
-                "nav_msgs/msg/Odometry": (
-                    header,
-                    "base",
-                    make("geometry_msgs/msg/PoseWithCovariance", pose, C),
-                    make("geometry_msgs/msg/TwistWithCovariance", twist, C),
-                ),
+                "nav_msgs/msg/Odometry": (header, "base", stated, moving),
                 "geometry_msgs/msg/PoseStamped": (header, pose),
                 "std_msgs/msg/String": ("hello",),
             }
@@ -448,21 +402,24 @@ def bag2(folder, storage="SQLITE3", compression=False, kinds=("sensor_msgs/msg/N
     return next(file for file in folder.iterdir() if file.suffix in (".db3", ".mcap"))
 
 
-@pytest.mark.parametrize(("storage", "compression"), [("SQLITE3", False), ("MCAP", False), ("MCAP", True)])
+def check_fixes(recording, topic):
+    """Compare with the places of the bags, whose tenth has no fix."""
+    there = recording.measurements["available"][0] > 0.0
+    assert there.tolist() == [i != 9 for i in range(2, COUNT)]
+    found = recording.measurements["position"][0][there]
+    np.testing.assert_allclose(found, around_the_first()[2:][there], atol=1e-7)
+    assert (recording.measurements["variance"][0][there] == [4.0, 9.0]).all()
+    assert recording.notes[:2] == (f"positions are of the topic {topic}", "1 message without a fix")
+
+
+@pytest.mark.parametrize(("storage", "compression"), [("SQLITE3", False), ("MCAP", True)])
 def test_messages_of_a_bag_of_ros_2(storage, compression, tmp_path):
     """By its file and by its folder, whose metadata are not needed."""
     path = bag2(tmp_path / "drive", storage, compression)
-    (tmp_path / "drive" / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information: {relative_file_paths: [/etc/passwd]}"
-    )
+    metadata = "rosbag2_bagfile_information: {relative_file_paths: [/etc/passwd]}"
+    (tmp_path / "drive" / "metadata.yaml").write_text(metadata)
     recording = read_recording(path, TARGET)
-    there = recording.measurements["available"][0] > 0.0
-    assert there.tolist() == [i != 9 for i in range(2, COUNT)]
-    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
-    found = recording.measurements["position"][0][there]
-    np.testing.assert_allclose(found, np.stack([east, north], axis=1)[2:][there], atol=1e-7)
-    assert (recording.measurements["variance"][0][there] == [4.0, 9.0]).all()
-    assert recording.notes[:2] == ("positions are of the topic /NavSatFix", "1 message without a fix")
+    check_fixes(recording, "/NavSatFix")
     folder = read_recording(tmp_path / "drive", TARGET)
     np.testing.assert_array_equal(folder.measurements["position"], recording.measurements["position"])
 
@@ -471,16 +428,14 @@ def test_odometry_of_a_bag_is_the_second_sensor(tmp_path):
     """Displacements of poses between the times of fixes, in the frame of the odometry."""
     kinds = ("sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry")
     recording = read_recording(bag2(tmp_path / "drive", kinds=kinds), TARGET)
-    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
-    moved = np.diff(np.stack([east, north], axis=1), axis=0)[1:]
+    moved = np.diff(around_the_first(), axis=0)[1:]
     np.testing.assert_allclose(recording.measurements["odometry_displacement"][0], moved, atol=1e-8)
     assert (recording.measurements["odometry_available"] == 1.0).all()
     assert any("the second sensor is the topic /Odometry" in note for note in recording.notes)
 
 
 def test_poses_of_a_bag_are_positions(tmp_path):
-    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
-    expected = np.stack([east + 3.0, north - 1.0], axis=1)[2:]
+    expected = around_the_first()[2:] + np.array([3.0, -1.0])
     recording = read_recording(bag2(tmp_path / "odometry", kinds=("nav_msgs/msg/Odometry",)), TARGET)
     np.testing.assert_allclose(recording.measurements["position"][0], expected, atol=1e-9)
     assert (recording.measurements["variance"][0] == [4.0, 9.0]).all()
@@ -488,32 +443,22 @@ def test_poses_of_a_bag_are_positions(tmp_path):
     recording = read_recording(path, TARGET, range_sigma=2.0)
     np.testing.assert_allclose(recording.measurements["position"][0], expected, atol=1e-9)
     assert "messages do not say how large errors are" in recording.notes
-    with pytest.raises(
-        ValueError, match=r"it holds no .*NavSatFix and no positions; it holds std_msgs/msg/String"
-    ):
-        read_recording(bag2(tmp_path / "talk", kinds=("std_msgs/msg/String",)), TARGET)
+    talk = bag2(tmp_path / "talk", kinds=("std_msgs/msg/String",))
+    with pytest.raises(ValueError, match=r"no .*NavSatFix and no positions; it holds std_msgs/msg/String"):
+        read_recording(talk, TARGET)
 
 
-@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+@pytest.mark.parametrize("compression", [None, "BZ2"])
 def test_messages_of_a_bag(compression, tmp_path):
-    recording = read_recording(bag(tmp_path / "drive.bag", compression=compression), TARGET)
-    there = recording.measurements["available"][0] > 0.0
-    assert there.tolist() == [i != 9 for i in range(2, COUNT)]
-    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
-    found = recording.measurements["position"][0][there]
-    np.testing.assert_allclose(found, np.stack([east, north], axis=1)[2:][there], atol=1e-7)
-    assert (recording.measurements["variance"][0][there] == [4.0, 9.0]).all()
-    assert recording.notes[:2] == ("positions are of the topic /gps/fix", "1 message without a fix")
+    check_fixes(read_recording(bag(tmp_path / "drive.bag", compression=compression), TARGET), "/gps/fix")
 
 
 def test_a_bag_without_deviations_or_positions(tmp_path):
     unknown = read_recording(bag(tmp_path / "drive.bag", covariance_type=0), TARGET)
     assert "scatter" in unknown.deviations_from
-    with pytest.raises(
-        ValueError,
-        match=r"it holds no sensor_msgs/msg/NavSatFix and no positions; it holds .*std_msgs/msg/String",
-    ):
-        read_recording(bag(tmp_path / "imu.bag", kind="sensor_msgs/msg/Imu"), TARGET)
+    imu = bag(tmp_path / "imu.bag", kind="sensor_msgs/msg/Imu")
+    with pytest.raises(ValueError, match=r"no .*NavSatFix and no positions; it holds .*std_msgs/msg/String"):
+        read_recording(imu, TARGET)
 
 
 def test_a_bag_with_a_definition_of_its_own_is_refused(tmp_path):
@@ -523,12 +468,6 @@ def test_a_bag_with_a_definition_of_its_own_is_refused(tmp_path):
     path.write_bytes(content.replace(digest, b"0" * 32))
     with pytest.raises(ValueError, match=r"its sensor_msgs/msg/NavSatFix is another than that of ROS 1"):
         read_recording(path, TARGET)
-
-
-def test_only_known_columns_of_a_log_are_given(tmp_path):
-    path = rtklib(tmp_path / "drive.pos", GEODETIC, places())
-    table = read_table(path, KNOWN)
-    assert list(table.columns) == table.names == KNOWN[:6]
 
 
 @pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap"])
@@ -548,7 +487,7 @@ def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
     whole = make(tmp_path / f"whole{suffix}").read_bytes()
     path, rng, sentences = tmp_path / f"log{suffix}", np.random.default_rng(0), []
     # Text is read at once; what takes a library takes longer, and `make fuzz` goes on for hours.
-    for _ in range(40 if suffix in (".pos", ".nmea") else 6):
+    for _ in range(30 if suffix in (".pos", ".nmea") else 4):
         content = bytearray(whole)
         for place in rng.integers(0, len(whole), int(rng.choice([1, 5, 50]))):
             content[place] = int(rng.choice([0, 255, rng.integers(0, 256)]))

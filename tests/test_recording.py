@@ -4,35 +4,27 @@ import copy
 import dataclasses
 import json
 import pickle
-import re
-import runpy
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pandas
 import pytest
-import xarray
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.data.recorded_tables import Columns
 from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.engine.compiled import AVAILABLE
 from filtergym.envs.engine.episode_noise import uniforms_of_seeds
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.evaluation.running.metrics import chi_square_band
 from filtergym.evaluation.running.seeds import episode_seeds
-from filtergym.evaluation.storage.dataset import notes_of
-from filtergym.evaluation.storage.estimates import write_estimates
 from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
 from models import make_model
 
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.commands.evaluation import causal_names
-from filtergym.reports.tables.terminal_tables import with_interval
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigation-v0"
@@ -44,7 +36,6 @@ OPEN = {
     TIGHT: {"scenario": "rates-lost", "horizon": 12, "decision_interval": 3},
 }
 DOCS = Path(__file__).parent.parent / "docs"
-BACKENDS = ["numpy", *(["compiled"] if AVAILABLE else [])]
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +52,7 @@ def blind(recording):
 # --- replay
 
 
-@pytest.mark.parametrize(
-    ("env", "backend"),
-    [(env, backend) for env in OPEN for backend in BACKENDS if (env, backend) != (TIGHT, "compiled")],
-)
+@pytest.mark.parametrize(("env", "backend"), [*((env, "numpy") for env in OPEN), (TARGET, "compiled")])
 def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
     keywords = OPEN[env]
     control = make_model(env).task.controls[-1]
@@ -93,37 +81,6 @@ def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
         assert over.all() == (i == decisions - 1)
 
 
-@pytest.mark.parametrize("env", OPEN)
-def test_evaluation_of_a_replay_is_that_of_the_simulation(env, recordings):
-    policy = {TARGET: "imm", LOOSE: "paper", ESM: "paper", TIGHT: "paper"}[env]
-    names = [policy] if policy in _names(env) else _names(env)[:1]
-    simulated = evaluate(env, names, episodes=3, backend="numpy", tracks=True, **OPEN[env])
-    replayed = evaluate(env, names, scenario=recordings[env], backend="numpy", tracks=True)
-    assert replayed["flight"].values.tolist() == ["0", "1", "2"]
-    for name in ("estimate", "covariance", "error", "cost", "charge", "nees", "nis", "log_likelihood"):
-        np.testing.assert_array_equal(simulated[name].values, replayed[name].values, name)
-
-
-def _names(env):
-    from filtergym.baselines.catalogue import baselines_of
-
-    return list(baselines_of(env).policies)
-
-
-def test_types_of_measurements_come_back(recordings):
-    for env, recording in recordings.items():
-        model = make_model(env, scenario=recording)
-        expected = dict(named_arrays(measure_once(make_model(env, **OPEN[env]).task)[1]))
-        lanes = Lanes(model, 2)
-        for lane in range(2):
-            lanes.seed(lane, np.random.default_rng(lane))
-        lanes.restart()
-        found = dict(named_arrays(lanes.state.measurement))
-        assert {n: (v.dtype, v.shape) for n, v in found.items()} == {
-            n: (v.dtype, v.shape) for n, v in expected.items()
-        }
-
-
 @pytest.mark.parametrize("env", [LOOSE, ESM])
 def test_nothing_of_a_recording_is_lost_to_the_decision_interval(env):
     """Without a named interval an agent acts at every measurement, in an episode of any length."""
@@ -137,8 +94,7 @@ def test_nothing_of_a_recording_is_lost_to_the_decision_interval(env):
     assert (named.horizon, named.decision_interval) == (interval, interval)
 
 
-def test_torch_replays_too(recordings):
-    pytest.importorskip("torch")
+def test_torch_replays_too(recordings, torch):
     env = gym.make_vec(TARGET, num_envs=2, backend="torch", scenario=recordings[TARGET])
     other = gym.make_vec(TARGET, num_envs=2, backend="numpy", scenario=recordings[TARGET])
     shown, expected = env.reset(seed=3)[0], other.reset(seed=3)[0]
@@ -160,7 +116,6 @@ def test_episodes_of_different_lengths_end_where_they_do(tmp_path):
     assert model.task.horizon == 12
     dataset = evaluate(TARGET, ["imm"], scenario=read, backend="numpy")
     assert dataset["length"].values.tolist() == lengths.tolist()
-    assert np.isfinite(dataset["cost"].values[0]).sum(axis=1).tolist() == lengths.tolist()
     assert make_model(TARGET, scenario=read, horizon=5).task.flights == (5, 5, 4)
     assert make_model(TARGET, scenario=read, decision_interval=3).task.flights == (12, 6, 3)
     env = gym.make(TARGET, scenario=read, context=True)
@@ -209,7 +164,6 @@ def test_a_recording_travels(recordings, tmp_path):
     recording.write(tmp_path / "esm.nc")
     named = gym.make(ESM, scenario=str(tmp_path / "esm.nc"))
     np.testing.assert_array_equal(named.reset(seed=5)[0], shown)
-    assert make_model(ESM, scenario=recording).under("mode").task.recording is recording
 
 
 # --- without truth
@@ -241,37 +195,21 @@ def test_without_truth_evaluation_tells_of_innovations(recordings):
     dataset = evaluate(TARGET, ["imm", "kalman-imm"], scenario=blind(recordings[TARGET]), backend="numpy")
     assert not {"error", "cost", "charge", "nees"} & set(dataset)
     found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
-    nis, likelihood = (
-        dataset["nis"].sel(policy="imm").values,
-        dataset["log_likelihood"].sel(policy="imm").values,
-    )
-    said = recordings[TARGET].measurements
-    seen = said["available"][:, : nis.shape[-1]] > 0.0
+    seen = recordings[TARGET].measurements["available"][:, : dataset.sizes["time"]] > 0.0
     assert not seen.all()
-    for values in (nis, likelihood):
-        np.testing.assert_array_equal(np.isfinite(values), seen)
-    nis, likelihood = nis[seen], likelihood[seen]
-    assert found["imm", "anis"].value == pytest.approx(nis.mean() / 2.0)
-    low, high = chi_square_band(np.array([2.0]))
-    assert found["imm", "nis_inside"].value == pytest.approx(((nis >= low) & (nis <= high)).mean())
-    assert found["imm", "log_likelihood"].value == pytest.approx(likelihood.mean())
-    band = found["imm", "anis_band"]
-    total = 2.0 * nis.size
-    assert (band.low, band.high) == pytest.approx(
-        [float(b[0]) / total for b in chi_square_band(np.array([total]))]
-    )
-    of_other = dataset["log_likelihood"].sel(policy="kalman-imm").values
-    np.testing.assert_array_equal(np.isfinite(of_other), seen)
-    assert found["kalman-imm", "log_likelihood"].value == pytest.approx(of_other[seen].mean())
-
-
-@pytest.mark.parametrize("env", [LOOSE, ESM, TIGHT])
-def test_every_environment_has_a_likelihood_without_truth(env, recordings):
-    controls = {name: name for name in _names(env)[:3]}
-    dataset = evaluate(env, controls, scenario=blind(recordings[env]), backend="numpy")
-    records = [r for r in tidy_records(dataset) if r.metric == "log_likelihood" and r.window == "all"]
-    assert len(records) == 3
-    assert all(r.value is not None for r in records)
+    for name in ("imm", "kalman-imm"):
+        nis, likelihood = (dataset[of].sel(policy=name).values for of in ("nis", "log_likelihood"))
+        for values in (nis, likelihood):
+            np.testing.assert_array_equal(np.isfinite(values), seen)
+        assert found[name, "anis"].value == pytest.approx(nis[seen].mean() / 2.0)
+        assert found[name, "log_likelihood"].value == pytest.approx(likelihood[seen].mean())
+        low, high = chi_square_band(np.array([2.0]))
+        inside = (nis[seen] >= low) & (nis[seen] <= high)
+        assert found[name, "nis_inside"].value == pytest.approx(inside.mean())
+        total = 2.0 * seen.sum()
+        low, high = chi_square_band(np.array([total]))
+        band = found[name, "anis_band"]
+        assert (band.low, band.high) == pytest.approx((low[0] / total, high[0] / total))
 
 
 @pytest.mark.parametrize("control", ["evidence", "gain"])
@@ -304,21 +242,6 @@ def test_mixture_density_of_what_underflows():
     np.testing.assert_allclose(density, -5000.0 + np.log(0.25 + 0.75 * np.exp(-1.0)))
 
 
-def test_likelihood_where_a_fix_is_missing_is_none():
-    made = record(LOOSE, "outage", episodes=1, backend="numpy", horizon=300)
-    dataset = evaluate(LOOSE, _names(LOOSE)[:1], scenario=blind(made), backend="numpy")
-    missing = made.measurements["available"][0, :300] == 0.0
-    assert missing.any()
-    np.testing.assert_array_equal(np.isnan(dataset["log_likelihood"].values[0, 0]), missing)
-
-
-def test_references_are_refused_on_recordings(recordings):
-    with pytest.raises(
-        ValueError, match="reference 'known-turn' is told what recording 'random recorded' does not"
-    ):
-        evaluate(TARGET, ["known-turn"], scenario=recordings[TARGET])
-
-
 def test_training_and_tuning_refuse_recordings(recordings):
     from filtergym.agents.training_run import training_scenarios
     from filtergym.baselines.problem import problem_of
@@ -333,51 +256,13 @@ def test_training_and_tuning_refuse_recordings(recordings):
 # --- estimates
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_estimates_are_written(known, recordings, tmp_path):
-    recording = recordings[TARGET] if known else blind(recordings[TARGET])
-    dataset = evaluate(TARGET, ["imm", "kalman-imm"], scenario=recording, backend="numpy", tracks=True)
-    write_estimates(tmp_path / "estimates.nc", dataset)
-    with xarray.open_dataset(tmp_path / "estimates.nc", engine="scipy") as found:
-        np.testing.assert_array_equal(found["estimate"].values, dataset["estimate"].values)
-        variance = np.diagonal(dataset["covariance"].values, axis1=-2, axis2=-1)
-        np.testing.assert_allclose(found["sigma"].values, np.sqrt(variance))
-        assert ("truth" in found) == known
-    write_estimates(tmp_path / "estimates.csv", dataset)
-    lines = (tmp_path / "estimates.csv").read_text().splitlines()
-    header = lines[0].split(",")
-    assert len(lines) == 1 + 2 * 3 * 24
-    row = dict(zip(header, lines[1 + 24 * 3 + 24 + 1].split(","), strict=True))
-    assert (row["policy"], row["recording"], row["measurement"]) == ("kalman-imm", "1", "2")
-    assert float(row["nis"]) == dataset["nis"].values[1, 1, 1]
-    assert float(row["estimate_position_y"]) == dataset["estimate"].values[1, 1, 1, 1]
-    assert float(row["seconds"]) == 12.0
-    write_estimates(tmp_path / "tracks.tum", dataset)
-    kinds = ("", "truth.") if known else ("",)
-    names = {
-        f"{kind}{policy}.{i}.tum" for kind in kinds for policy in ("imm", "kalman-imm") for i in range(3)
-    }
-    assert {path.name for path in (tmp_path / "tracks.tum").iterdir()} == names
-    rows = np.loadtxt(tmp_path / "tracks.tum" / "imm.1.tum")
-    np.testing.assert_allclose(rows[:, 0], dataset["seconds"].values[0, 1], atol=1e-9)
-    np.testing.assert_allclose(rows[:, 1:3], dataset["estimate"].values[0, 1, :, :2], atol=1e-9)
-    np.testing.assert_array_equal(rows[:, 3:], np.tile([0.0, 0, 0, 0, 1], (len(rows), 1)))
-    if known:
-        truth = np.loadtxt(tmp_path / "tracks.tum" / "truth.imm.1.tum")
-        np.testing.assert_allclose(truth[:, 1:3], dataset["truth"].values[0, 1, :, :2], atol=1e-9)
-    with pytest.raises(ValueError, match=r"estimates are written as \.csv or \.nc"):
-        write_estimates(tmp_path / "estimates.txt", dataset)
-
-
 # --- closed loops
 
 
-@pytest.mark.parametrize(("env", "keywords"), [(UAV, {}), (TIGHT, {"scenario": "paper"})])
-def test_a_closed_loop_says_why_it_cannot_be_recorded(env, keywords):
-    with pytest.raises(
-        ValueError, match="is a closed loop, in which the estimate decides what is measured next"
-    ):
-        record(env, episodes=1, **keywords)
+def test_a_closed_loop_says_why_it_cannot_be_recorded():
+    for env, scenario in ((UAV, None), (TIGHT, "paper")):
+        with pytest.raises(ValueError, match="is a closed loop, in which the estimate decides"):
+            record(env, scenario, episodes=1)
 
 
 # --- tables
@@ -415,8 +300,6 @@ def test_plots_start_from_the_first_two(tmp_path):
     J = np.array([[0.0, 1.0], [-0.2, 0.2]])
     expected = J @ np.diag([2500.0, 3600.0]) @ J.T
     np.testing.assert_allclose(read.initial["covariance"][0][np.ix_([0, 2], [0, 2])], expected)
-    dataset = evaluate(TARGET, ["imm"], scenario=read, tracks=True)
-    assert np.isfinite(dataset["estimate"].values).all()
 
 
 def test_range_and_azimuth_are_east_and_north(tmp_path):
@@ -439,22 +322,15 @@ def test_range_and_azimuth_are_east_and_north(tmp_path):
     named = read_recording(table(tmp_path / "own.csv", **polar, **sigmas), TARGET)
     as_parameters = read_recording(tmp_path / "polar.csv", TARGET, range_sigma=30.0, bearing_sigma=0.5)
     np.testing.assert_allclose(named.measurements["variance"], as_parameters.measurements["variance"])
-    assert as_parameters.parameters["bearing_sigma"] == 0.5
 
 
 def test_several_tracks_with_truth_in_one_table(tmp_path):
-    rows = {name: values * 2 for name, values in PLOTS.items()}
-    truth = {
-        "truth_position_x": (1000.0 + 1000.0 * np.arange(5)).tolist() * 2,
-        "truth_position_y": (9000.0 - 150.0 * np.arange(5)).tolist() * 2,
-        "truth_velocity_x": [200.0] * 10,
-        "truth_velocity_y": [-30.0] * 10,
-    }
-    path = table(tmp_path / "two.csv", **rows, recording=["a"] * 5 + ["b"] * 5, **truth)
-    read = read_recording(path, TARGET)
+    rows = {name: values * 2 for name, values in PLOTS.items()} | {"recording": ["a"] * 5 + ["b"] * 5}
+    rows |= {"truth_position_x": (1000.0 + 1000.0 * np.arange(5)).tolist() * 2}
+    rows |= {"truth_position_y": (9000.0 - 150.0 * np.arange(5)).tolist() * 2}
+    read = read_recording(table(tmp_path / "two.csv", **rows), TARGET)
     assert read.names == ("a", "b")
     assert read.truth[:, :, 0].tolist() == [[3000.0, 4000.0, 5000.0]] * 2
-    assert np.isfinite(evaluate(TARGET, ["imm"], scenario=read)["cost"].values).all()
 
 
 def test_positions_of_ins_and_receiver(tmp_path):
@@ -472,8 +348,6 @@ def test_positions_of_ins_and_receiver(tmp_path):
     assert said["fix"][0].tolist() == [[1.5, 5.5], [0.0, 0.0], [5.0, 4.5]]
     assert said["reported_deviation"][0].tolist() == [2.0, 3.0, 4.0]
     assert read.initial["mean"][0].tolist() == [0.0, 5.0]
-    found = evaluate(LOOSE, _names(LOOSE)[:1], scenario=read, tracks=True)
-    assert np.isfinite(found["estimate"].values).all()
 
 
 def test_ranges_and_decisions(tmp_path):
@@ -496,7 +370,6 @@ def test_ranges_and_decisions(tmp_path):
     # Everyone is told what the simulation tells.
     initial, _ = measure_once(make_model(ESM).task)
     np.testing.assert_allclose(read.initial["covariance"][0], initial.covariance[..., 0])
-    assert np.isfinite(evaluate(ESM, _names(ESM)[:1], scenario=read, tracks=True)["estimate"].values).all()
 
 
 def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, tmp_path):
@@ -511,7 +384,6 @@ def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, t
         assert read.lengths.tolist() == [n - used for n in recordings[env].lengths]
         counted = "number" if env == LOOSE else "scan"
         assert read.measurements[counted][:, 0].tolist() == [1] * 3
-        assert np.isfinite(evaluate(env, _names(env)[:1], scenario=read)["cost"].values).all()
         if env == TARGET:
             said = recordings[env].measurements
             assert (said["interval"][:, 1] != 6.0).any()  # scans that come early
@@ -531,9 +403,8 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
     time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
     x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
-    found = read_log(
-        Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {"range_sigma": 100.0})
-    )
+    given = {"range_sigma": 100.0}
+    found = read_log(Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), given))
     said = found.measurements
     assert set(said) == set(fields)
     assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]
@@ -543,42 +414,19 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     assert said["position"][1].tolist() == [0.0, 0.0]
     assert said["variance"][2].tolist() == [1e4, 1e4]  # range_sigma squared
     assert said["position"][4].tolist() == [6e3, 6001.0]
-
-
-def test_a_table_with_gaps_is_filtered_over_the_times_it_has(tmp_path):
-    """No plot is prediction only, over the time that has passed; nothing becomes NaN but what is of no measurement."""
-    time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0, 40.0])
-    x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3, 8e3])
-    path = table(tmp_path / "gaps.csv", time=time, x=x, y=x + 1.0)
-    read = read_recording(path, TARGET)
-    names = ["imm", "kalman-imm-turn", "adaptive-rearm", "constant"]
-    names = [name for name in names if name in _names(TARGET)]
-    for backend in ("numpy", "auto"):
-        found = evaluate(TARGET, names, scenario=read, tracks=True, backend=backend)
-        assert np.isfinite(found["estimate"].values).all()
-        nis = found["nis"].sel(policy="imm").values[0]
-        assert np.isnan(nis).tolist() == [False, True, True, True, False, False, False]
-    estimate = found["estimate"].sel(policy="imm").values[0]
-    lasted = np.array([4.8, 5.0, 5.0])
-    # Of a mixture of two filters the mean moves on as its own velocity says.
-    moved = estimate[0, :2] + np.cumsum(lasted)[:, None] * estimate[0, 2:]
-    assert abs(estimate[1:4, :2] - moved).max() < 1e-9 * 1e4
-    # The same with cells of the scans that nobody wrote down.
-    full = np.insert(time, 4, [20.0, 25.0])
-    told = np.insert(x, 4, [np.nan, np.nan])
-    again = read_recording(table(tmp_path / "told.csv", time=full, x=told, y=told + 1.0), TARGET)
-    for name, values in read.measurements.items():
+    full, told = np.insert(time, 4, [20.0, 25.0]), np.insert(x, 4, [np.nan, np.nan])
+    again = read_log(Columns("track", pandas.DataFrame({"time": full, "x": told, "y": told + 1.0}), given))
+    for name, values in said.items():
         np.testing.assert_array_equal(values, again.measurements[name])
 
 
 @pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
 def test_missed_and_irregular_scans_are_replayed_bit_for_bit(scenario, tmp_path):
-    for backend in ("numpy", "auto"):
-        made = record(TARGET, scenario, episodes=3, horizon=30, backend=backend)
-        made.write(tmp_path / "made.nc")
-        simulated = evaluate(TARGET, ["imm"], scenario, 3, horizon=30, backend=backend)
-        replayed = evaluate(TARGET, ["imm"], read_recording(tmp_path / "made.nc"), backend=backend)
-        np.testing.assert_array_equal(simulated["error"].values, replayed["error"].values)
+    made = record(TARGET, scenario, episodes=3, horizon=30)
+    made.write(tmp_path / "made.nc")
+    simulated = evaluate(TARGET, ["imm"], scenario, 3, horizon=30)
+    replayed = evaluate(TARGET, ["imm"], read_recording(tmp_path / "made.nc"))
+    np.testing.assert_array_equal(simulated["error"].values, replayed["error"].values)
     interval = made.measurements["interval"]
     np.testing.assert_allclose(made.seconds, np.cumsum(interval, axis=1))
     assert (np.ptp(interval) > 1.0) == (scenario == "irregular-scans")
@@ -603,9 +451,6 @@ def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
             f"b: {assumed}sigma_x 90.8 m, sigma_y 90.8 m",
             "d: left out: sampling_interval is 6.0, and of a 5.0",
         )
-    dataset = evaluate(TARGET, ["imm"], scenario=read)
-    assert notes_of(dataset) == list(read.notes)
-    assert np.isfinite(dataset["nis"].values[0]).sum(axis=1).tolist() == [3, 2]
     with pytest.raises(ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time decreases"):
         read_recording([tmp_path / "c.csv"] * 2, TARGET)
 
@@ -619,13 +464,6 @@ def test_files_with_and_without_truth_are_not_judged(recordings, tmp_path):
     assert read.notes == ("untold: has no truth, so no competitor is judged",)
 
 
-def test_a_horizon_makes_episodes_shorter(recordings, tmp_path):
-    recordings[TARGET].write(tmp_path / "plots.nc")
-    read = read_recording(tmp_path / "plots.nc", horizon=10)
-    assert make_model(TARGET, scenario=read).task.flights == (10, 10, 10)
-    assert make_model(TARGET, scenario=read, horizon=7).task.horizon == 7
-
-
 def changed(**columns):
     """Plots with other columns; None leaves one out."""
     return {name: values for name, values in {**PLOTS, **columns}.items() if values is not None}
@@ -633,84 +471,41 @@ def changed(**columns):
 
 LOG = {"time": [0.0, 1.0, 2.0, 3.0], "ins": [0.0, 1.0, 2.0, 3.0], "fix": [0.0, 1.0, 2.0, 3.0]}
 ECHO = {"time": [0.0, 1.0, 2.0], "range": [9e4, 9e4, 9e4], "range_rate": [0.0, 1.0, 2.0]}
-WRONG = {
-    "sigma zero": (TARGET, changed(sigma_x=[1.0, 1.0, 0.0, 1.0, 1.0], sigma_y=[1.0] * 5), "row 2 has 0"),
-    "sigma negative": (
-        TARGET,
-        changed(sigma_x=[1.0] * 5, sigma_y=[1.0, -2.0, 1.0, 1.0, 1.0]),
-        "row 1 has -2",
-    ),
-    "one sigma": (TARGET, changed(sigma_x=[1.0] * 5), "lacks the column sigma_y"),
-    "one coordinate": (TARGET, changed(y=[1.0, 2.0, None, 4.0, 5.0]), "row 2 has one coordinate of two"),
-    "no coordinate": (
-        TARGET,
-        {"time": PLOTS["time"], "sigma_x": [1.0] * 5, "sigma_y": [1.0] * 5},
-        "needs x and y",
-    ),
-    "words": (TARGET, changed(x=["a", 1.0, 2.0, 3.0, 4.0]), "x has 'a' in row 0, which is no number"),
-    "decreasing": (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases between rows 1 and 2"),
-    "twice": (
-        TARGET,
-        changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]),
-        "time is the same in rows 1 and 2: 1 of 5 rows",
-    ),
-    "no time": (TARGET, changed(time=None), "reads time and x, y"),
-    "two rows": (TARGET, {name: values[:2] for name, values in PLOTS.items()}, "it has 2 plots"),
-    "one row": (
-        TARGET,
-        {name: values[:1] for name, values in PLOTS.items()},
-        "1 row, and a recording needs several",
-    ),
-    "radians": (
-        TARGET,
-        {"time": PLOTS["time"], "range": [9e3] * 5, "azimuth": [400.0] * 5},
-        "azimuth reaches 400, and degrees",
-    ),
-    "range below zero": (
-        TARGET,
-        {"time": PLOTS["time"], "range": [9e3, -1.0, 1.0, 1.0, 1.0], "azimuth": [1.0] * 5},
-        "range is a distance, and row 1 has -1 m",
-    ),
-    "half the truth": (TARGET, changed(truth_position_x=[1.0] * 5), "the column truth_position_y is missing"),
-    "no such truth": (
-        TARGET,
-        changed(truth_height=[1.0] * 5),
-        "truth_height is no truth of filtergym/ManeuveringTarget-v0, whose components are truth_position_x",
-    ),
-    "truth without a cost": (
-        TARGET,
-        changed(truth_velocity_x=[1.0] * 5, truth_velocity_y=[1.0] * 5),
-        "does not say what an error costs",
-    ),
-    "irregular": (
-        LOOSE,
-        {**LOG, "time": [0.0, 1.0, 2.0, 4.0]},
-        "times are 2 s apart after row 2 and 1 s elsewhere",
-    ),
-    "no fix": (LOOSE, {**LOG, "fix": [None] * 4}, "no row has a fix"),
-    "INS missing": (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),
-    "no INS": (LOOSE, {"time": LOG["time"], "fix": LOG["fix"]}, "lacks the column ins"),
-    "unknown type": (ESM, {**ECHO, "decision": [0, 7, None]}, "from 0 to 3, and row 1 has 7"),
-    "no bearings": (
-        ESM,
-        {**ECHO, "decision": [0, None, None]},
-        "the gate needs radar_bearing and esm_bearing",
-    ),
-    "one bearing": (
-        ESM,
-        {**ECHO, "decision": [0, 1, None], "radar_bearing": [1.0, 2.0, 3.0], "esm_bearing": [1.0, None, 3.0]},
-        "row 1 has a decision and lacks a bearing",
-    ),
-    "no tables": (TIGHT, LOG, "reads recordings from NetCDF only"),
-    "a closed loop": (UAV, LOG, "is a closed loop, in which the estimate decides"),
-    "kilometres away": (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
-    "another environment": (ESM, PLOTS, "reads time and range, range_rate"),
-}
+ONE, POLAR = [1.0] * 5, {"time": PLOTS["time"], "range": [9e3] * 5, "azimuth": [1.0] * 5}
+BEARINGS = {"decision": [0, 1, None], "radar_bearing": [1.0, 2.0, 3.0], "esm_bearing": [1.0, None, 3.0]}
+WRONG = [
+    (TARGET, changed(sigma_x=[1.0, 1.0, 0.0, 1.0, 1.0], sigma_y=ONE), "row 2 has 0"),
+    (TARGET, changed(sigma_x=ONE, sigma_y=[1.0, -2.0, 1.0, 1.0, 1.0]), "row 1 has -2"),
+    (TARGET, changed(sigma_x=ONE), "lacks the column sigma_y"),
+    (TARGET, changed(y=[1.0, 2.0, None, 4.0, 5.0]), "row 2 has one coordinate of two"),
+    (TARGET, {"time": PLOTS["time"], "sigma_x": ONE, "sigma_y": ONE}, "needs x and y"),
+    (TARGET, changed(x=["a", 1.0, 2.0, 3.0, 4.0]), "x has 'a' in row 0, which is no number"),
+    (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases between rows 1 and 2"),
+    (TARGET, changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]), "is the same in rows 1 and 2: 1 of 5 rows"),
+    (TARGET, changed(time=None), "reads time and x, y"),
+    (TARGET, {name: values[:2] for name, values in PLOTS.items()}, "it has 2 plots"),
+    (TARGET, {name: values[:1] for name, values in PLOTS.items()}, "1 row, and a recording needs several"),
+    (TARGET, POLAR | {"azimuth": [400.0] * 5}, "azimuth reaches 400, and degrees"),
+    (TARGET, POLAR | {"range": [9e3, -1.0, 1.0, 1.0, 1.0]}, "range is a distance, and row 1 has -1 m"),
+    (TARGET, changed(truth_position_x=ONE), "the column truth_position_y is missing"),
+    (TARGET, changed(truth_height=ONE), "truth_height is no truth of filtergym/ManeuveringTarget-v0"),
+    (TARGET, changed(truth_velocity_x=ONE, truth_velocity_y=ONE), "does not say what an error costs"),
+    (LOOSE, {**LOG, "time": [0.0, 1.0, 2.0, 4.0]}, "times are 2 s apart after row 2 and 1 s elsewhere"),
+    (LOOSE, {**LOG, "fix": [None] * 4}, "no row has a fix"),
+    (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),
+    (LOOSE, {"time": LOG["time"], "fix": LOG["fix"]}, "lacks the column ins"),
+    (ESM, {**ECHO, "decision": [0, 7, None]}, "from 0 to 3, and row 1 has 7"),
+    (ESM, {**ECHO, "decision": [0, None, None]}, "the gate needs radar_bearing and esm_bearing"),
+    (ESM, ECHO | BEARINGS, "row 1 has a decision and lacks a bearing"),
+    (TIGHT, LOG, "reads recordings from NetCDF only"),
+    (UAV, LOG, "is a closed loop, in which the estimate decides"),
+    (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
+    (ESM, PLOTS, "reads time and range, range_rate"),
+]
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_tables_are_one_sentence(case, tmp_path):
-    env, columns, sentence = WRONG[case]
+@pytest.mark.parametrize(("env", "columns", "sentence"), WRONG, ids=[sentence for *_, sentence in WRONG])
+def test_wrong_tables_are_one_sentence(env, columns, sentence, tmp_path):
     with pytest.raises(ValueError, match=r"recording .*wrong\.csv: ") as refusal:
         read_recording(table(tmp_path / "wrong.csv", **columns), env)
     assert sentence in str(refusal.value)
@@ -742,11 +537,7 @@ def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
         read_recording(tmp_path / "nothing.nc")
 
 
-def test_too_many_rows_are_refused_early(tmp_path, monkeypatch):
-    monkeypatch.setattr("filtergym.envs.data.flight_tables.MOST_ROWS", 1000)
-    (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + b"1,2,3\n" * 1002)
-    with pytest.raises(ValueError, match="more than 1,000 rows"):
-        read_recording(tmp_path / "long.csv", TARGET)
+def test_too_many_rows_are_refused_early():
     with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may hold"):
         record(TARGET, episodes=10, horizon=10_000_000)
 
@@ -760,57 +551,28 @@ NOT_FINITE = "position is not finite at measurement 3; what is missing has the v
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (
-            lambda d: d.assign_attrs(environment=LOOSE),
-            "it is of filtergym/LooselyCoupledNavigation-v0, not of",
-        ),
+        (lambda d: d.assign_attrs(environment=LOOSE), "it is of filtergym/LooselyCoupledNavigation-v0, not of"),
         (lambda d: d.assign_attrs(parameters="{"), "must be a JSON object"),
-        (
-            lambda d: d.assign_attrs(parameters='{"rang_sigma": 1}'),
-            "sets 'rang_sigma', which is no parameter",
-        ),
+        (lambda d: d.assign_attrs(parameters='{"rang_sigma": 1}'), "sets 'rang_sigma', which is no parameter"),
         (lambda d: d.drop_vars("variance"), "lacks variance; filtergym/ManeuveringTarget-v0 measures scan"),
         (lambda d: d.drop_vars("initial_mean"), "lacks initial_mean"),
         (lambda d: d.assign(variance=d["variance"].astype(str)), "variance must be numbers, got "),
         (lambda d: d.assign(height=d["scan"]), "has height, which is nothing that"),
         (lambda d: d.isel(position_axis0=[0]), "position has the shape (1,)"),
         (lambda d: d.drop_vars("seconds"), "lacks the variable seconds"),
-        (
-            lambda d: d.assign(seconds=-6.0 * d["scan"]),
-            "seconds must increase, and measurement 2 has -12 s",
-        ),
+        (lambda d: d.assign(seconds=-6.0 * d["scan"]), "seconds must increase, and measurement 2 has -12 s"),
         (lambda d: d.assign(seconds=0.0 * d["seconds"] + np.nan), "it holds no measurements"),
         (lambda d: d.assign(position=d["position"].where(d["scan"] != 3.0)), NOT_FINITE),
         (lambda d: d.assign(length=d["length"] + 5), "length must be from 1 to its 25 measurements, got 29"),
-        (
-            lambda d: d.assign(truth=d["truth"].isel(component=slice(2)).rename(component="two")),
-            "truth has 2",
-        ),
+        (lambda d: d.assign(truth=d["truth"][..., :2].rename(component="two")), "truth has 2"),
     ],
-)
+)  # fmt: skip
 def test_wrong_netcdf_is_one_sentence(change, sentence, recordings, tmp_path):
     change(recordings[TARGET].dataset).to_netcdf(tmp_path / "wrong.nc", engine="scipy")
     with pytest.raises(ValueError, match=r"wrong") as refusal:
         read_recording(tmp_path / "wrong.nc", TARGET)
     assert sentence in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_satellites_without_velocity(recordings, tmp_path):
-    data = recordings[TIGHT].dataset.drop_vars("satellite_velocity")
-    data.to_netcdf(tmp_path / "gnss.nc", engine="scipy")
-    with pytest.raises(ValueError, match=r"lacks satellite_velocity; .* measures number, readings"):
-        gym.make(TIGHT, scenario=tmp_path / "gnss.nc")
-
-
-def test_files_say_what_they_hold(recordings):
-    data = recordings[LOOSE].dataset
-    assert data["ins"].dims[:2] == data["seconds"].dims == ("episode", "time")
-    assert data["truth"].dims == ("episode", "time", "component")
-    assert data["initial_covariance"].dims == ("episode", "component", "other_component")
-    assert data.attrs["environment"] == LOOSE
-    assert json.loads(data.attrs["parameters"])["axes"] == 2
-    assert data["recording"].values.tolist() == ["0", "1", "2"]
 
 
 def test_recordings_of_another_environment_are_refused(recordings):
@@ -857,24 +619,6 @@ def test_the_example_of_the_page_prints_what_it_says(capsys):
     assert capsys.readouterr().out.splitlines() == said
 
 
-def test_the_table_of_the_page_is_that_of_its_command(tmp_path):
-    runpy.run_path(str(DOCS / "examples" / "plots.py"))["write_plots"](tmp_path / "plots.csv")
-    read = read_recording(tmp_path / "plots.csv", TARGET)
-    assert read.names == ("straight", "turning")
-    records = tidy_records(evaluate(TARGET, ["imm", "imm-tuned"], scenario=read, tracks=True))
-    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    text = PAGE.read_text(encoding="utf-8").partition("--recording plots.csv")[2]
-    band = found["imm", "anis_band"]
-    assert f"lies in the band ({band.low:.3g} to {band.high:.3g} here)" in text
-    for policy in ("imm", "imm-tuned"):
-        line = next(line for line in text.splitlines() if line.startswith(f"{policy} "))
-        cells = re.split("  +", line)
-        metrics = {1: "log_likelihood", 3: "anis"}
-        assert {i: cells[i] for i in metrics} == {
-            i: with_interval(found[policy, m]) for i, m in metrics.items()
-        }
-
-
 def test_every_column_is_on_the_page():
     text = PAGE.read_text(encoding="utf-8")
     axes = ("ins_y", "ins_z", "fix_y", "fix_z")
@@ -901,62 +645,30 @@ def _command(command, monkeypatch, tmp_path):
 def test_record_and_evaluate_on_the_command_line(command, tmp_path):
     code, out = command("record", TARGET, "--episodes", 2, "--set", "horizon=12", "--out", "plots.nc")
     assert (code, out.strip()) == (0, "2 episodes in plots.nc")
-    code, out = command(
-        "evaluate",
-        "--recording",
-        "plots.nc",
-        "--policy",
-        "imm",
-        "--estimates",
-        "estimates.csv",
-        "--out",
-        "figures",
-    )
+    words = ("--policy", "imm", "--estimates", "estimates.csv", "--json", "records.json")
+    code, out = command("evaluate", "--recording", "plots.nc", *words)
     assert code == 0
     assert "2 recordings" in out
     assert len((tmp_path / "estimates.csv").read_text().splitlines()) == 25
-    assert (tmp_path / "figures" / "records.json").exists()
-    # The file names its environment as a scenario, too.
-    code, again = command("evaluate", "--scenario", "plots.nc", "--policy", "imm")
-    assert code == 0
-    assert again.splitlines()[:9] == out.splitlines()[:9]
-
-
-def test_tables_on_the_command_line(command, tmp_path):
-    table(tmp_path / "plots.csv", **PLOTS)
-    code, out = command(
-        "evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", "--json", "records.json"
-    )
-    assert code == 0
+    # A table has no truth; the file of the first names its environment as a scenario, too.
+    code, out = command("evaluate", TARGET, "--recording", table(tmp_path / "plots.csv", **PLOTS), *words)
     assert "log-likelihood: of what was measured" in out
     metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
-    assert {"log_likelihood", "anis", "anis_band", "nis_inside"} <= metrics
-    assert {"prediction_error", "innovation_correlation"} <= metrics
+    assert {"log_likelihood", "anis", "anis_band", "prediction_error", "innovation_correlation"} <= metrics
     assert not {"rmse", "cost", "anees"} & metrics
+    assert "2 recordings" in command("evaluate", "--scenario", "plots.nc", "--policy", "imm")[1]
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["evaluate", "--recording", "plots.csv"], "does not say of which environment it is"),
         (["evaluate"], "name an environment, or a recording, which names its own"),
-        (
-            ["evaluate", TARGET, "--recording", "plots.csv", "--scenario", "paper"],
-            "takes the place of --scenario",
-        ),
-        (
-            ["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"],
-            "'known-turn' is told what",
-        ),
-        (
-            ["evaluate", TARGET, "--recording", "plots.csv", "--site", "1,2"],
-            "--site is for flights from files",
-        ),
-        (["evaluate", TARGET, "--recording", "nothing/*.csv"], "no file matches 'nothing/*.csv'"),
+        (["evaluate", TARGET, "--recording", "plots.csv", "--scenario", "paper"], "takes the place of --scenario"),
+        (["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"], "'known-turn' is told what"),
+        (["evaluate", TARGET, "--recording", "plots.csv", "--site", "1,2"], "--site is for flights from files"),
         (["record", TARGET, "--out", "plots.csv"], "a recording is a NetCDF file, whose name ends in .nc"),
-        (["record", UAV, "--out", "loop.nc"], "is a closed loop"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_on_the_command_line_are_one_sentence(words, sentence, command, tmp_path):
     table(tmp_path / "plots.csv", **PLOTS)
     code, out = command(*words)

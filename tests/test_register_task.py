@@ -127,8 +127,12 @@ def test_evaluation_without_baselines(package):
     assert {r.policy for r in records} == {"mine", "random"}
     assert {r.environment for r in records} == {"mine/Turns-v0"}
     assert not {"score", "cost_difference"} & {r.metric for r in records}
-    with pytest.raises(ValueError, match="unknown policy 'imm': choose from random"):
+    with pytest.raises(ValueError, match="unknown policy 'imm': choose from paper, random"):
         filtergym.evaluate(ID, ["imm"])
+    # The action that the class declares is the paper's algorithm of the environment that it equals.
+    own = filtergym.evaluate(ID, ["paper"], episodes=3, horizon=20)["cost"]
+    equal = filtergym.evaluate("filtergym/ManeuveringTarget-v0", ["zero"], "random", 3, horizon=20)["cost"]
+    np.testing.assert_array_equal(own, equal)
 
 
 def test_evaluation_with_baselines(turns):
@@ -167,7 +171,7 @@ def test_training_with_default_hyperparameters(package, command, monkeypatch):
     assert code == 0, errors
     record = json.loads((package / "run" / "run.json").read_text())
     assert record["environment"] == ID
-    assert list(record["validation"][-1]) == ["steps", "cost"]
+    assert record["validation"][-1]["paper"] == "paper"
     code, _, errors = command("export", "run", "--trust")  # its record names the module to import
     assert code == 0, errors
     code, _, errors = command("evaluate", ID, "--policy", "run/agent.safetensors", "--episodes", "3")

@@ -153,17 +153,20 @@ def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
     return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in cells]
 
 
-def open_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
+def open_netcdf(file: Path, wanted: ColumnNames | None = None, **decoding: Any) -> "xarray.Dataset":
     """Open a NetCDF file, of the third or the fourth version.
 
     Args:
         file: its path.
-        **decoding: as of ``xarray.open_dataset``.
+        wanted: names of the variables that are read, others are empty; None: all are read.
+        **decoding: as of ``xarray.decode_cf``, which applies what attributes say of offsets, dates and missing values.
 
     Raises:
-        ValueError: if it is none, or needs a package that is not installed.
+        ValueError: if it is none, breaks a limit, or needs a package that is not installed.
     """
-    return decode_netcdf(read_netcdf_variables(file), **decoding)
+    import xarray
+
+    return xarray.decode_cf(_read_netcdf_variables(file, wanted), **decoding)
 
 
 def _is_hdf(file: Path) -> bool:
@@ -185,20 +188,11 @@ def netcdf_attribute_names(file: Path) -> list[str]:
     if _is_hdf(file):
         found: list[str] = parse_apart("netcdf4_names", file, EXTRA)["names"]
         return found
-    return [str(name) for name in read_netcdf_variables(file).attrs]
+    return [str(name) for name in _read_netcdf_variables(file).attrs]
 
 
-def read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
-    """Read a NetCDF file, of the third or the fourth version, as it stands there: what its attributes say of offsets,
-    dates and missing values is not applied yet.
-
-    Args:
-        file: its path.
-        wanted: names of the variables that are read, others are empty; None: all are read.
-
-    Raises:
-        ValueError: if it is none, breaks a limit, or needs a package that is not installed.
-    """
+def _read_netcdf_variables(file: Path, wanted: ColumnNames | None = None) -> "xarray.Dataset":
+    """Read a NetCDF file as it stands there; arguments and errors as of :func:`open_netcdf`."""
     import xarray
 
     if not _is_hdf(file):
@@ -238,25 +232,10 @@ def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     }
 
 
-def decode_netcdf(data: "xarray.Dataset", **decoding: Any) -> "xarray.Dataset":
-    """Apply what attributes say of offsets, dates and missing values.
-
-    Args:
-        data: as it stands in a file.
-        **decoding: as of ``xarray.decode_cf``.
-
-    Raises:
-        ValueError: if they make no sense.
-    """
-    import xarray
-
-    return xarray.decode_cf(data, **decoding)
-
-
 def _netcdf(file: Path, known: ColumnNames) -> Table:
     import pandas
 
-    with decode_netcdf(read_netcdf_variables(file, known), decode_timedelta=False) as data:
+    with open_netcdf(file, known, decode_timedelta=False) as data:
         names = list(map(str, data.variables))
         columns: dict[str, Any] = {}
         for name, lower in zip(names, check_column_names(names), strict=True):

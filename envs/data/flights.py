@@ -34,6 +34,7 @@ from .flight_tables import (
     suffix_of,
 )
 from .plausibility import check_degrees
+from .receiver_logs import count_of
 from .trajectory import Trajectory, trajectory_of
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ class Flights:
                     kept.append(piece)
             notes = [*source.notes]
             if source.notes or dropped:
-                notes.append(_count_of(len(source.trajectories), "piece"))
+                notes.append(count_of(len(source.trajectories), "piece"))
             if dropped:
                 notes.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
             if far:
@@ -138,10 +139,6 @@ def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         else trajectory
         for i, trajectory in enumerate(trajectories, 1)
     ]
-
-
-def _count_of(count: int, what: str, plural: str = "") -> str:
-    return f"{count:,} {what if count == 1 else plural or what + 's'}"
 
 
 def _nothing(name: str, reasons: Sequence[str]) -> str:
@@ -305,7 +302,7 @@ def read_flights(
     elif isinstance(source, Trajectory):
         name, given = source.name, [source]
     elif isinstance(source, list | tuple) and source:
-        name, given = _count_of(len(source), "flight"), list(source)
+        name, given = count_of(len(source), "flight"), list(source)
     else:
         raise ValueError(
             f"flights are a file, a folder, a pattern such as 'flights/*.csv', or a sequence of them, got {source!r}"
@@ -420,7 +417,7 @@ def _flights_of(
     if not good:
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
     notes = [
-        f"{_count_of(count, *words)}{tail(limits)}"
+        f"{count_of(count, *words)}{tail(limits)}"
         for (words, tail), count in zip(CLEANING_COUNTS.values(), counts.values(), strict=True)
         if count
     ]

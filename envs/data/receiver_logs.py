@@ -47,8 +47,9 @@ class ReceiverLog(NamedTuple):
     """What is to be told of the reading, a line each."""
 
 
-def _count_of(count: int, what: str) -> str:
-    return f"{count:,} {what}{'s' * (count != 1)}"
+def count_of(count: int, what: str, plural: str = "") -> str:
+    """Say how many there are of something; its plural is with s, or as it is given."""
+    return f"{count:,} {what if count == 1 else plural or what + 's'}"
 
 
 def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
@@ -58,8 +59,8 @@ def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
         ValueError: if most lines are broken.
     """
     if count > MOST_BROKEN * (count + good):
-        raise ValueError(f"{_count_of(count, 'line')} of {count + good:,} {what}: is it whole?")
-    return (f"{_count_of(count, 'line')} {what}: left out",) if count else ()
+        raise ValueError(f"{count_of(count, 'line')} of {count + good:,} {what}: is it whole?")
+    return (f"{count_of(count, 'line')} {what}: left out",) if count else ()
 
 
 def _read_lines(file: Path) -> Iterator[bytes]:
@@ -245,7 +246,7 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
         )
     missing = int(numpy.isnan(places[:, 0]).sum())
     if missing:
-        notes += (f"{_count_of(missing, 'time')} without a position",)
+        notes += (f"{count_of(missing, 'time')} without a position",)
     return ReceiverLog(columns, notes)
 
 
@@ -350,7 +351,7 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
         columns |= {"sigma_x": sigma, "sigma_y": sigma}
     notes = [f"positions are of {log['topic']}, times seconds since the start of the autopilot"]
     if not fixed.all():
-        notes.append(f"{_count_of(int((~fixed).sum()), 'row')} without a fix")
+        notes.append(f"{count_of(int((~fixed).sum()), 'row')} without a fix")
     return ReceiverLog(columns, tuple(notes))
 
 
@@ -393,7 +394,7 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
         columns["sigma_x"] = numpy.sqrt(numpy.maximum(east, 0.0))
         columns["sigma_y"] = numpy.sqrt(numpy.maximum(north, 0.0))
     if not fixed.all():
-        notes.append(f"{_count_of(int((~fixed).sum()), 'message')} without a fix")
+        notes.append(f"{count_of(int((~fixed).sum()), 'message')} without a fix")
     return ReceiverLog(columns, tuple(notes))
 
 

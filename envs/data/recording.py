@@ -284,10 +284,8 @@ class Recording:
         return dataset_of(self)
 
     def write(self, path: Any) -> None:
-        """Write a NetCDF file, which ``read_recording`` reads and ``scenario`` names."""
-        from .recording_files import write_recording
-
-        write_recording(self, path)
+        """Write a NetCDF file that every reader of NetCDF takes, ``read_recording`` reads and ``scenario`` names."""
+        self.dataset.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
 
     # --- as a world
 

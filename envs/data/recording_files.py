@@ -68,11 +68,6 @@ def dataset_of(recording: Recording) -> "xarray.Dataset":
     )
 
 
-def write_recording(recording: Recording, path: Path) -> None:
-    """Write a NetCDF file that every reader of NetCDF takes."""
-    dataset_of(recording).to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
-
-
 def is_recording(path: Any) -> bool:
     """Whether this is the path of a NetCDF file that says of which environment it holds measurements."""
     try:

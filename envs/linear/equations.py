@@ -14,7 +14,7 @@ same one, G N D^T, is left out.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
@@ -134,35 +134,28 @@ def process_noise(
     return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
-class Passed(Protocol):
-    """What says how a state moved since the measurement before, such as a measurement."""
+class Measurement(NamedTuple):
+    """What the sensors say."""
 
-    @property
-    def interval(self) -> Array | None:
-        """Since then, s, ``(N,)``; None where the model is not timed."""
-
-    @property
-    def inputs(self) -> Array | None:
-        """What acted in it, ``(p, N)``; None where the model has no inputs."""
-
-
-class Measured(Passed, Protocol):
-    """A measurement."""
-
-    @property
-    def values(self) -> Array:
-        """``(m, N)``."""
-
-    @property
-    def available(self) -> Array:
-        """1 where a value was received, 0 where not, ``(m, N)``."""
+    values: Array
+    """``(m, N)``; zero where nothing was received, where an estimator gets NaN."""
+    available: Array
+    """1 where a value was received, 0 where not, ``(m, N)``."""
+    interval: Array | None = None
+    """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
+    inputs: Array | None = None
+    """What is told of the inputs that acted in that time, ``(p, N)``; None where the model has none."""
 
 
 class Passage(NamedTuple):
-    """No more than that."""
+    """How a state moves until a measurement, which is not made yet: its interval and inputs."""
 
     interval: Array | None
     inputs: Array | None
+
+
+Passed = Measurement | Passage
+"""What says how a state moved since the measurement before."""
 
 
 class Equations:
@@ -302,7 +295,7 @@ class Equations:
                 rows.append(nu[place] - turns)
         return self.xp.stack(rows)
 
-    def receive(self, measurement: Measured, mean: Array, R: Array) -> Received:
+    def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.
 
         Args:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ...filters import data_association, polar
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, Numbers
+from ..contract.faults import Disturbance, Step
 from ..contract.observation import Array
 from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
@@ -63,10 +63,12 @@ class Clutter(Disturbance):
         """Whether there are any."""
         return parameters.cluttered
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> ClutterState:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
         """Draw the density, which the parameters give per square kilometre."""
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
-        return ClutterState(density, 0.0 * density, Echo(truth.position, 0.0 * density), 0.0 * density)
+        return ClutterState(
+            density, 0.0 * density, Echo(self.xp.stack([zero, zero]), 0.0 * density), 0.0 * density
+        )
 
     def count(self, uniform: Array, density: Array) -> Array:
         """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
@@ -82,10 +84,10 @@ class Clutter(Disturbance):
         return count
 
     def change_measurement(
-        self, state: ClutterState, measurement: Any, numbers: Numbers, feedback: Track
+        self, state: ClutterState, measurement: Any, step: Step, feedback: Track
     ) -> tuple[ClutterState, Any]:
         """Put false plots beside that of the target, and associate one with the track of the filter."""
-        xp, p, uniforms = self.xp, self.parameters, numbers.uniforms
+        xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
             feedback,
             measurement.interval,

@@ -40,8 +40,7 @@ class ErrorMoments(NamedTuple):
 
 def propagate_error(
     moments: ErrorMoments,
-    displacement: Array,
-    increment: Array,
+    push: tuple[Array, Array],
     R: Array,
     alpha: Array,
     beta: Array,
@@ -51,18 +50,18 @@ def propagate_error(
 
     The error of the filter is linear in its initial error, the measurement noise and what the target does
     beyond straight flight, so its mean and covariance follow without Monte Carlo:
-    ``e(k|k) = (I - K H) (F e + [displacement, increment]) - K v``.
+    ``e(k|k) = (I - K H) (F e + push) - K v``.
 
     Args:
         moments: of the error after the previous update.
-        displacement: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``).
-        increment: what it adds to the velocity, m/s (``a T``).
+        push: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``), and to the velocity, m/s
+            (``a T``).
         R: variance of the measurement noise, m^2.
         alpha: position gain of this scan.
         beta: velocity gain of this scan.
         T: sampling interval, s.
     """
-    position = moments.position + T * moments.velocity + displacement
-    velocity = moments.velocity + increment
+    position = moments.position + T * moments.velocity + push[0]
+    velocity = moments.velocity + push[1]
     covariance = update_covariance(predict_covariance(moments.covariance, T), R, alpha, beta, T)
     return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)

@@ -73,8 +73,7 @@ def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
     for k in range(len(alpha)):
         moments = propagate_error(
             moments,
-            flight.displacement[k],
-            flight.increment[k],
+            (flight.displacement[k], flight.increment[k]),
             flight.variance[k + 1],
             alpha[k],
             beta[k],

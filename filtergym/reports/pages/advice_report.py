@@ -24,7 +24,7 @@ from ..tables.advice import (
     parameter_name,
     parameter_size,
     parameter_text,
-    price_cells,
+    price_rows,
     verdict,
 )
 from ..tables.results import Settings
@@ -72,7 +72,7 @@ def advice_html(
         rows=list(advice_rows(advice, learned)),
         columns=[title.replace("-\n", "") for title in COLUMNS],
         price_columns=list(PRICES),
-        prices=_prices(advice, learned),
+        prices=price_rows(advice, learned),
         families=[
             (name, list(_parameters(advice, name))) for name in advice.fits if name not in advice.diverging
         ],
@@ -98,13 +98,6 @@ def advice_html(
 def _shown(advice: Advice) -> list[str]:
     """Who is drawn: the advised one first."""
     return list(dict.fromkeys([advice.advised.name, advice.fitted.name, advice.rival]))
-
-
-def _prices(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
-    """What an update of each filter in the table costs; empty where it is known of none."""
-    names = [row.competitor.name for row in advice_rows(advice, learned)]
-    known = any(advice.prices[name] for name in names)
-    return [(name, price_cells(advice.prices[name])) for name in names] if known else []
 
 
 def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]]:

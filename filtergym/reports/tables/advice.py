@@ -106,23 +106,30 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
         yield Row(one, _label(advice, one), cells)
 
 
-def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
-    """Say what an update of each filter of :func:`advice_table` costs; None where it is known of none."""
+def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
+    """What an update of each filter of :func:`advice_table` costs, in the order of ``PRICES``; empty where it is known
+    of none.
+    """
     prices = {row.competitor.name: advice.prices[row.competitor.name] for row in advice_rows(advice, learned)}
-    if not any(prices.values()):
+    cells = {
+        name: tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
+        for name, price in prices.items()
+    }
+    return list(cells.items()) if any(prices.values()) else []
+
+
+def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
+    """Put :func:`price_rows` into a table; None where there are none."""
+    rows = price_rows(advice, learned)
+    if not rows:
         return None
     table = Table(title="What an update costs in C, in double precision", title_justify="left")
     table.add_column("filter", no_wrap=True)
     for title in PRICES:
         table.add_column(title, justify="right")
-    for name, price in prices.items():
-        table.add_row(name, *price_cells(price))
+    for name, cells in rows:
+        table.add_row(name, *cells)
     return table
-
-
-def price_cells(price: Mapping[str, int] | None) -> tuple[str, ...]:
-    """Cells of a price, in the order of ``PRICES``."""
-    return tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
 
 
 def _answers_alike(one: Competitor, other: Competitor) -> bool:
