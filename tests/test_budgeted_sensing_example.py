@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy
 from contract import assert_equals_its_vector
-from models import load_module, make_model
+from models import begin, load_module, make_model, next_row
 
 ROOT = Path(__file__).parent.parent
 ID = "mine/BudgetedSensing-v0"
@@ -22,17 +22,10 @@ def example():
 def run(example, steps, episodes, actions=None, **parameters):
     """Truth, measurement, prediction and the bank's state at each of some measurements."""
     model = make_model(ID, "beam", backend="numpy", **parameters)
-    rng, noise = np.random.default_rng(0), model.task.noise
-    episode = model.begin(
-        rng.random((noise.uniforms, episodes)), rng.standard_normal((noise.initial_normals, episodes))
-    )
-    kept = []
+    rng = np.random.default_rng(0)
+    episode, kept = begin(model, rng, episodes), []
     for k in range(steps):
-        row = [
-            rng.standard_normal((noise.normals, episodes)),
-            rng.random((noise.row_uniforms, episodes)),
-        ]
-        predicted = model.measure(episode, np.concatenate(row))
+        predicted = model.measure(episode, next_row(model, rng, episodes))
         action = np.full(episodes, k % 4) if actions is None else actions[k]
         episode = model.act(predicted, action)
         kept.append((predicted.truth, predicted.measurement, predicted.filter, episode.filter))

@@ -13,7 +13,7 @@ from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
-from models import KINDS, make_model, random_actions, short_episodes
+from models import KINDS, begin, make_model, next_row, random_actions, short_episodes
 
 from filtergym import evaluate, make_policy
 
@@ -81,13 +81,11 @@ def run(env, actions, seed=21):
 def needs_nothing_but_the_measurements(subject):
     """No truth: fed with what the world said, and with nothing else, the bank shows and estimates the same."""
     model = subject.model()
-    rng, episode = np.random.default_rng(3), None
-    noise = model.task.noise
-    episode = model.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
+    rng = np.random.default_rng(3)
+    episode = begin(model, rng, 8)
     alone = model.filter.start(episode.measurement)
     for step in range(model.task.horizon):
-        row = np.concatenate([rng.normal(size=(noise.normals, 8)), rng.random((noise.row_uniforms, 8))])
-        episode = model.measure(episode, row)
+        episode = model.measure(episode, next_row(model, rng, 8))
         alone = model.filter.predict(alone, episode.measurement)
         np.testing.assert_array_equal(
             model.observe(Episode(None, episode.measurement, alone)), model.observe(episode)
