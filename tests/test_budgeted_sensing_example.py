@@ -68,19 +68,6 @@ def test_what_is_not_looked_at_changes_nothing_and_what_is_beyond_the_beam_neith
     np.testing.assert_array_equal(missed.mean, predicted.mean)
 
 
-def test_the_moments_of_the_course(example):
-    """Variance and correlation of the acceleration are what `later` takes for them."""
-    _, kept = run(example, 100, 300, agility=(2.0, 2.0))
-    a = np.stack([truth.acceleration for truth, *_ in kept[60:]])
-    P = np.zeros((3, 3, 1))
-    for _ in range(200):
-        P = example.later(P, np.array([2.0]))
-        P[:2], P[:, :2] = 0.0, 0.0
-    assert a.var() == pytest.approx(P[2, 2, 0], rel=0.05)
-    kept_share = (a[1:] * a[:-1]).mean() / a.var()
-    assert kept_share == pytest.approx(1.0 - 1.0 / 7.5, abs=0.015)
-
-
 def test_the_expected_cost_is_the_integral(example):
     model = make_model(ID, "beam", backend="numpy", lost=300.0)
     greedy = example.Greedy(model)
