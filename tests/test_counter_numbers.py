@@ -9,6 +9,9 @@ from filtergym.compiler.counter_numbers import (
     ARRAYS,
     LOW,
     UNIFORM_PAIRS,
+    C,
+    P,
+    S,
     logarithm,
     normal_pair,
     numbers,
@@ -66,6 +69,28 @@ def test_uniform_is_exact_symmetrical_and_never_at_an_end():
     assert (found > 0.0).all()
     assert (found < 1.0).all()
     np.testing.assert_array_equal(uniform(ARRAYS, ~EDGES), 1.0 - found)
+
+
+def test_coefficients_interpolate_in_chebyshev_nodes():
+    mp = pytest.importorskip("mpmath")
+    edge = (mp.sqrt(2) - 1) / (mp.sqrt(2) + 1)
+
+    def of_logarithm(y):
+        s = mp.sqrt(y)
+        return ((mp.log((1 + s) / (1 - s))) / s - 2) / y
+
+    cases = (
+        (P, of_logarithm, edge**2),
+        (S, lambda y: mp.sin(mp.pi / 2 * mp.sqrt(y)) / mp.sqrt(y), mp.mpf(1) / 4),
+        (C, lambda y: mp.cos(mp.pi / 2 * mp.sqrt(y)), mp.mpf(1) / 4),
+    )
+    with mp.workdps(50):
+        for coefficients, function, end in cases:
+            n = len(coefficients)
+            nodes = [end / 2 * (1 + mp.cos(mp.pi * (2 * i + 1) / (2 * n))) for i in range(n)]
+            matrix = mp.matrix([[node**power for power in range(n)] for node in nodes])
+            solved = mp.lu_solve(matrix, mp.matrix([function(node) for node in nodes]))
+            assert [float(c) for c in solved] == list(coefficients)
 
 
 def test_logarithm_near_every_place_where_it_changes():
