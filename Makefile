@@ -13,7 +13,7 @@ SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation bas
 # Numbers, and every library once: gymnasium, scipy, pandas, xarray, matplotlib, typer and rich, safetensors, msgspec.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
   test_linear_systems.py test_bounds.py test_files.py test_store.py \
-  test_recording.py::test_several_tracks_with_truth_in_one_table test_recording.py::test_estimates_are_written \
+  test_recording.py::test_several_tracks_with_truth_in_one_table test_file_estimates.py::test_what_is_written_costs_what_it_has_cost \
   test_evaluation.py::test_tuning_improves_on_fresh_episodes_and_is_repeatable \
   test_evaluation.py::test_dataset_has_named_axes_and_units \
   test_evaluation.py::test_records_follow_from_the_dataset \
