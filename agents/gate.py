@@ -448,7 +448,7 @@ class GatedMaker:
         learned = isinstance(maker, EstimatorMaker)
         self._policy = maker.policy if learned else maker
         self._is_asked_always = learned
-        self.control = maker.bank if learned else control_of(maker, "policy", None, problem.task, name)
+        self.control = maker.bank if learned else control_of(maker, None, problem.task, name)
         self.task_keywords = getattr(maker, "task_keywords", {})
         self._fallback = problem.competitor(self.fallback)
         self._check_fallback()
@@ -495,7 +495,7 @@ class GatedMaker:
         if kind_of(self._fallback) == "estimator":
             with explain_errors(f"fallback {self.fallback!r} cannot be made"):
                 return as_filter(task, make_competitor(self._fallback, task))
-        control = control_of(self._fallback, "policy", None, self.problem.task, self.fallback)
+        control = control_of(self._fallback, None, self.problem.task, self.fallback)
         model = Model(task, control)
         policy = make_competitor(self._fallback, model.on_numpy())
         own = getattr(self._fallback, "task_keywords", {})

@@ -12,7 +12,6 @@ import numpy
 
 from ..baselines.problem import Problem
 from ..envs.contract.model import Model
-from ..envs.interface.environment import TaskEnv
 from ..evaluation.competitors.kinds import Policy, expose_spaces, kind_of, make_competitor, says_traceable
 
 
@@ -47,48 +46,6 @@ def policy_to_correct(model: Model, name: str) -> Any:
         )
     check_residual(model, maker)
     return make_competitor(maker, model)
-
-
-class ResidualActions(gymnasium.Wrapper):
-    """A single environment whose actions are added to a policy's.
-
-    Args:
-        env: a filtergym environment with a control of continuous actions.
-        policy: anything with Stable-Baselines3's ``predict``, for the same control.
-
-    Raises:
-        ValueError: if actions cannot be added.
-    """
-
-    def __init__(self, env: gymnasium.Env, policy: Any) -> None:
-        super().__init__(env)
-        inner: Any = env.unwrapped
-        if not isinstance(inner, TaskEnv):
-            raise ValueError(f"ResidualActions takes an environment of filtergym, got {type(inner).__name__}")
-        check_residual(inner.model, policy)
-        self.policy = policy
-        self._shown: Any = None
-        self._memory: Any = None
-        self._start = numpy.ones(1, dtype=bool)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and the policy's memory with it."""
-        self._shown, info = self.env.reset(seed=seed, options=options)
-        self._memory, self._start = None, numpy.ones(1, dtype=bool)
-        return self._shown, info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Add the policy's action and step."""
-        if self._shown is None:
-            raise gymnasium.error.ResetNeeded("call reset before the first step")
-        inner: Any = self.env.unwrapped
-        shown = self._shown["observation"] if inner.privileged else self._shown
-        own, self._memory = self.policy.predict(shown[None], self._memory, self._start, deterministic=True)
-        self._start = numpy.zeros(1, dtype=bool)
-        self._shown, reward, terminated, truncated, info = self.env.step(own[0] + numpy.asarray(action))
-        return self._shown, reward, terminated, truncated, info
 
 
 class ResidualPolicy(Policy):

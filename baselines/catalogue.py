@@ -10,9 +10,9 @@ from functools import cache
 from types import ModuleType
 
 from ..envs.contract.task import Task
-from ..envs.engine.catalogue import folders, nearest
+from ..envs.engine.catalogue import folders, nearest, task_class
 from ..evaluation.competitors.kinds import TOLD_MORE, RandomPolicy, kind_of
-from .table import Baselines
+from .table import Baselines, PaperAction
 
 USER_BASELINES: dict[str, Baselines] = {}
 """Baselines of users' environments: Gymnasium id -> table."""
@@ -28,11 +28,23 @@ def package_of(id: str) -> ModuleType | None:
 
 
 def baselines_of(id: str) -> Baselines:
-    """Return what the environment of a Gymnasium id is compared with; only random actions where nothing is known."""
+    """Return what the environment of a Gymnasium id is compared with.
+
+    Where it brings nothing: the paper's algorithm that its class declares, and random actions.
+    """
     package = package_of(id)
     if package is not None:
         return package.BASELINES
-    return USER_BASELINES.get(id) or Baselines(id, {"random": RandomPolicy})
+    return USER_BASELINES.get(id) or _declared_baselines(task_class(id))
+
+
+@cache
+def _declared_baselines(task: type[Task]) -> Baselines:
+    """Return what the class of a task declares itself; an action that is no vector is no constant policy."""
+    if not isinstance(task.paper_policy.action, tuple):
+        return Baselines(task.id, {"random": RandomPolicy})
+    paper = type("DeclaredPaper", (PaperAction,), {"control": task.paper_policy.control})
+    return Baselines(task.id, {"paper": paper, "random": RandomPolicy}, score_paper="paper")
 
 
 def add_baselines(task: type[Task], table: Baselines) -> None:

@@ -74,7 +74,7 @@ class Problem:
         """
         known = self.baselines
         for reading in filter(None, (known.stronger_paper, known.score_paper)):
-            paper = self.competitor(reading)
+            paper = self.find(reading)
             for name, maker in competitors.items():
                 if name == reading or maker is paper:
                     return name
@@ -102,19 +102,30 @@ class Problem:
         """Names of its policies, estimators, smoothers, references and bounds, and of policies that were tuned."""
         return [*self.baselines.names, *self.tuned_policies]
 
-    def competitor(self, name: str) -> Any:
-        """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds.
-
-        Raises:
-            ValueError: if there is no such name.
+    def find(self, name: str) -> Any:
+        """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds; None
+        where there is no such name. Tuned values are read only for a name that ends so.
         """
         known = self.baselines
         for table in (known.policies, known.estimators, known.smoothers, known.references, known.bounds):
             if name in table:
                 return table[name]
-        if name.endswith("-tuned"):
+        if name.endswith("-tuned") and name in self.tuned_policies:
             return self.tuned_values.competitor(name.removesuffix("-tuned"))
-        raise nearest("policy", name, self.names)
+        return None
+
+    def competitor(self, name: str) -> Any:
+        """Return the same.
+
+        Raises:
+            ValueError: if there is no such name.
+        """
+        found = self.find(name)
+        if found is None and name.endswith("-tuned"):
+            return self.tuned_values.competitor(name.removesuffix("-tuned"))  # says why there is none
+        if found is None:
+            raise nearest("policy", name, self.names)
+        return found
 
     def experiment(self, *arguments: Any, **fields: Any) -> Experiment:
         """Return an experiment on it, with the paper's algorithm and the reference of its baselines.

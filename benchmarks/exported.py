@@ -192,7 +192,7 @@ def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
     for array in arrays:
         table += [array.__array_interface__["data"][0], array.strides[0] // 8]
     addresses = numpy.array(table, dtype=numpy.int64)
-    code = native(program, [False] * len(arrays))
+    code = native(program, [False] * len(arrays)).expect(LANES)
     return least_time(lambda: code(addresses.ctypes.data, 0, LANES), 5) / LANES
 
 
@@ -200,7 +200,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
     """Of the competitor itself on NumPy's arrays, one track."""
     kind = kind_of(maker)
     keywords = getattr(maker, "task_keywords", {})
-    plain = make_model(problem.task, control_of(maker, kind, None, problem.task, name), **keywords)
+    plain = make_model(problem.task, control_of(maker, None, problem.task, name), **keywords)
     seeds = episode_seeds("test", 0, 1)
     started: list[Any] = []
     start_lanes(plain, seeds, lambda episode: started.append(one_lane(episode.measurement)))

@@ -13,7 +13,7 @@ import numpy
 from .block import Block, block_for
 from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
 from .functions import Call, address_of
-from .native import Code, Native, native_text, processor
+from .native import Code, native_text, processor
 
 _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", "<<": "shl", ">>": "lshr"}
 
@@ -225,15 +225,6 @@ def llvm_text(block: Block) -> str:
     return "\n".join(lines)
 
 
-def numbers_code() -> Native:
-    """Compiled :func:`llvm_text`.
-
-    Raises:
-        ImportError: without llvmlite.
-    """
-    return native_text(llvm_text(block_for(processor()[1])))
-
-
 def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
     """Return what goes on to the next measurement and makes its numbers, in compiled code.
 
@@ -255,4 +246,5 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     for array in arrays:
         table += [address_of(array), array.strides[0] // array.itemsize]
     table += [normals, len(rows) - normals]
-    return Call(Code(numbers_code()), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
+    code = Code(lambda: native_text(llvm_text(block_for(processor()[1]))))
+    return Call(code, numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))

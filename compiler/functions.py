@@ -12,7 +12,7 @@ import numpy
 from . import namespace
 from .block import LANES
 from .library import Library
-from .native import Code, address_of_code, native
+from .native import Code, Native, native
 from .program import Graph, Program, Result, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
@@ -149,7 +149,6 @@ class Specialised:
         """Run on inputs of some width; returns new outputs, None where an input stands for one."""
         self.compile()
         assert self.code is not None
-        self.code.expect(width)
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -170,6 +169,7 @@ class Specialised:
         call = Call(
             self.code, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
         )
+        call.expect(width)
         run_over(call, width, threads)
         return outputs
 
@@ -193,20 +193,21 @@ class Call:
         constants: that the table begins with.
 
     Attributes:
-        native: the code of now, see :meth:`expect`.
+        native: the code of now, see :meth:`expect`; None: it has not been made.
     """
 
     def __init__(
         self, code: Code, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
     ) -> None:
         self.table, self.arrays, self._constants = table, arrays, constants
-        self._code, self.native, self._uncounted = code, code.run, 0
+        self._code, self._uncounted = code, 0
+        self.native: Native | None = None
         self.address = address_of(table)
 
-    def expect(self, lanes: int) -> None:
-        """Prepare to run over so many lanes in all, with better code where that is worth its time."""
-        self._code.expect(lanes)
-        self.native = self._code.run
+    def expect(self, lanes: int, in_sequence: bool = False) -> Native:
+        """Return the code for running over so many lanes in all, see :meth:`.native.Code.expect`."""
+        self.native = self._code.expect(lanes, in_sequence)
+        return self.native
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
         """Read or write another array of the same shape from now on."""
@@ -217,18 +218,14 @@ class Call:
         """Return the same call with a table of its own."""
         return Call(self._code, self.table.copy(), list(self.arrays), self._constants)
 
-    @property
-    def native_address(self) -> int:
-        """Address of the code of now."""
-        return address_of_code(self.native)
-
     def __call__(self, first: int, last: int) -> None:
         """Run from one lane to another."""
         self._uncounted += last - first
-        if self._uncounted > UNCOUNTED:
-            self.expect(self._uncounted)
+        native = self.native
+        if native is None or self._uncounted > UNCOUNTED:
+            native = self.expect(self._uncounted)
             self._uncounted = 0
-        self.native(self.address, first, last)
+        native(self.address, first, last)
 
 
 def run_over(call: Callable[[int, int], None], width: int, threads: int) -> None:

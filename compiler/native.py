@@ -144,11 +144,14 @@ _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=F
 
 
 @contextmanager
-def optimised_code() -> Iterator[None]:
-    """Let every program that runs inside be optimised at once: times then depend neither on a cache nor on how long
-    it has run.
+def optimised_code(at_once: bool = True) -> Iterator[None]:
+    """Let programs that run inside in a :class:`~.sequence.CallSequence` be optimised at once: times depend neither
+    on a cache nor on how long they have run then.
+
+    Args:
+        at_once: whether they are.
     """
-    token = _EAGER.set(True)
+    token = _EAGER.set(at_once)
     try:
         yield
     finally:
@@ -156,39 +159,40 @@ def optimised_code() -> Iterator[None]:
 
 
 class Code:
-    """Code of a program, called as :data:`Native`.
+    """Code of a program, made when it is first to run.
 
     A program is compiled quickly first, and better once it has run over many lanes, where that gains anything.
 
     Args:
-        run: the code.
+        make: makes the code.
         optimise: makes better code; None: there is none.
         hot: lanes after which it is made.
-
-    Attributes:
-        run: the code of now.
     """
 
     def __init__(
-        self, run: Native, optimise: Callable[[], Native] | None = None, hot: int | None = None
+        self, make: Callable[[], Native], optimise: Callable[[], Native] | None = None, hot: int = 0
     ) -> None:
-        self.run, self._optimise, self._lanes = run, optimise, 0
-        self._hot = HOT if hot is None else hot
+        self._make, self._optimise, self._hot, self._lanes = make, optimise, hot, 0
+        self._run: Native | None = None
 
-    def __call__(self, table: int, first: int, last: int) -> None:
-        """Run from one lane to another."""
-        self.run(table, first, last)
+    def expect(self, lanes: int, in_sequence: bool = False) -> Native:
+        """Return the code for running over so many lanes: better code where it has become worth its time.
 
-    def expect(self, lanes: int) -> None:
-        """Prepare to run over so many lanes: make better code where it has become worth its time."""
+        Args:
+            lanes: in all steps.
+            in_sequence: whether many steps are one native call, which is what :func:`optimised_code` is about.
+        """
         self._lanes += lanes
-        if self._optimise is not None and (self._lanes > self._hot or _EAGER.get()):
+        if self._optimise is not None and (self._lanes > self._hot or (in_sequence and _EAGER.get())):
             optimise, self._optimise = self._optimise, None
-            self.run = optimise()
+            self._run = optimise()
+        elif self._run is None:
+            self._run = self._make()
+        return self._run
 
 
 def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Code:
-    """Return code that runs a program; one for all programs that differ in nothing but constants.
+    """Return the code of a program; one for all programs that differ in nothing but constants.
 
     Args:
         program: what it computes.
@@ -220,28 +224,30 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
                         key, lambda: emit(program, lane_first, library, *form), NATIVE, setting.level
                     )
 
-            if better is not None and (cache.holds(better_key) or _EAGER.get()):
-                _CODES[key] = Code(code(better, better_key))
-            else:
-                optimise = None if better is None else functools.partial(code, better, better_key)
-                _CODES[key] = Code(code(quick, key), optimise, HOT // IN_LOOPS if in_loops else HOT)
+            make, optimise = functools.partial(code, quick, key), None
+            if better is not None:
+                optimise = functools.partial(code, better, better_key)
+                if cache.holds(better_key):
+                    make, optimise = optimise, None
+            _CODES[key] = Code(make, optimise, HOT // IN_LOOPS if in_loops else HOT)
         return _CODES[key]
 
 
-def native_text(text: str, signature: Any = NATIVE) -> Any:
+def native_text(text: str, signature: Any = NATIVE, level: int = 1) -> Any:
     """Return code of a text that calls no function by its name: only what every processor computes alike.
 
     Args:
         text: of LLVM, with an entry ``@program``.
         signature: of the entry, as ctypes writes it; default: ``(table, first, last)``, as of :data:`Native`.
+        level: of LLVM's optimisation of code.
 
     Raises:
         ImportError: without llvmlite.
     """
     with LOCK:
-        key = _key(text)
+        key = _key(text, str(level))
         if key not in _TEXTS:
-            _TEXTS[key] = _load(key, lambda: text, signature)
+            _TEXTS[key] = _load(key, lambda: text, signature, level)
         return _TEXTS[key]
 
 

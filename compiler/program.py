@@ -380,11 +380,17 @@ def _callers() -> str:
     found: dict[str, str] = {}
     frame: types.FrameType | None = sys._getframe(2)
     while frame is not None and len(found) < 2:
-        place, name = Path(frame.f_code.co_filename), frame.f_code.co_name
-        if place.parent != Path(__file__).parent and not name.startswith("<"):
-            found.setdefault(place.stem, name)
+        stem, name = _stem_outside(frame.f_code.co_filename), frame.f_code.co_name
+        if stem is not None and not name.startswith("<"):
+            found.setdefault(stem, name)
         frame = frame.f_back
     return " of ".join(f"{file}.{name}" for file, name in found.items())
+
+
+@functools.cache
+def _stem_outside(path: str) -> str | None:
+    """Name of a file without its ending, None of one of this package."""
+    return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
 class Result(NamedTuple):

@@ -440,5 +440,7 @@ def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
 
 def steady(places: Sequence[int]) -> int | None:
     """Distance from each place to the next, where it is always the same."""
-    step = places[1] - places[0] if len(places) > 1 else 0
-    return step if all(b - a == step for a, b in pairwise(places)) else None
+    count, first = len(places), places[0]
+    step = places[1] - first if count > 1 else 0
+    regular = range(first, first + step * count, step) if step else (first,) * count
+    return step if tuple(places) == tuple(regular) else None

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy
 
 from .functions import Call, address_of, run_over
-from .native import Native, native_text
+from .native import Native, address_of_code, native_text
 
 TILE = 64
 """Lanes that go through all steps together: enough that a call costs little beside its numbers, few enough for the
@@ -111,7 +111,7 @@ exit:
 
 @functools.cache
 def _driver() -> Native:
-    driver: Native = native_text(TEXT)
+    driver: Native = native_text(TEXT, level=0)  # nearly all the time passes in what it calls
     return driver
 
 
@@ -124,8 +124,8 @@ class CallList:
 
     def __init__(self, calls: Sequence[Call]) -> None:
         self._calls = calls
-        self._natives = [call.native for call in calls]
-        self._codes = numpy.array([call.native_address for call in calls], dtype=numpy.int64)
+        self._natives: list[Native | None] = [call.native or call.expect(0) for call in calls]
+        self._codes = numpy.array(list(map(address_of_code, self._natives)), dtype=numpy.int64)
         self._tables = numpy.array([call.address for call in calls], dtype=numpy.int64)
         addresses = address_of(self._codes), address_of(self._tables)
         self._given = numpy.array([*addresses, len(calls), 0, 0, 0, 1, TILE], dtype=numpy.int64)
@@ -136,7 +136,7 @@ class CallList:
         natives = [call.native for call in self._calls]
         if natives != self._natives:  # better code
             self._natives = natives
-            self._codes[:] = [call.native_address for call in self._calls]
+            self._codes[:] = list(map(address_of_code, natives))
         self._run(self._address, first, last)
 
 
@@ -189,9 +189,10 @@ class CallSequence:
             threads: how many share the lanes.
             tile: lanes that go through all steps together.
         """
-        for call in self._calls:
-            call.expect(steps * width // 2)
-        codes = numpy.array([call.native_address for call in self._calls], dtype=numpy.int64)
+        codes = numpy.array(
+            [address_of_code(call.expect(steps * width // 2, True)) for call in self._calls],
+            dtype=numpy.int64,
+        )
         tables = numpy.concatenate([call.table for call in self._calls])
 
         def lanes(first: int, last: int) -> None:

@@ -78,15 +78,15 @@ def online(
             None if log is None else log.plane,
         ),
     )
-    own = control_of(maker, kind, control, problem.task, name)
+    own = control_of(maker, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
     range = training_range(problem.task, maker)
     if range is None:
-        return OnlineFilter(model, maker, kind, name, tracks, lag=lag)
+        return OnlineFilter(model, maker, name, tracks, lag=lag)
     if kind == "estimator":
         estimator = maker(model.task)
         watch = WatchedPolicy(estimator.network, range)
         estimator.decider.ask = watch.act
-        return OnlineFilter(model, estimator, kind, name, tracks, watch, lag)
+        return OnlineFilter(model, estimator, name, tracks, watch, lag)
     watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), range)
-    return OnlineFilter(model, watch, kind, name, tracks, watch, lag)
+    return OnlineFilter(model, watch, name, tracks, watch, lag)

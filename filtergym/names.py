@@ -80,13 +80,14 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return GatedMaker(problem, inner, find_competitor(problem, inner, trust))
-    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned_policies):
-        return problem.competitor(name)
+    own = problem.find(name)
+    if own is not None:
+        return own
     learned = find_learned_policy(problem.task, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
-        return problem.competitor(name)  # says why there is none
+        return problem.competitor(name)  # refuses it
     module, colon, attribute = name.partition(":")
     if not colon:
         for ending in (".zip", ".safetensors", SUFFIX):
@@ -138,7 +139,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     """
 
     def is_module(name: str) -> bool:
-        return name not in problem.names and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
+        return problem.find(name) is None and re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", name) is not None
 
     for name in names:
         if name.startswith(GATED) and is_module(name.removeprefix(GATED)):
@@ -150,7 +151,7 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)
-    if inner in problem.names or inner.endswith(SUFFIX):
+    if problem.find(inner) is not None or inner.endswith(SUFFIX):
         return False
     return inner in pretrained_agents(problem.id) or ":" not in inner
 
@@ -251,26 +252,21 @@ def competitors_of(
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     for name, entry in named.items():
-        if _is_competitor(problem, name) and not _is_same(entry, name, find_competitor(problem, name)):
-            raise ValueError(
-                f"{name!r} is the name of what {problem.id} has already: call your own something else"
-            )
+        if type(entry) is str and entry == name:
+            continue
+        known = problem.find(name)
+        if known is not None or name in pretrained_agents(problem.id):
+            known = find_competitor(problem, name) if known is None else known
+            if type(entry) is not type(known) or not bool(entry == known):
+                raise ValueError(
+                    f"{name!r} is the name of what {problem.id} has already: call your own something else"
+                )
     return {
         name: find_competitor(problem, entry, trust)
         if isinstance(entry, str | Path)
         else with_normalisation(entry)
         for name, entry in named.items()
     }
-
-
-def _is_same(entry: Any, *known: Any) -> bool:
-    """Whether what a user gives under a name is one of what the name stands for already."""
-    return any(type(entry) is type(one) and bool(entry == one) for one in known)
-
-
-def _is_competitor(problem: Problem, name: str) -> bool:
-    """Whether a name is that of a competitor of the environment."""
-    return name in problem.names or name in pretrained_agents(problem.id)
 
 
 def evaluation_requests(
@@ -337,7 +333,7 @@ def make_policy(
     if control is not None or scenario is not None or keywords:
         raise ValueError("control, scenario and parameters are the environment's own: leave them out")
     name, maker = _named_policy(problem, policy, trust)
-    control_of(maker, "policy", model.control, problem.task, name)
+    control_of(maker, model.control, problem.task, name)
     keywords = getattr(maker, "task_keywords", {})
     for parameter, value in keywords.items():
         own = getattr(model.task.parameters, parameter)
@@ -359,7 +355,7 @@ def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bo
         trust: likewise.
     """
     name, maker = _named_policy(problem, policy, trust)
-    control = control_of(maker, "policy", experiment.control, problem.task, name)
+    control = control_of(maker, experiment.control, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
     model = make_model(problem.task, control, experiment.scenario, backend=experiment.backend, **keywords)
     return _stepping(name, maker, model, experiment.scenario, keywords)

@@ -212,42 +212,6 @@ def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -
     return ChannelUpdate(updated, whitened, channels.log_normaliser - 0.5 * squared)
 
 
-def channel_error_covariance(
-    models: Models, channels: Channels, target: int, channel: int, start: numpy.ndarray
-) -> numpy.ndarray:
-    """Exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
-
-    Truth and error e = estimate - truth obey one linear recursion of 2 n states,
-
-        x(k) = Phi_t x + xi,   e(k) = (I - K H) (Phi_c e + (Phi_c - Phi_t) x - xi) + K v
-
-    with t the target's class and c the filter's, so the covariance follows without Monte Carlo. The mean of
-    the error is zero when that of x lies where Phi_c and Phi_t agree (any mean position and velocity).
-
-    Args:
-        models: of the classes.
-        channels: design of the filters, for scans 0 to K.
-        target: index of the true class.
-        channel: index of the filter.
-        start: joint covariance of (x, e) at scan 0, ``(2 n, 2 n)``.
-    """
-    n = models.Phi.shape[0]
-    Phi_t, Phi_c = models.Phi[..., target], models.Phi[..., channel]
-    scans = channels.gain.shape[-1]
-    joint = start
-    result = numpy.zeros((n, n, scans))
-    result[..., 0] = start[n:, n:]
-    for k in range(1, scans):
-        K = channels.gain[..., channel, k]
-        rest = numpy.eye(n) - K @ models.H
-        A = numpy.block([[Phi_t, numpy.zeros((n, n))], [rest @ (Phi_c - Phi_t), rest @ Phi_c]])
-        B = numpy.concatenate([numpy.eye(n), -rest])
-        C = numpy.concatenate([numpy.zeros_like(K), K])
-        joint = A @ joint @ A.T + B @ models.Q[..., target] @ B.T + C @ models.R @ C.T
-        result[..., k] = joint[n:, n:]
-    return result
-
-
 # --- coloured errors of the radar
 
 
@@ -314,15 +278,6 @@ def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray)
         composition: P(type | s), ``(M, J)``, rows sum to one.
     """
     return numpy.asarray(composition) @ numpy.asarray(confusion)
-
-
-def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
-    """Mean log-likelihood ratio of one decision, nats, ``(M, M)``: row = true class, column = its rival.
-
-    The Kullback-Leibler divergence of rows of :func:`decision_probabilities`, which must be positive.
-    """
-    logarithm = numpy.log(probabilities)
-    return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
 
 
 def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:

@@ -26,12 +26,24 @@ Shapes: states ``(n, ...)``, plots ``(2, K, ...)`` with trailing axes that broad
 """
 
 import math
+from typing import NamedTuple
 
 from . import imm
 from .array_namespace import Array, namespace
 from .kalman import Update
 from .ordered_sums import ordered_sum
 from .small_matrices import apply, mirror_lower, outer, product, transpose
+
+
+class Plots(NamedTuple):
+    """All plots of a scan in the window of a track, in random order."""
+
+    position: Array
+    """x and y, m, ``(2, K, N)``; zero where there is none, where an estimator gets NaN."""
+    variance: Array
+    """Variances of their errors, evaluated at the plots, m^2, ``(2, K, N)``."""
+    available: Array
+    """1 where there is a plot, 0 where not, ``(K, N)``."""
 
 
 def _invert(xx: Array, xy: Array, yy: Array) -> tuple[Array, Array]:
@@ -79,22 +91,14 @@ def nearest_neighbour(distances: Array, available: Array, gate: float) -> tuple[
 
 
 def update_position(
-    mean: Array,
-    covariance: Array,
-    plots: Array,
-    variances: Array,
-    available: Array,
-    detection_probability: float,
-    density: Array,
+    mean: Array, covariance: Array, plots: Plots, detection_probability: float, density: Array
 ) -> Update:
     """Update with all plots of a scan, which measure the first two components of the state.
 
     Args:
         mean: predicted, ``(n, ...)``.
         covariance: predicted, ``(n, n, ...)``.
-        plots: positions, ``(2, K, ...)``; those that are not available may be anything, NaN too.
-        variances: R of their errors, which are independent, ``(2, K, ...)``.
-        available: above zero where there is a plot, ``(K, ...)``.
+        plots: of the scan; their errors are independent.
         detection_probability: P_D.
         density: lambda, false plots per unit of area, ``(...)``.
 
@@ -107,10 +111,11 @@ def update_position(
     # Density is of plots, of their ratio to it the unit is none.
     ratio = math.log(detection_probability / (2.0 * math.pi)) - xp.log(density)
     logarithms, inverses, scaled, distances = [none], [], [], []
-    for i in range(plots.shape[1]):
-        there = available[i] > 0.0
-        nu = xp.where(there, plots[:, i] - mean[:2], 0.0)
-        xx, yy = (covariance[j, j] + variances[j, i] for j in range(2))
+    count = plots.available.shape[0]
+    for i in range(count):
+        there = plots.available[i] > 0.0
+        nu = xp.where(there, plots.position[:, i] - mean[:2], 0.0)
+        xx, yy = (covariance[j, j] + plots.variance[j, i] for j in range(2))
         inverse, determinant = _invert(xx, covariance[1, 0], yy)
         applied = apply(inverse, nu)
         distance = nu[0] * applied[0] + nu[1] * applied[1]
@@ -121,7 +126,7 @@ def update_position(
         distances.append(distance)
     stacked = xp.stack(logarithms)
     beta = imm.softmax(stacked)
-    weights = [beta[i + 1] for i in range(plots.shape[1])]
+    weights = [beta[i + 1] for i in range(count)]
     d = ordered_sum(b * applied for b, applied in zip(weights, scaled, strict=True))
     information = outer(d, d) + ordered_sum(
         b * (inverse - outer(applied, applied))

@@ -23,11 +23,26 @@ observes a constant error, one that lasts longer than the recording.
 Shapes: batch last.
 """
 
+from typing import NamedTuple
+
 from .array_namespace import Array, namespace
 from .kalman import predict
 
 CREEP = 0.01
 """m/s, by which the way that dead reckoning may err over grows at a standstill; ours."""
+
+
+class Noise(NamedTuple):
+    """Constants of the filter."""
+
+    drift: float | Array
+    """q, m over the root of a metre."""
+    acceleration: float | Array
+    """Deviation of a where there is no displacement, m/s^2."""
+    correlation_time: float | Array
+    """tau, s."""
+    deviation: float | Array
+    """s, m."""
 
 
 def _both_axes(block: list[list[Array]]) -> Array:
@@ -78,11 +93,7 @@ def predict_position(
     displacement: Array,
     available: Array,
     T: Array,
-    *,
-    drift: float | Array,
-    acceleration: float | Array,
-    correlation_time: float | Array,
-    deviation: float | Array,
+    noise: Noise,
 ) -> tuple[Array, Array]:
     """Time update.
 
@@ -92,23 +103,20 @@ def predict_position(
         displacement: calibrated, m, ``(2, N)``.
         available: above zero where there is one, ``(N,)``.
         T: s, ``(N,)``.
-        drift: q, m over the root of a metre.
-        acceleration: deviation of a where there is no displacement, m/s^2.
-        correlation_time: tau, s.
-        deviation: s, m.
+        noise: constants of the filter.
     """
     xp = namespace(mean)
     known = available > 0.0
     zero, one = 0.0 * T, 1.0 + 0.0 * T
     way = xp.sqrt(displacement[0] ** 2 + displacement[1] ** 2) + CREEP * T
     # In either case one number a both axes alike drives position and velocity.
-    noise = xp.where(known, drift**2 * way, acceleration**2 + zero)
+    driving = xp.where(known, noise.drift**2 * way, noise.acceleration**2 + zero)
     by_noise = xp.where(known, one, 0.5 * T**2), xp.where(known, 1.0 / T, T)
-    fading = xp.exp(-T / correlation_time)
+    fading = xp.exp(-T / noise.correlation_time)
     coasting = xp.where(known, zero, T), xp.where(known, zero, one)
     F = _both_axes([[one, coasting[0], zero], [zero, coasting[1], zero], [zero, zero, fading]])
-    pp, pv, vv = (noise * by_noise[i] * by_noise[j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    ee = deviation**2 * (1.0 - fading**2)
+    pp, pv, vv = (driving * by_noise[i] * by_noise[j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    ee = noise.deviation**2 * (1.0 - fading**2)
     Q = _both_axes([[pp, pv, zero], [pv, vv, zero], [zero, zero, ee]])
     moved = xp.where(known, displacement, 0.0)
     return predict(mean, covariance, F, Q, xp.concat([moved, moved / T, xp.stack([zero, zero])], axis=0))

@@ -118,14 +118,19 @@ def fall_silent(table: Array, grid: Surroundings, looked: Array) -> Array:
     return xp.stack([table[:, 0] - change, table[:, 1] + change], axis=1)
 
 
+class Look(NamedTuple):
+    """What the station says at one scan."""
+
+    looked: Array
+    """Whether it looks, ``(N,)`` of booleans."""
+    decision: Array
+    """rho, or K where nothing is heard, ``(N,)``."""
+    difference: Array
+    """Target's bearing minus the measured one, degrees, ``(N,)``; anything where nothing is heard."""
+
+
 def look_likelihood(
-    grid: Surroundings,
-    confusion: Array,
-    other_confusion: Array,
-    decision: Array,
-    difference: Array,
-    deviation: float,
-    looked: Array,
+    grid: Surroundings, confusion: Array, other_confusion: Array, look: Look, deviation: float
 ) -> Array:
     """Likelihood (1), (2) of a look over the density of a bearing at its mean, ``(J, 2, V, N)``; one without a look.
 
@@ -133,11 +138,10 @@ def look_likelihood(
         grid: V points.
         confusion: pi(rho | label), ``(J, K)``, K decisions.
         other_confusion: pi(rho | type) of the second emitter, ``(I, K)``.
-        decision: rho, or K where nothing is heard, ``(N,)``.
-        difference: target's bearing minus the measured one, degrees, ``(N,)``; anything where nothing is heard.
+        look: of the scan.
         deviation: sigma, degrees.
-        looked: whether the station looks, ``(N,)`` of booleans.
     """
+    looked, decision, difference = look
     xp, decisions = namespace(difference), confusion.shape[1]
     heard = decision < decisions
     apart = xp.where(heard, difference, 0.0)

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from ..baselines.names import evaluate
 from ..evaluation.running.rollout import rollout
 from ..evaluation.statistics.bootstrap import Bootstrap, percentile_interval
+from ..names import evaluate
 
 RESAMPLES = 500
 
@@ -82,7 +82,7 @@ def evaluate_policy(
         name: of the policy.
         scenario: name of the scenario.
         episodes: Monte Carlo runs.
-        **keywords: of :func:`~filtergym.baselines.names.evaluate`; parameters of the task.
+        **keywords: of :func:`~filtergym.names.evaluate`; parameters of the task.
     """
     return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 

@@ -32,4 +32,5 @@ def results_of(id, names, scenario, episodes, **options):
         scenario, episodes, about["seed"], about["split"], keywords=keywords_of(dataset)
     )
     worst = find_worst(problem, experiment, costs, records, [paper])
-    return result_of(problem, dataset, records, curves, pretrained_agents(id), [paper], worst)
+    found = result_of(problem, dataset, records, curves, pretrained_agents(id), [paper])
+    return found._replace(worst=worst)

@@ -1,12 +1,17 @@
-"""Models of an environment, made by its id."""
+"""Models of an environment, made by its id; modules of examples."""
 
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from filtergym.baselines import catalogue as baselines
 from filtergym.envs.contract.filter import Filter, Input, Likelihood
 from filtergym.envs.contract.model import Model
-from filtergym.envs.engine import backend
+from filtergym.envs.engine import backend, registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
@@ -18,6 +23,19 @@ KINDS = tuple(
 environments alike."""
 DECISIONS = 5
 """Length of the short episodes, in decisions."""
+
+
+def load_module(file: Path, name: str | None = None) -> Iterator[Any]:
+    """Yield the module in a file outside the packages, by a name of its own; then forget it and its environments."""
+    name, known = name or file.stem, set(registration.USER_TASKS)
+    spec: Any = importlib.util.spec_from_file_location(name, file)
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    sys.modules.pop(name)
+    for id in set(registration.USER_TASKS) - known:
+        for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
+            table.pop(id, None)
 
 
 def make_model(id: str, control: str | None = None, scenario: Any = None, **keywords: Any) -> Model:

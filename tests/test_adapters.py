@@ -76,17 +76,19 @@ class OurContinuousKalman(OurKalman):
         return self.motion(interval)[0], np.array(Q)
 
 
-@pytest.mark.parametrize("scenario", ["random", "missed-detections", "irregular-scans"])
-def test_imm_of_filterpy_is_ours_at_every_step(scenario):
+WITH_BOTH = {"scenario": "irregular-scans", "detection_probability": (0.7, 0.7)}
+"""Scans that miss the target, and come early."""
+
+
+def test_imm_of_filterpy_is_ours_at_every_step():
     """An IMM amplifies rounding: 7e-10 m were the most in 32 flights of each scenario."""
     ours = baselines_of(ID).estimators["kalman-imm"]
-    compare(example("filterpy_filters").Imm, ours, growth=20.0, scenario=scenario)
+    compare(example("filterpy_filters").Imm, ours, growth=20.0, **WITH_BOTH)
 
 
-@pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
-def test_kalman_filters_are_ours(scenario):
+def test_kalman_filters_are_ours():
     filters = example("filterpy_filters")
-    compare(filters.Kalman, OurKalman, scenario=scenario)
+    compare(filters.Kalman, OurKalman, **WITH_BOTH)
 
     class Extended(filters.Kalman):
         """Of a linear measurement."""
@@ -102,7 +104,7 @@ def test_kalman_filters_are_ours(scenario):
             if z is not None:
                 track.update(z, lambda x: np.eye(2, 4), lambda x: x[:2], R)
 
-    compare(Extended, OurKalman, scenario=scenario)
+    compare(Extended, OurKalman, **WITH_BOTH)
 
     class Unscented(filters.Kalman):
         """Of a linear motion and measurement, and a state in another order."""
@@ -124,36 +126,32 @@ def test_kalman_filters_are_ours(scenario):
             track.Q = np.kron(np.eye(2), 4.0 * np.outer(G, G))
             track.predict(dt=interval)
 
-    compare(Unscented, OurKalman, growth=20.0, scenario=scenario)  # sums over sigma points cancel
+    compare(Unscented, OurKalman, growth=20.0, **WITH_BOTH)  # sums over sigma points cancel
 
 
-@pytest.mark.parametrize("scenario", ["random", "missed-detections"])
-def test_kalman_filter_of_stone_soup_is_ours(scenario):
-    scans = {"scenario": scenario, "scan_jitter": (0.0, 0.0)}
-    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman, **scans)
-
-
-def test_kalman_filter_of_stone_soup_is_ours_at_irregular_times():
-    """Its clock counts microseconds, in which a target flies 0.3 mm."""
+def test_kalman_filter_of_stone_soup_is_ours():
     stone_soup = example("stone_soup_kalman")
+    on_time = {"scenario": "missed-detections", "scan_jitter": (0.0, 0.0)}
+    compare(stone_soup.Kalman, OurContinuousKalman, **on_time, episodes=4)
+    # Its clock counts microseconds, in which a target flies 0.3 mm.
     mean, expected = (
-        estimates(one, "irregular-scans")[0] for one in (stone_soup.Kalman, OurContinuousKalman)
+        estimates(one, "irregular-scans", 2)[0] for one in (stone_soup.Kalman, OurContinuousKalman)
     )
     np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("scenario", ["random", "missed-detections", "irregular-scans"])
-def test_plain_kalman_filter_of_the_page_is_ours(scenario):
-    compare(lambda task: example("mine").Mine(), OurKalman, scenario=scenario)
+def test_plain_kalman_filter_of_the_page_is_ours():
+    compare(lambda task: example("mine").Mine(), OurKalman, **WITH_BOTH)
 
 
-def test_extended_filter_follows_a_radar_that_measures_range_and_azimuth():
+def test_extended_and_unscented_filters_of_the_page_follow():
     filters = example("filterpy_filters")
-    makers = {"extended": filters.Extended, "kalman": filters.Kalman}
-    result = filtergym.evaluate(ID, makers, episodes=8, horizon=40, polar_measurements=True)
+    makers = {name: getattr(filters, name) for name in ("Extended", "Unscented", "Kalman")}
+    result = filtergym.evaluate(ID, makers, episodes=4, horizon=30, polar_measurements=True)
     cost = result.cost.mean(["episode", "time"]).values
-    # At these ranges the two are nearly the same filter.
-    assert abs(cost[0] / cost[1] - 1.0) < 0.2
+    # At these ranges the first is nearly the Kalman filter.
+    assert abs(cost[0] / cost[2] - 1.0) < 0.2
+    assert cost[1] < 2.0 * cost[2]
 
 
 @pytest.mark.parametrize("plant", ["U", "P"])
@@ -163,28 +161,6 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
     for name in ("error", "cost", "control_signal", "nees"):
         mine, paper = result[name].values
         np.testing.assert_allclose(mine, paper, rtol=1e-11, atol=1e-12, err_msg=name)
-
-
-def test_every_example_is_tried():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {
-        *LIBRARIES,
-        "budgeted_sensing",
-        "filterpy_file",
-        "mine",
-        "inverted_pendulum",
-        "flights",
-        "live_track",
-        "mixed_motion",
-        "nclt_odometry",
-        "plots",
-    }
-
-
-@pytest.mark.parametrize("irregular", [{}, {"detection_probability": (0.5, 0.5), "scan_jitter": (0.9, 0.9)}])
-def test_unscented_filter_of_the_page_runs(irregular):
-    competitors = {"ukf": example("filterpy_filters").Unscented, "imm": "imm"}
-    result = filtergym.evaluate(ID, competitors, episodes=2, horizon=20, **irregular)
-    assert np.isfinite(result.nees.values[0]).all()
 
 
 class Permuted(SingleTrackEstimator):
@@ -300,8 +276,3 @@ def test_a_library_that_is_not_installed_is_a_sentence(library, adapter, monkeyp
         ValueError, match=f"cannot load policy 'wants_library:Mine': ImportError: {adapter} needs"
     ):
         filtergym.evaluate(ID, ["wants_library:Mine"], episodes=1)
-
-
-def test_there_are_no_other_adapters():
-    with pytest.raises(AttributeError, match="no attribute 'PykalmanEstimator'"):
-        adapters.PykalmanEstimator  # noqa: B018

@@ -8,13 +8,12 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.agents import learned_policy
-from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
-from filtergym.agents.residual import ResidualActions, ResidualPolicy
-from filtergym.baselines.problem import problem_of
+from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, load_policy, pretrained_path
+from filtergym.agents.residual import ResidualPolicy
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.task import named_arrays
-from filtergym.envs.engine.catalogue import catalogue, task_class
+from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.competitors.kinds import ConstantPolicy, FunctionPolicy, kind_of
 from filtergym.evaluation.running.rollout import run_competitor
 from models import make_model
@@ -121,7 +120,11 @@ def wider(cls):
     return type(cls.__name__, (cls,), tables)
 
 
-@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+@pytest.mark.parametrize(
+    "file",
+    [file for file in SHIPPED if file.stem in ("bptt-small", "kalman-net", "student")],
+    ids=lambda file: f"{file.parent.name}-{file.stem}",
+)
 def test_fields_are_found_by_their_names(file):
     id = f"filtergym/{file.parent.name}"
     maker = competitor(id, file.stem)
@@ -137,17 +140,6 @@ def test_fields_are_found_by_their_names(file):
         costs.append(found["cost"])
     assert model.fields[0].name == "further"
     np.testing.assert_array_equal(*costs)
-
-
-def test_there_are_shipped_agents():
-    """Policies of every environment, estimators where there is a filter for them that does no ruin."""
-    names = ("bptt", "bptt-linear", "bptt-small", "ppo")
-    policies = [f"{id.partition('/')[2]}/{name}" for id in catalogue() for name in names]
-    estimators = [
-        f"{id.partition('/')[2]}/{name}" for id, cls in catalogue().items() for name in cls.trained_banks
-    ]
-    estimators.remove("TightlyCoupledNavigation-v0/kalman-net")
-    assert sorted(f"{file.parent.name}/{file.stem}" for file in SHIPPED) == sorted(policies + estimators)
 
 
 @pytest.fixture
@@ -188,31 +180,21 @@ def test_an_observation_that_is_divided_by_zero_is_refused(stored):
     with pytest.raises(
         ValueError, match="is not a learned policy of filtergym: observation_scale must not be zero"
     ):
-        learned_policy.load_policy(task_class(ID), path)
+        load_policy(task_class(ID), path)
 
 
-def test_policy_of_another_environment_is_refused(stored):
-    from filtergym.agents.learned_policy import load_policy
-
+def test_a_policy_of_something_else_is_refused(stored):
     assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
-    path = stored(environment="filtergym/Other-v0")
-    with pytest.raises(ValueError, match="was trained on 'filtergym/Other-v0', not on " + ID):
-        load_policy(problem_of(ID).task, path)
-    fields = [field.name for field in make_model(ID, "gain").fields]
-    path = stored(fields=json.dumps(["range", *fields[1:]]))
-    with pytest.raises(ValueError, match=r"was trained on other fields .* has no field 'range': choose from"):
-        evaluate(ID, [str(path)], episodes=1)
-
-
-def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command):
-    now = make_model(ID).task.interface
-    path = stored(interface=str(now - 1))
-    with pytest.raises(ValueError, match=rf"its interface '{now - 1}', now {now}\): train it again"):
-        evaluate(ID, [str(path)], episodes=1)
-    code, _, error = command("evaluate", ID, "--policy", path, "--episodes", 1)
-    assert code == 2
-    assert error.startswith("Error: ")
-    assert error.count("\n") == 1
+    model = make_model(ID, "gain")
+    now, fields = model.task.interface, [field.name for field in model.fields]
+    for changes, message in (
+        ({"environment": "filtergym/Other-v0"}, "was trained on 'filtergym/Other-v0', not on " + ID),
+        ({"fields": json.dumps(["range", *fields[1:]])}, r"on other fields .* has no field 'range': choose"),
+        ({"fields": json.dumps(fields[1:])}, "is not a learned policy of filtergym"),
+        ({"interface": str(now - 1)}, rf"its interface '{now - 1}', now {now}\): train it again"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evaluate(ID, [str(stored(**changes))], episodes=1)
 
 
 NOISE = "filtergym/UavAutopilot-v0"
@@ -221,8 +203,6 @@ NOISE = "filtergym/UavAutopilot-v0"
 
 def test_an_agent_keeps_the_reach_that_it_was_trained_with():
     """The same cost whether its reach is named or not; another one is refused, and other policies are as asked."""
-    from filtergym.agents.learned_policy import load_policy, pretrained_path
-
     stored = load_policy(task_class(NOISE), pretrained_path(NOISE, "ppo"))
     assert stored.task_keywords == {"noise_reach": 1.0}
     short = {"episodes": 4, "split": "validation", "horizon": 30}
@@ -240,12 +220,7 @@ def test_the_whole_reach_is_five_times_a_fifth():
         return FunctionPolicy(lambda o: np.full((len(o), width), action), "noise", {"noise_reach": reach})
 
     costs = [
-        evaluate(
-            NOISE,
-            {"constant": constant(action, reach)},
-            episodes=3,
-            horizon=30,
-        )["cost"].values
+        evaluate(NOISE, {"constant": constant(action, reach)}, episodes=3, horizon=30)["cost"].values
         for action, reach in ((0.2, 1.0), (1.0, 0.2), (0.2, 0.2))
     ]
     np.testing.assert_allclose(costs[1], costs[0], rtol=1e-9)  # the product of reach and action rounds
@@ -270,40 +245,12 @@ def test_layers_by_hand():
     np.testing.assert_allclose(action[:, 0], [0.1, 0.6, 1.0], rtol=1e-6)
 
 
-def paid(env, actions):
-    shown, _ = env.reset(seed=3)
-    rows = [shown]
-    for action in actions:
-        shown, reward, _, truncated, _ = env.step(action(shown))
-        rows += [shown, reward]
-        assert not truncated
-    return rows
-
-
-def test_zero_correction_is_exactly_the_policy():
-    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
-    env = ResidualActions(gymnasium.make(ID, control="gain"), policy)
-    memory = None
-
-    def alone(shown):
-        nonlocal memory
-        action, memory = policy.predict(shown[None], memory, np.array([memory is None]))
-        return action[0]
-
-    expected = paid(gymnasium.make(ID, control="gain"), [alone] * 60)
-    for _ in range(2):  # twice: the policy's memory starts anew with the episode
-        for one, other in zip(paid(env, [lambda _: np.zeros(1, np.float32)] * 60), expected, strict=True):
-            np.testing.assert_array_equal(one, other)
-    corrected = paid(env, [lambda _: np.full(1, 0.2)] * 60)
-    assert corrected[2] != expected[2]
-
-
 def test_zero_correction_is_exactly_the_policy_in_an_evaluation():
     def corrected(task):
         return ResidualPolicy(task, competitor(ID, "adaptive")(task), Correction(task))
 
     corrected.control = "gain"
-    dataset = evaluate(ID, {"adaptive": "adaptive", "residual": corrected}, episodes=20)
+    dataset = evaluate(ID, {"adaptive": "adaptive", "residual": corrected}, episodes=4)
     np.testing.assert_array_equal(dataset["cost"][0], dataset["cost"][1])
 
 
@@ -328,16 +275,6 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
         other = env.step(np.zeros((5, 1), np.float32))
         np.testing.assert_array_equal(other[0], shown)
         np.testing.assert_array_equal(other[1], reward)
-
-
-def test_residuals_that_cannot_be():
-    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
-    with pytest.raises(ValueError, match="made for control 'gain', but the environment has 'weights'"):
-        ResidualActions(gymnasium.make(ID, control="weights"), policy)
-    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
-        ResidualActions(gymnasium.make(ID, control="mode"), policy)
-    with pytest.raises(ValueError, match="takes an environment of filtergym"):
-        ResidualActions(gymnasium.make("CartPole-v1"), policy)
 
 
 def test_shipped_agents_need_no_torch():

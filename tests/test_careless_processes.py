@@ -20,7 +20,7 @@ def load():
 thread = threading.Thread(target=load)
 thread.start()
 while not any(name.startswith("filtergym.evaluation") for name in list(sys.modules)):
-    pass
+    time.sleep(0.001)
 child = os.fork()
 if not child:
     import filtergym.evaluation.running.evaluate

@@ -7,6 +7,10 @@ import numpy
 import pytest
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
+from filtergym.papers.radar_esm_class_fusion.experiment import (
+    channel_error_covariance,
+    information_per_decision,
+)
 
 PARAMETERS = RadarEsmTrackingParameters()
 MODELS, START = RadarEsmTracking.design_models(PARAMETERS)
@@ -95,22 +99,6 @@ def test_identity_is_a_bank_of_kalman_filters(seed):
         assert step.innovation == pytest.approx(update.innovation, rel=1e-11, abs=1e-11)
 
 
-def test_class_transition_is_read_from_row_to_column():
-    P, mean, covariance, z = bank(numpy.random.default_rng(0), 8)
-    P = numpy.array([[0.0], [1.0], [0.0]]) + numpy.zeros(8)
-    step = class_fusion.advance(P, mean, covariance, z, MODELS, ASYMMETRIC)
-    assert numpy.exp(step.log_predicted) == pytest.approx(ASYMMETRIC[1][:, None] + numpy.zeros(8), abs=1e-12)
-
-
-def test_a_class_of_no_probability_and_a_wild_measurement_stay_finite():
-    P, mean, covariance, _ = bank(numpy.random.default_rng(1), 8)
-    z = numpy.full((2, 8), 1e9)
-    P = numpy.array([[1.0], [0.0], [0.0]]) + 0.0 * P
-    for q in (numpy.eye(3), ASYMMETRIC):
-        step = class_fusion.advance(P, mean, covariance, z, MODELS, q)
-        assert all(numpy.isfinite(array).all() for array in step)
-
-
 def test_whitened_innovations_square_to_the_nis():
     P, mean, covariance, z = bank(numpy.random.default_rng(2), 8)
     step = class_fusion.advance(P, mean, covariance, z, MODELS, numpy.eye(3))
@@ -149,7 +137,7 @@ def joint_start(target):
 
 def exact_deviations(target, channel):
     channels = class_fusion.design_channels(MODELS, START, 120)
-    errors = class_fusion.channel_error_covariance(MODELS, channels, target, channel, joint_start(target))
+    errors = channel_error_covariance(MODELS, channels, target, channel, joint_start(target))
     return numpy.sqrt(numpy.stack([errors[i, i] for i in range(3)]))
 
 
@@ -184,7 +172,7 @@ def test_exact_errors_in_the_windows():
 def test_a_matched_filter_reports_its_error():
     channels = class_fusion.design_channels(MODELS, START, 40)
     for s in range(3):
-        exact = class_fusion.channel_error_covariance(MODELS, channels, s, s, joint_start(s))
+        exact = channel_error_covariance(MODELS, channels, s, s, joint_start(s))
         assert exact == pytest.approx(channels.covariance[:, :, s], rel=1e-9)
 
 
@@ -196,7 +184,7 @@ def test_information_per_decision():
         numpy.array(PARAMETERS.recognition), numpy.array(PARAMETERS.composition)
     )
     assert probabilities == pytest.approx(1 / 30 + 26 / 30 * numpy.array(PARAMETERS.composition), rel=1e-12)
-    information = class_fusion.information_per_decision(probabilities)
+    information = information_per_decision(probabilities)
     pairs = [information[0, 1], information[0, 2], information[1, 2], information[2, 1]]
     assert pairs == pytest.approx([1.21, 1.47, 0.66, 0.64], abs=0.0055)
 
@@ -264,14 +252,3 @@ def test_gate_and_wrapped_bearings():
     for bad in (0.0, 1.0, -0.1, 1.5):
         with pytest.raises(ValueError, match="error_probability"):
             class_fusion.bearing_gate(1.0, 1.0, bad)
-
-
-def test_wrong_target_association():
-    # P(associate a wrong target) at 2, 5, 10, 20 degrees.
-    from scipy.stats import norm
-
-    for sigma, expected in ((15.0, (0.90, 0.88, 0.83, 0.63)), (1.5, (0.84, 0.56, 0.09, 0.000))):
-        gate, spread = class_fusion.bearing_gate(sigma, 3.0, 0.1), math.hypot(sigma, 3.0)
-        for separation, probability in zip((2, 5, 10, 20), expected, strict=True):
-            inside = norm.cdf((gate - separation) / spread) - norm.cdf((-gate - separation) / spread)
-            assert inside == pytest.approx(probability, abs=0.0055)

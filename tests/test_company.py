@@ -8,7 +8,7 @@ from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import programs
 from filtergym.evaluation.competitors.kinds import DRAWN_AT_ONCE, RandomPolicy
-from models import make_model
+from models import KINDS, make_model
 
 from filtergym import evaluate
 from filtergym.names import competitor
@@ -25,13 +25,13 @@ def assert_same(some, more):
         np.testing.assert_array_equal(some[name].values, expected, err_msg=str(name))
 
 
-@pytest.mark.parametrize("everybody", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_an_episode_is_the_same_in_any_company(env_id, everybody, short, monkeypatch):
-    """One of each kind, since a competitor may take a second to trace; everybody with the whole programs."""
+@pytest.mark.parametrize("env_id", KINDS)
+def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
+    """One of each kind, since a competitor may take a second to trace."""
     problem, agents = problem_of(env_id), pretrained_agents(env_id)
     known = problem.baselines
     kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
-    names = [name for kind in kinds for name in (kind if everybody else list(kind)[:1])]
+    names = [name for kind in kinds for name in list(kind)[:1]]
     monkeypatch.setattr(programs, "PROGRAM_CACHE_SIZE", len(names))  # what was traced once serves twice
     everyone = evaluate(env_id, names, episodes=13, **short)
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 12)  # and the last one alone
@@ -73,14 +73,12 @@ def test_random_actions_are_one_draw_after_another(control):
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo"])
-def test_a_model_is_asked_about_as_many_always(algorithm):
+def test_a_model_is_asked_about_as_many_always():
     pytest.importorskip("sb3_contrib")
     from filtergym.agents.sb3_training import ALGORITHMS
 
     env = gymnasium.make(ID, horizon=10)
-    policy = "MlpLstmPolicy" if algorithm == "recurrent-ppo" else "MlpPolicy"
-    model = ALGORITHMS[algorithm](policy, env, seed=0, device="cpu", n_steps=8, batch_size=8)
+    model = ALGORITHMS["recurrent-ppo"]("MlpLstmPolicy", env, seed=0, device="cpu", n_steps=8, batch_size=8)
     everyone = evaluate(ID, {"model": model}, episodes=130, horizon=10)
     for count in (1, 3):
         assert_same(evaluate(ID, {"model": model}, episodes=count, horizon=10), everyone)

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -76,12 +75,7 @@ def test_structures_come_back_as_they_went_in():
     np.testing.assert_array_equal(said["speed"], np.full(8, 0.125))
     np.testing.assert_array_equal(said["flag"], ~flags)
     assert said["flag"].dtype == bool
-
-
-def test_what_passes_through_is_the_given_array():
-    position, flags, count = numbers(2, 8), np.arange(8) % 2 == 0, np.arange(8)
-    bank = Bank(Track(position, flags), None, {"count": count})
-    after, said, _ = Function(moved, Graph())(bank, np.full(8, 0.25))
+    # What passes through is the given array.
     assert after.track.flags is flags
     assert after.more["count"] is count
     assert said["bank"]["count"] is count
@@ -100,12 +94,11 @@ def test_a_part_of_an_array_or_another_kind_of_it_is_a_new_one():
     assert same is x
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1,), (3,), (2, 0, 3), (2, 1, 3, 2)], ids=str)
-def test_arrays_of_every_shape(shape):
-    x = numbers(*shape, 11)
-    result = Function(lambda x: x * 2.0 + 1.0, Graph())(x)
-    assert result.shape == x.shape
-    np.testing.assert_array_equal(result, x * 2.0 + 1.0)
+def test_arrays_of_every_shape():
+    for shape in ((11,), (0, 11), (1, 11), (2, 0, 3, 11), (2, 1, 3, 2, 11), (3, 0)):
+        x = numbers(*shape)
+        result = Function(lambda x: x * 2.0 + 1.0, Graph())(x)
+        np.testing.assert_array_equal(result, x * 2.0 + 1.0, strict=True)
 
 
 def test_answers_can_have_another_dtype_and_no_operations():
@@ -194,10 +187,6 @@ def test_one_lane_stands_for_all_but_other_widths_are_refused():
         add(x, x[:, :3])
 
 
-def test_no_lanes_are_no_trouble(compiled):
-    assert compiled(np.empty((3, 0))).shape == (3, 0)
-
-
 # --- lanes and threads
 
 
@@ -257,7 +246,7 @@ def _threads_change_often():
 
 @pytest.mark.usefixtures("_threads_change_often")
 def test_threads_that_meet_a_function_at_once_all_get_it(monkeypatch):
-    for attempt in range(5):
+    for attempt in range(2):
         monkeypatch.setattr(native, "_CODES", {})
         x, start, graph = numbers(3, 24, seed=attempt), threading.Barrier(4), Graph()
         # Two functions, whose expressions meet in one graph.
@@ -355,30 +344,6 @@ def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
             os._exit(1)
     thread.join()
     assert os.waitpid(child, 0)[1] == 0
-
-
-SCRIPT = """
-import sys, numpy
-from filtergym.compiler import namespace
-from filtergym.compiler.functions import Function
-from filtergym.compiler.program import Graph
-from filtergym.compiler.sequence import CallSequence, moving_array
-x = numpy.frombuffer(bytes.fromhex(sys.argv[1])).reshape(3, -1)
-function = Function(lambda x: namespace.exp(-x) * namespace.sin(x[::-1]) + namespace.sum(x * x, axis=0) / 3.0, Graph())
-print(function(x).tobytes().hex())
-"""
-
-
-def test_a_process_of_its_own_computes_the_same_bits(compiled):
-    x = numbers(3, 9)
-    answer = subprocess.run(
-        [sys.executable, "-c", SCRIPT, x.tobytes().hex()],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    assert answer.stdout.strip() == compiled(x).tobytes().hex()
 
 
 # --- what is bound to memory

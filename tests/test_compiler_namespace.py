@@ -1,15 +1,12 @@
 """The namespace's functions against NumPy's of the same names: shapes, types, values, and what is refused."""
 
 import math
-import re
-import types
-from pathlib import Path
 
 import numpy as np
 import pytest
 from filtergym.compiler import cache, namespace
 from filtergym.compiler.functions import Function, Specialised
-from filtergym.compiler.namespace import NotTraceable, tracing
+from filtergym.compiler.namespace import NotTraceable
 from filtergym.compiler.program import Graph
 
 pytest.importorskip("llvmlite")
@@ -358,25 +355,3 @@ def test_what_is_given_must_be_numbers():
 
 
 # --- the namespace itself
-
-
-def test_arrays_name_their_namespace():
-    with tracing(Graph()):
-        assert namespace.asarray([1.0]).__array_namespace__() is namespace
-        assert namespace.asarray(2.0, dtype=namespace.int64).dtype == np.int64
-
-
-def test_this_file_tries_every_function():
-    names = {
-        name
-        for name, value in vars(namespace).items()
-        if callable(value)
-        and not isinstance(value, type | types.ModuleType)
-        and not name.startswith("_")
-        # What typing and the like bring is no function of arrays.
-        and getattr(value, "__module__", namespace.__name__) in (namespace.__name__, "numpy", "functools")
-    } - {"tracing"}
-    assert {"add", "matmul", "zeros_like", "roll", "exp"} <= names
-    text = Path(__file__).read_text(encoding="utf-8")
-    listed = {word for words in re.findall(r'\("([a-z0-9 ]+)", [A-Z_]+\)', text) for word in words.split()}
-    assert names <= set(re.findall(r"\bxp\.(\w+)", text)) | listed

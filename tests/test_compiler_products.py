@@ -99,27 +99,11 @@ def test_several_loops_in_a_program_of_many_parts():
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_lane_does_not_depend_on_its_company():
-    A = matrix(33, 65)
-    product = Function(lambda x: A @ x, Graph(loops=True))
-    x = vector(65)
-    np.testing.assert_array_equal(product(x)[:, 5:6], product(x[:, 5:6]))
-
-
 def test_what_is_no_number_stays_in_its_lane():
     x = vector(40)
     x[3, 7] = np.nan
     result = Function(lambda x: matrix(40, 40) @ x, Graph(loops=True))(x)
     assert (np.isnan(result).all(axis=0) == (np.arange(LANES) == 7)).all()
-
-
-def test_matrices_that_differ_in_numbers_only_have_the_same_steps():
-    one, other = (
-        Specialised(lambda x, seed=seed: matrix(40, 30, seed) @ x, Graph(loops=True), [vector(30)]).program
-        for seed in (0, 1)
-    )
-    assert list(one.steps) == list(other.steps)
-    assert (one.constants != other.constants).any()
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("llvmlite")
 
-WIDTHS = (8, 16, 24, 520)
+WIDTHS = (8, 24, 136)
 SETTINGS = [Setting(8, 3, 1), Setting(4, 7, 0), Setting(8, 100, 0), Setting(4, 100, 1)]
 ONE = ("sqrt", "abs", "sign", "negative", "floor", "ceil", "trunc", "round")
 TWO = ("add", "multiply", "divide")
@@ -96,8 +96,8 @@ def computed(recipe, arrays, setting, constants=()):
                 yield width, *compiled(*(array[..., :width] for array in arrays), threads=threads)
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
-@settings(max_examples=25)
+@pytest.mark.parametrize("setting", SETTINGS[:2])
+@settings(max_examples=20)
 @given(recipe=recipes(WITHOUT_CONSTANTS))
 def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(setting, recipe):
     arrays = leaves(special=True)
@@ -113,8 +113,8 @@ def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(setting, re
             np.testing.assert_array_equal(result, expected[:width])
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
-@settings(max_examples=25)
+@pytest.mark.parametrize("setting", SETTINGS[:2])
+@settings(max_examples=20)
 @given(recipe=recipes(WITH_CONSTANTS))
 def test_random_programs_with_constants_are_numpys_where_all_is_finite(setting, recipe):
     arrays = leaves(special=False)
@@ -359,19 +359,18 @@ def test_what_runs_long_is_compiled_again_with_optimisation(monkeypatch):
     assert settings_used(monkeypatch, chain(6), runs=12) == [first, better]
 
 
-def test_what_is_timed_is_optimised_at_once(monkeypatch):
-    first, better = named(quick_setting(native.processor()[1], False)), named(OPTIMISED)
+def test_code_is_made_when_it_runs_and_what_is_timed_is_optimised_at_once():
+    made = []
+    code = native.Code(lambda: made.append("quick"), lambda: made.append("better"), hot=100)
+    assert not made
     with native.optimised_code():
-        assert settings_used(monkeypatch, chain(7), runs=2) == [better]
-    assert settings_used(monkeypatch, chain(8), runs=2) == [first]
-
-
-def test_long_programs_stay_as_they_are(monkeypatch):
-    monkeypatch.setattr(native, "HOT", 40)
-    monkeypatch.setattr(native, "LONG", 30)
-    assert len(settings_used(monkeypatch, chain(12), runs=12)) == 2
-    assert len(settings_used(monkeypatch, chain(13), runs=12)) == 2
-    assert len(settings_used(monkeypatch, chain(20), runs=12)) == 1
+        code.expect(8)
+        assert made == ["quick"]  # the start of an episode is not timed
+        code.expect(8, in_sequence=True)
+        assert made == ["quick", "better"]
+    other = native.Code(lambda: made.append("one"), lambda: made.append("other"), hot=100)
+    other.expect(8, in_sequence=True)
+    assert made == ["quick", "better", "one"]
 
 
 def test_what_is_compiled_quickly_as_loops_becomes_a_straight_line(monkeypatch):
@@ -384,6 +383,8 @@ def test_what_is_compiled_quickly_as_loops_becomes_a_straight_line(monkeypatch):
     )
     for length, expected in ((11, [loops, OPTIMISED]), (20, [loops, straight]), (30, [loops])):
         assert settings_used(monkeypatch, chain(length), runs=12) == [named(each) for each in expected]
+    monkeypatch.setattr(emission, "LONG", 100)  # and what is a straight line already stays one
+    assert settings_used(monkeypatch, chain(21), runs=12) == [named(loops)]
 
 
 def test_parts_are_cut_by_results_as_well_as_by_steps():

@@ -33,11 +33,8 @@ def complete(monkeypatch, capsys):
     return offered
 
 
-def test_commands(complete):
+def test_commands_and_environments(complete):
     assert complete("ev") == ["evaluate"]
-
-
-def test_environments(complete):
     assert complete("evaluate", "") == list(catalogue())
     assert complete("list", "filtergym/M") == [TARGET]
     assert complete("train", "Uav") == ["UavAutopilot-v0"]
@@ -53,14 +50,13 @@ def test_scenarios_of_the_environment(complete):
     assert {"cruise", "silent"} <= set(complete("evaluate", "--scenario", ""))
 
 
-@pytest.mark.parametrize("command", ["evaluate", "animate", "tune"])
-def test_policies_of_the_environment(complete, command):
+def test_policies_of_the_environment(complete):
     expected = {
         name for name in [*problem_of(TARGET).names, *pretrained_agents(TARGET)] if name.startswith("k")
     }
-    assert set(complete(command, TARGET, "--policy", "k")) == expected
+    assert set(complete("evaluate", TARGET, "--policy", "k")) == expected
     assert "kalman-imm" in expected
-    assert complete(command, "ManeuveringTarget", "--policy", "imm", "--policy", "known-t") == ["known-turn"]
+    assert complete("tune", "ManeuveringTarget", "--policy", "imm", "--policy", "known-t") == ["known-turn"]
 
 
 def test_few_words_and_nothing(complete):
@@ -95,16 +91,3 @@ def test_other_shells(monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "cruise" in shown
     assert "crowded" not in shown  # of another environment
-
-
-def test_completion_imports_no_torch_and_takes_no_time():
-    code = (
-        "import sys, os; os.environ.update(_FILTERGYM_COMPLETE='complete_bash', COMP_CWORD='3', "
-        f"COMP_WORDS='filtergym evaluate {TARGET} --policy p'); sys.argv = ['filtergym']\n"
-        "from filtergym.__main__ import main\n"
-        "try:\n    main()\nfinally:\n"
-        "    heavy = {'torch', 'stable_baselines3', 'matplotlib.pyplot', 'plotly'} & set(sys.modules)\n"
-        "    print(sorted(heavy), file=sys.stderr)"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert run.stderr.strip() == "[]"

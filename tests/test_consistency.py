@@ -1,6 +1,5 @@
 """Whether covariances are believed: NEES and NIS, medians and wins, and what is said of who is best."""
 
-import gymnasium
 import numpy as np
 import pytest
 import xarray
@@ -13,12 +12,13 @@ from filtergym import evaluate, tidy_records
 from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
+EPISODES = 100
 
 
 @pytest.fixture(scope="module")
 def dataset():
-    names = ["imm", "adaptive-rearm-tuned", "bptt", "ppo", "kalman-imm", "known-turn", "known-input-bound"]
-    return evaluate(ID, names, episodes=200, tracks=True)
+    names = ["imm", "bptt", "ppo", "kalman-imm", "known-turn", "known-input-bound"]
+    return evaluate(ID, names, episodes=EPISODES, tracks=True)
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +59,6 @@ def test_consistency_is_what_it_says(dataset, found):
     assert ("known-input-bound", "anees") not in found
 
 
-def test_a_gain_reports_a_covariance_that_one_can_gate_with(found):
-    """Without what an acceleration leaves it would be too small by factors of tens to hundreds."""
-    for name in ("adaptive-rearm-tuned", "bptt", "ppo"):
-        assert 0.5 < found[name, "anees"].value < 2.0
-
-
 def test_what_an_acceleration_leaves():
     T, alpha, a = 4.0, np.array([0.2, 0.9]), 3.0
     beta, zero = alpha_beta.benedict_bordner_beta(alpha), np.zeros(2)
@@ -93,7 +87,7 @@ def test_typical_episodes(dataset, found):
     ratio = (cost.sel(policy="bptt") / cost.sel(policy="imm")).values
     assert found["bptt", "win_rate"].value == pytest.approx((ratio < 1.0).mean())
     # Of an even number the lower of the two in the middle.
-    assert found["bptt", "median_cost_ratio"].value == np.sort(ratio)[99]
+    assert found["bptt", "median_cost_ratio"].value == np.sort(ratio)[EPISODES // 2 - 1]
     assert found["imm", "win_rate"].value == pytest.approx(0.5, rel=1e-12)
     assert found["imm", "median_cost_ratio"].value == 1.0
 
@@ -102,8 +96,8 @@ def test_the_headline_is_a_geometric_mean_and_lost_tracks_are_counted(dataset, f
     """Of each episode's ratio of costs, with the interval of a bootstrap of its logarithm."""
     cost = dataset["cost"].mean("time").transpose("episode", "policy").to_pandas()
     logs = np.log(cost["bptt"] / cost["imm"]).to_numpy()
-    counts = np.rint(Bootstrap(200).weights * 200)
-    expected = np.percentile(np.exp(counts[1:] @ logs / 200) - 1.0, [2.5, 97.5])
+    counts = np.rint(Bootstrap(EPISODES).weights * EPISODES)
+    expected = np.percentile(np.exp(counts[1:] @ logs / EPISODES) - 1.0, [2.5, 97.5])
     record = found["bptt", "geometric_cost_difference"]
     assert record.value == pytest.approx(np.exp(logs.mean()) - 1.0, rel=1e-12)
     np.testing.assert_allclose([record.low, record.high], expected, rtol=1e-12)
@@ -208,17 +202,6 @@ def test_tracks_hold_what_a_track_is_drawn_from(dataset):
     )
     for name in ("measurement_position", "measurement_variance"):
         values = run[name].values  # the same for everybody: nobody steers the radar
-        assert values.shape == (3, 200, 100, 2)
+        assert values.shape == (3, EPISODES, 100, 2)
         np.testing.assert_array_equal(values[1:], values[:1].repeat(2, axis=0))
     assert "estimate" not in evaluate(ID, ["imm"], episodes=2)
-
-
-def test_info_holds_the_same(dataset):
-    env = gymnasium.make(ID, control="weights", detailed_info=True)
-    env.reset(seed=int(dataset["episode_seed"].values[3]))
-    info = env.step(np.array([0.5, 0.5], dtype=np.float32))[-1]
-    first = dataset.sel(policy="imm").isel(episode=3, time=0)
-    for name in ("truth", "measurement_position", "measurement_variance"):
-        np.testing.assert_allclose(info[name], first[name].values, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(info["estimate"] - info["truth"], info["error"], rtol=0, atol=1e-9)
-    assert info["covariance"].shape == (4, 4)

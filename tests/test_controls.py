@@ -17,6 +17,13 @@ def test_values_beyond_the_box_count_as_its_edge(control, low):
     np.testing.assert_array_equal(probabilities(beyond), probabilities(edge))
 
 
+def test_weights_are_normalised_and_zero_is_uniform():
+    found = bank_probabilities(
+        "weights", np.array([[0.2, 0.0], [0.6, 0.0]]), LOG_PREDICTED, LOG_LIKELIHOOD, 4.0, np
+    )
+    np.testing.assert_allclose(found, [[0.25, 0.5], [0.75, 0.5]], rtol=1e-14)
+
+
 def test_evidence_is_added_to_the_logarithm():
     action = np.array([[0.5, -1.0], [0.0, 0.25]])
     weighed = np.exp(LOG_PREDICTED + LOG_LIKELIHOOD + 4.0 * action)

@@ -1,9 +1,4 @@
-"""Random numbers by counter: published answers, the same bits from compiled code, distribution and independence.
-
-The numbers are functions of counters that stand here, so nothing is left to chance from run to run. A statistic is held
-against a threshold that as many numbers of an ideal generator would pass with the stated probability: a false alarm
-could only come with a change of the algorithm.
-"""
+"""Random numbers by counter: published answers, exact definitions, and the same bits from compiled code."""
 
 import math
 
@@ -26,9 +21,6 @@ from filtergym.compiler.counter_numbers import (
 )
 
 WHOLE = np.uint64
-SIGMAS = 5.5
-"""Of a normal statistic: an ideal generator goes beyond with a probability of 3.8e-8, for all of these tests together,
-some hundred statistics, below 1e-5."""
 EDGES = np.array(
     [0, 1, 2, 3, 0xFFF, 0x1000, 1 << 31, LOW, 1 << 32, 1 << 63, (1 << 63) - 1, 2**64 - 4096, 2**64 - 1], WHOLE
 )
@@ -154,6 +146,19 @@ def test_compiled_code_gives_the_same_bits(normals, uniforms):
         assert np.isnan(rows[:, [*range(8), *range(-8, 0)]]).all(), "nor beside the lanes"
 
 
+def test_numbers_are_those_of_the_pairs_that_their_places_name():
+    identity = np.array([[7], [2**63 + 5]], WHOLE)
+    found = numbers(identity, np.array([3]), 5, 3)[:, 0]
+    expected = []
+    for place in range(5):
+        pair = pair_of_bits(*identity, np.array([3], WHOLE), np.array([place // 2], WHOLE))
+        expected.append(normal_pair(ARRAYS, *pair)[place % 2][0])
+    for place in range(3):
+        pair = pair_of_bits(*identity, np.array([3], WHOLE), np.array([UNIFORM_PAIRS + place // 2], WHOLE))
+        expected.append(uniform(ARRAYS, pair[place % 2])[0])
+    assert found.tolist() == expected
+
+
 def test_numbers_do_not_depend_on_what_else_is_asked_for():
     identities, t = identities_of(16), np.arange(16)
     many = numbers(identities, t, 7, 5)
@@ -173,92 +178,3 @@ def test_no_two_names_have_the_same_bits():
     found = np.concatenate([bits.ravel() for bits in pair_of_bits(key, episode, t, pairs)])
     # Of so many numbers of 64 bits two would be equal with a probability of 1e-9.
     assert len(np.unique(found)) == found.size
-
-
-@pytest.fixture(scope="module")
-def sample():
-    """Normals and uniforms of episodes one after another, ``(t, 8, episodes)``."""
-    return numbers(identities_of(1 << 15), np.arange(16)[:, None] + np.zeros(1 << 15, dtype=int), 4, 4)
-
-
-def test_moments_of_normals(sample):
-    x = sample[:, :4].ravel()
-    for power, mean, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10170)):
-        assert abs((x**power).mean() - mean) < SIGMAS * math.sqrt(variance / x.size), power
-
-
-def test_moments_of_uniforms(sample):
-    x = sample[:, 4:].ravel()
-    for power in (1, 2, 3, 4):
-        mean = 1.0 / (power + 1)
-        variance = 1.0 / (2 * power + 1) - mean**2
-        assert abs((x**power).mean() - mean) < SIGMAS * math.sqrt(variance / x.size), power
-
-
-def test_bins_are_as_full_as_they_should_be(sample):
-    distribution = np.vectorize(lambda x: 0.5 * math.erfc(-x / math.sqrt(2.0)))
-    for values in (distribution(sample[:4, :4].ravel()), sample[:, 4:].ravel()):
-        counts = np.bincount((values * 256.0).astype(int), minlength=256)
-        expected = values.size / 256
-        # Chi-squared of 255 degrees of freedom, as normal as its cube root is (Wilson and Hilferty).
-        chi = ((counts - expected) ** 2 / expected).sum() / 255
-        spread = 2.0 / (9.0 * 255)
-        assert abs(chi ** (1.0 / 3.0) - (1.0 - spread)) < SIGMAS * math.sqrt(spread)
-
-
-def test_tails_are_as_heavy_as_they_should_be():
-    episodes = 1 << 18
-    x = numbers(identities_of(episodes, 1 << 40), np.zeros(episodes, dtype=int), 16, 0).ravel()
-    for limit in (2.0, 3.0, 4.0):
-        expected = 0.5 * math.erfc(limit / math.sqrt(2.0)) * x.size
-        for count in ((x > limit).sum(), (x < -limit).sum()):
-            assert abs(count - expected) < SIGMAS * math.sqrt(expected)
-    # Beyond 5 some 2.4 of so many are expected, and more than 17 with a probability of 1e-9 (Poisson).
-    assert (np.abs(x) > 5.0).sum() <= 17
-    assert np.abs(x).max() > 4.5  # less with a probability of e^-28
-
-
-def correlation(a, b):
-    """Correlation of numbers with zero mean and unit variance, times the square root of their count: about normal."""
-    return float((a * b).sum() / math.sqrt(a.size))
-
-
-@pytest.mark.parametrize("change", [lambda x: x, lambda x: (x * x - 1.0) / math.sqrt(2.0)])
-def test_numbers_of_different_names_are_independent(sample, change):
-    normal, even = sample[:, :4], (sample[:, 4:] - 0.5) * math.sqrt(12.0)
-    x = change(normal)
-    pairs = {
-        "measurement": (x[:-1], x[1:]),
-        "measurements, two": (x[:-2], x[2:]),
-        "of one pair": (x[:, ::2], x[:, 1::2]),
-        "pair": (x[:, :2], x[:, 2:]),
-        "episode": (x[..., :-1], x[..., 1:]),
-        "episodes, 256": (x[..., :-256], x[..., 256:]),
-        "kind": (x, even),
-    }
-    for bit in (0, 1, 31, 32, 63):
-        other = identities_of(1 << 13)
-        for which in (0, 1):
-            flipped = other.copy()
-            flipped[which] ^= WHOLE(1 << bit)
-            t = np.arange(8)[:, None] + np.zeros(1 << 13, dtype=int)
-            if which == 0 or bit >= 13:  # the lower bits exchange episodes among themselves
-                a, b = (change(numbers(i, t, 4, 0)) for i in (other, flipped))
-                pairs[f"bit {bit} of {('key', 'episode')[which]}"] = a, b
-    for name, (a, b) in pairs.items():
-        assert abs(correlation(a, b)) < SIGMAS, name
-
-
-def test_a_bit_of_the_name_changes_half_of_the_bits():
-    rng = np.random.default_rng(3)
-    key, episode = rng.integers(0, 2**64, size=(2, 4096), dtype=WHOLE)
-    t, pair = rng.integers(0, 2**32, size=(2, 4096), dtype=WHOLE)
-    before = pair_of_bits(key, episode, t, pair)
-    for place, width in enumerate((64, 64, 32, 32)):
-        for bit in range(0, width, 7):
-            names = [key, episode, t, pair]
-            names[place] = names[place] ^ WHOLE(1 << bit)
-            changed = [a ^ b for a, b in zip(before, pair_of_bits(*names), strict=True)]
-            count = sum(int(np.bitwise_count(c).sum()) for c in changed)
-            total = 128 * 4096
-            assert abs(count - total / 2) < SIGMAS * math.sqrt(total / 4)

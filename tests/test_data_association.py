@@ -28,7 +28,7 @@ def scan(seed):
 def test_update_has_the_moments_of_the_mixture_of_all_associations(seed):
     mean, covariance, plots, variances, available, density = scan(seed)
     found = data_association.update_position(
-        mean, covariance, plots, variances, available, DETECTION, density
+        mean, covariance, data_association.Plots(plots, variances, available), DETECTION, density
     )
     H = np.eye(2, STATES)
     for b in range(BATCH):

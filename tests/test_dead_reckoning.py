@@ -71,9 +71,13 @@ def test_filter_is_least_squares_over_the_whole_log():
     likelihood = 0.0
     for k in range(K):
         mean, covariance = dead_reckoning.predict_position(
-            mean, covariance, d[k][:, None], np.ones(1), T[[k]],
-            drift=q, acceleration=1.0, correlation_time=tau, deviation=s,
-        )  # fmt: skip
+            mean,
+            covariance,
+            d[k][:, None],
+            np.ones(1),
+            T[[k]],
+            dead_reckoning.Noise(q, 1.0, tau, s),
+        )
         S = H @ covariance[:, :, 0] @ H.T + r**2 * np.eye(2)
         gain, nu = covariance[:, :, 0] @ H.T @ np.linalg.inv(S), z[k] - H @ mean[:, 0]
         likelihood -= 0.5 * (nu @ np.linalg.solve(S, nu) + math.log(np.linalg.det(2.0 * math.pi * S)))
@@ -106,9 +110,13 @@ def test_what_the_odometry_does_not_say_is_coasting():
     mean, covariance = rng.normal(size=6), root @ root.T
     T, a, s, tau = 2.0, 0.7, 3.0, 10.0
     found = dead_reckoning.predict_position(
-        mean[:, None], covariance[:, :, None], np.full((2, 1), 99.0), np.zeros(1), np.array([T]),
-        drift=1.0, acceleration=a, correlation_time=tau, deviation=s,
-    )  # fmt: skip
+        mean[:, None],
+        covariance[:, :, None],
+        np.full((2, 1), 99.0),
+        np.zeros(1),
+        np.array([T]),
+        dead_reckoning.Noise(1.0, a, tau, s),
+    )
     F = np.eye(6) + T * np.eye(6, k=2)
     F[2:4, 4:] = 0.0
     F[4:, 4:] = math.exp(-T / tau) * np.eye(2)

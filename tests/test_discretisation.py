@@ -1,18 +1,13 @@
 """Continuous models over an interval, against SciPy's exponential, quadrature and naive loops."""
 
-import shutil
-
 import numpy as np
 import pytest
 import scipy
-from filtergym.baselines.problem import problem_of
 from filtergym.filters import discretisation
 from own_models import make_models, simulate
 
 import filtergym
 from filtergym import Input
-from filtergym.exports.c_source import export_c
-from filtergym.exports.request import request_export
 
 CASES = {
     "integrators": ([[0, 1, 0], [0, 0, 1], [0, 0, 0]], 0.0),
@@ -156,13 +151,6 @@ def test_a_linear_drift_is_the_model_that_one_writes_by_hand(make):
         expected, found = (filter.update(time, z1=z, acceleration=u) for filter in (one, two))
         np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no compiler")
-def test_a_filter_of_a_drift_is_exported(make, tmp_path):
-    figures = export_c(request_export(problem_of(make().id), "extended"), tmp_path)
-    assert figures.difference < 1e-9
-    assert figures.test
 
 
 @pytest.mark.parametrize(

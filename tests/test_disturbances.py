@@ -5,11 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from filtergym.baselines.maneuvering_target.references import KnownTurn
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.faults import Disturbance, Disturbances
 from filtergym.envs.maneuvering_target import world
 from filtergym.envs.maneuvering_target.disturbances import DISTURBANCES
+from filtergym.evaluation.competitors.filters import put_in_loop
 from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -25,11 +27,11 @@ class Shift(Disturbance):
     def is_in(cls, parameters):
         return parameters.shifted
 
-    def begin(self, draws, normals, truth):
-        return truth + draws.unit("shift") + normals[0]
+    def begin(self, draws, normals, zero):
+        return zero + draws.unit("shift") + normals[0]
 
-    def advance(self, state, interval, numbers):
-        return state + interval * numbers.normals[1]
+    def advance(self, state, step):
+        return state + step.interval * step.normals[1]
 
     def change_errors(self, state, errors):
         return errors + state
@@ -48,8 +50,8 @@ class Scale(Disturbance):
     def is_in(cls, parameters):
         return True
 
-    def begin(self, draws, normals, truth):
-        return normals[1], 0.0 * truth
+    def begin(self, draws, normals, zero):
+        return normals[1], 0.0 * zero
 
     def change_errors(self, state, errors):
         return errors * state[0]
@@ -57,8 +59,8 @@ class Scale(Disturbance):
     def change_reading(self, state, reading):
         return (state[0], state[1] + 1.0), -reading
 
-    def change_measurement(self, state, measurement, numbers, feedback):
-        return state, measurement + numbers.uniforms[0] + feedback
+    def change_measurement(self, state, measurement, step, feedback):
+        return state, measurement + step.uniforms[0] + feedback
 
     def records(self, state):
         return {"changed": state[1]}
@@ -71,15 +73,15 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
     drawn, start = np.array([[0.25, 0.5]]), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     states = both.begin(Draws(drawn, np), start, np.array([100.0, 200.0]))
     np.testing.assert_array_equal(states["shift"], [101.25, 202.5])
-    numbers = both.share(np.array([[7.0, 7.0], [8.0, 9.0]]), np.array([[0.1, 0.2]]))
-    states = both.advance(states, 2.0, numbers)
+    steps = both.share(np.array([1.0, 1.0]), 2.0, np.array([[7.0, 7.0], [8.0, 9.0]]), np.array([[0.1, 0.2]]))
+    states = both.advance(states, steps)
     np.testing.assert_array_equal(both.context(states)["shift"], [117.25, 220.5])
     errors = both.change_errors(states, np.array([1.0, 1.0]))
     np.testing.assert_array_equal(errors, [118.25 * 5.0, 221.5 * 6.0])
     states, reading = both.change_reading(states, np.array([1.0, 2.0]))
     np.testing.assert_array_equal(reading, [-1.0, -2.0])
     np.testing.assert_array_equal(both.records(states)["changed"], [1.0, 1.0])
-    _, measurement = both.change_measurement(states, np.array([1.0, 2.0]), numbers, 10.0)
+    _, measurement = both.change_measurement(states, np.array([1.0, 2.0]), steps, 10.0)
     np.testing.assert_array_equal(measurement, [11.1, 12.2])
     task.parameters.shifted = False
     assert [part.name for part in Disturbances.of(task, (Shift, Scale)).parts] == ["scale"]
@@ -88,7 +90,7 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
 class Held(NamedTuple):
     """State of :class:`Frozen`."""
 
-    scans: np.ndarray
+    number: np.ndarray
     reading: np.ndarray
 
 
@@ -102,14 +104,14 @@ class Frozen(Disturbance):
     def is_in(cls, parameters):
         return True
 
-    def begin(self, draws, normals, truth):
-        return Held(truth.scan, 0.0 * truth.position)
+    def begin(self, draws, normals, zero):
+        return Held(zero, self.xp.stack([zero, zero]))
 
-    def advance(self, state, interval, numbers):
-        return state._replace(scans=state.scans + 1.0)
+    def advance(self, state, step):
+        return state._replace(number=step.number)
 
     def change_reading(self, state, reading):
-        fresh = state.scans - 4.0 * self.xp.floor(state.scans / 4.0) == 1.0
+        fresh = state.number - 4.0 * self.xp.floor(state.number / 4.0) == 1.0
         reading = self.xp.where(fresh, reading, state.reading)
         return state._replace(reading=reading), reading
 
@@ -141,3 +143,11 @@ def test_a_world_runs_a_further_one_that_stands_in_its_list(backend, monkeypatch
         zero = np.zeros((len(plain.action_space.low), 8))
         one, other = plain.act(one, zero), model.act(other, zero)
     assert frozen > 20
+
+
+def test_a_reference_that_does_not_know_what_may_happen_is_refused(monkeypatch):
+    monkeypatch.setattr(world, "DISTURBANCES", (*DISTURBANCES, Frozen))
+    with pytest.raises(
+        ValueError, match="'known-turn' does not know the disturbance 'frozen' of filtergym/Man"
+    ):
+        put_in_loop(make_model(ID), KnownTurn, "reference", "known-turn", 1)

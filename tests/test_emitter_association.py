@@ -33,7 +33,11 @@ def test_the_table_is_the_sum_over_all_histories_of_silence_and_source():
         if k:
             table = emitter_association.fall_silent(table, grid, one)
         table = table * emitter_association.look_likelihood(
-            grid, CONFUSION, CONFUSION, numpy.array([decision]), numpy.array([apart]), sigma, one
+            grid,
+            CONFUSION,
+            CONFUSION,
+            emitter_association.Look(one, numpy.array([decision]), numpy.array([apart])),
+            sigma,
         )
     for j, v in itertools.product(range(3), range(len(grid.other_type))):
         i, delta, q, f, g, weight = (float(part.ravel()[v]) for part in grid)
@@ -62,9 +66,8 @@ def test_without_a_look_nothing_changes():
     grid = emitter_association.surroundings(3, (2.0, 12.0), 2, RATES)
     table = emitter_association.start_table(grid, 3) * numpy.ones(2)
     none = numpy.zeros(2, bool)
-    factor = emitter_association.look_likelihood(
-        grid, CONFUSION, CONFUSION, numpy.array([3, 3]), numpy.zeros(2), 3.0, none
-    )
+    look = emitter_association.Look(none, numpy.array([3, 3]), numpy.zeros(2))
+    factor = emitter_association.look_likelihood(grid, CONFUSION, CONFUSION, look, 3.0)
     assert (factor == 1.0).all()
     assert (emitter_association.fall_silent(table, grid, none) == table).all()
     assert table[0].sum() == pytest.approx(2 * 3, rel=1e-12)  # two lanes, three types of the second emitter

@@ -1,8 +1,5 @@
 """The complete small example in the documentation: a user's own environment in one file."""
 
-import importlib.util
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -10,10 +7,8 @@ import numpy as np
 import pytest
 from contract import assert_equals_its_vector
 from environment_page import environment_table
-from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine import registration
-from models import make_model
+from models import load_module, make_model
 
 import filtergym
 
@@ -21,31 +16,20 @@ FOLDER = Path(__file__).parent.parent / "docs" / "examples"
 ID = "mine/InvertedPendulum-v0"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def example():
-    """The module, registered; forgotten afterwards."""
-    spec = importlib.util.spec_from_file_location("inverted_pendulum", FOLDER / "inverted_pendulum.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["inverted_pendulum"] = module
-    spec.loader.exec_module(module)
-    yield module
-    for table in (sys.modules, registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
-        table.pop("inverted_pendulum", None)
-        table.pop(ID, None)
+    """The module, registered."""
+    yield from load_module(FOLDER / "inverted_pendulum.py")
 
 
-def test_it_is_short():
-    assert len((FOLDER / "inverted_pendulum.py").read_text().splitlines()) < 300
-
-
-def test_environment(example):
+def test_environment():
     env = assert_equals_its_vector(
         ID, [np.full(1, 0.1 * k) for k in range(8)], render_mode="rgb_array", horizon=8
     )
     assert env.render().ndim == 3
 
 
-def test_closed_loop_flies_a_truth_of_its_own_on_the_same_noise(example):
+def test_closed_loop_flies_a_truth_of_its_own_on_the_same_noise():
     dataset = filtergym.evaluate(
         ID, ["kalman", "matching", "random", "known-gusts"], episodes=60, horizon=150
     )
@@ -57,7 +41,7 @@ def test_closed_loop_flies_a_truth_of_its_own_on_the_same_noise(example):
     assert abs(nees.mean() - 2.0) < 4 * nees.mean(axis=1).std() / np.sqrt(200)
 
 
-def test_torch(example):
+def test_torch():
     torch = pytest.importorskip("torch")
     one = gymnasium.make_vec(ID, num_envs=2, horizon=8)
     other = gymnasium.make_vec(ID, num_envs=2, horizon=8, backend="torch")
@@ -72,7 +56,7 @@ def test_torch(example):
         np.testing.assert_allclose(reward, paid, rtol=1e-11, atol=1e-11)
 
 
-def test_tables_of_its_page(example):
+def test_tables_of_its_page():
     problem = problem_of(ID)
     assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in environment_table(
         problem, "fields"
@@ -80,13 +64,3 @@ def test_tables_of_its_page(example):
     assert "Limits of its true factor" in environment_table(problem, "parameters")
     assert "Knows the factor on the gusts at every moment." in environment_table(problem, "policies")
     assert make_model(ID).task.noise.uniforms == 3
-
-
-def test_command_line_finds_it_in_the_working_directory():
-    arguments = ["evaluate", f"inverted_pendulum:{ID}", "--policy", "kalman", "--policy", "known-gusts"]
-    done = subprocess.run(
-        [sys.executable, "-m", "filtergym", *arguments, "--episodes", "5", "--set", "horizon=20"],
-        capture_output=True, text=True, cwd=FOLDER, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "known-gusts" in done.stdout

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from filtergym.evaluation.running.parallel import Workers
 import filtergym
 from filtergym import protocol as protocols
 from filtergym.commands.protocol import quoted_row
-from filtergym.protocol import bib_entry, find_entries, read_protocol, run_protocol
+from filtergym.protocol import find_entries, read_protocol, run_protocol
 
 FROZEN = {"filtergym-1": "25cfbd9dcaba4cbfdd3bedcbdcc51c265bb44cdd69a0f12273d6693c147446ff"}
 """SHA-256 of every protocol that was ever published. Who changes one adds a file with the next number."""
@@ -47,12 +46,24 @@ training = "random"
 """
 
 
-@pytest.fixture
-def small(tmp_path):
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
     """Path of a protocol of few episodes of two environments."""
-    path = tmp_path / "small.toml"
+    path = tmp_path_factory.mktemp("protocol") / "small.toml"
     path.write_text(SMALL, encoding="utf-8")
     return str(path)
+
+
+def entered(path, *words):
+    """Run what is entered in a protocol."""
+    protocol, digest = read_protocol(path)
+    return run_protocol(protocol, digest, find_entries(protocol, words), Workers())
+
+
+@pytest.fixture(scope="module")
+def found(small):
+    """What comes out for an agent."""
+    return entered(small, "bptt-small")
 
 
 def test_published_protocols_are_frozen():
@@ -76,12 +87,10 @@ def test_filtergym_1_is_of_all_five_environments_and_of_scenarios_that_there_are
         assert [name for name, one in shipped[own.id].scenarios.items() if one.training] == [own.training]
 
 
-def test_the_number_is_what_the_formula_says(small):
+def test_the_number_is_what_the_formula_says(found):
     """Against costs of episodes that ``evaluate`` gives, one environment and episode after another."""
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
     logarithms, lost = [], []
-    for own in protocol.environments:
+    for own in found.protocol.environments:
         dataset = filtergym.evaluate(own.id, ["bptt-small", own.paper], None, 12, 3)
         costs = dataset["cost"].mean("time")
         logs = [math.log(costs.values[0, i] / costs.values[1, i]) for i in range(12)]
@@ -92,29 +101,21 @@ def test_the_number_is_what_the_formula_says(small):
     assert found.lost == sum(lost) / 2
     for one, logarithm in zip(found.environments, logarithms, strict=True):
         assert one.cost.value == pytest.approx(math.expm1(logarithm), rel=1e-12)
-    held = {
-        name: filtergym.tidy_records(
-            filtergym.evaluate(
-                "filtergym/ManeuveringTarget-v0", ["bptt-small", "imm-steady-state"], name, 6, 3
-            )
-        )
-        for name in ("atc", "glint")
-    }
-    costs = {
-        name: next(
-            r.value for r in records if r.metric == "geometric_cost_difference" and r.policy == "bptt-small"
-        )
-        for name, records in held.items()
-    }
+    costs = {}
+    for name in ("atc", "glint"):
+        dataset = filtergym.evaluate("ManeuveringTarget", ["bptt-small", "imm-steady-state"], name, 6, 3)
+        [costs[name]] = [
+            r.value
+            for r in filtergym.tidy_records(dataset)
+            if (r.metric, r.policy) == ("geometric_cost_difference", "bptt-small")
+        ]
     worst = max(costs, key=costs.get)
     assert found.environments[0].worst == (worst, pytest.approx(costs[worst], rel=1e-12))
     assert found.environments[1].worst is None
 
 
-def test_the_interval_covers_what_many_episodes_say(small):
+def test_the_interval_covers_what_many_episodes_say(found):
     """The interval of the number is that of a bootstrap of whole episodes, all environments at once."""
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["bptt-small"]), Workers())
     values = np.stack([one.logarithms for one in found.environments])
     generator = np.random.default_rng(1)
     naive = [np.expm1(values[:, generator.integers(0, 12, 12)].mean()) for _ in range(20_000)]
@@ -124,16 +125,13 @@ def test_the_interval_covers_what_many_episodes_say(small):
 
 
 def test_the_papers_algorithms_are_zero(small):
-    protocol, digest = read_protocol(small)
-    entries = find_entries(protocol, ["imm-steady-state", "UavAutopilot=kalman"])
-    found = run_protocol(protocol, digest, entries, Workers())
+    found = entered(small, "imm-steady-state", "UavAutopilot=kalman")
     assert found.cost.value == found.cost.low == found.cost.high == 0.0
     assert found.title == "imm-steady-state, kalman"
 
 
 def test_no_number_without_all_environments(small):
-    protocol, digest = read_protocol(small)
-    found = run_protocol(protocol, digest, find_entries(protocol, ["UavAutopilot=mehra"]), Workers())
+    found = entered(small, "UavAutopilot=mehra")
     assert found.cost is found.lost is found.time is None
     assert quoted_row(found)[-1].startswith("| mehra | - | - | 1 of 2 |")
 
@@ -208,22 +206,14 @@ def test_the_row_does_not_depend_on_the_processor(small, tmp_path, command):
 
 def test_what_the_command_prints_and_refuses(small, tmp_path, command):
     records = tmp_path / "records.json"
-    code, shown, errors = command(
-        "evaluate",
-        "--protocol",
-        small,
-        "--policy",
-        "adaptive",
-        "--policy",
-        "UavAutopilot=mehra",
-        "--json",
-        str(records),
-    )
+    words = ("--policy", "adaptive", "--policy", "UavAutopilot=mehra", "--json", records)
+    code, shown, errors = command("evaluate", "--protocol", small, *words)
     assert code == 0, errors
     _, digest = read_protocol(small)
     assert "| adaptive, mehra | " in shown
     assert f"protocol SHA-256 {digest}" in shown
-    assert "@misc{small," in shown
+    assert re.search(r"@misc\{small,\n(  \w+ = \{[^\n]+\},\n)+\}", shown)
+    assert "year = {2026}" in shown
     assert records.stat().st_size > 1000
     for words in (["--seed", "1"], ["--scenario", "glint"], ["--out", "x"], ["--set", "horizon=5"]):
         code, _, errors = command("evaluate", "--protocol", small, "--policy", "adaptive", *words)
@@ -234,12 +224,3 @@ def test_what_the_command_prints_and_refuses(small, tmp_path, command):
     )
     assert code == 2
     assert "leave out the environment" in errors
-
-
-def test_a_bib_entry_is_one(small):
-    protocol, digest = read_protocol(small)
-    entry = bib_entry(protocols.ProtocolResult(protocol, digest, [], []), "0.1.0")
-    assert re.fullmatch(r"@misc\{small,\n(  \w+ = \{[^\n]+\},\n)+\}", entry)
-    assert entry.count("{") == entry.count("}")
-    assert tomllib.loads(SMALL)["year"] == 2026
-    assert "year = {2026}" in entry

@@ -180,7 +180,7 @@ def test_readings_of_a_level_aircraft():
     )
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_jacobian_by_finite_differences(seed):
     rng = numpy.random.default_rng(seed)
     state, ins = random_states(rng, 1), rng.uniform(-1.4, 1.4, (3, 1))
@@ -235,7 +235,7 @@ def lane_by_lane(form, state, P, residual, H):
     return mean, covariance
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_three_forms_of_the_update_are_one(seed):
     state, P, residual, rows = random_update(seed)
     H = dense(rows, state)
@@ -339,34 +339,3 @@ def test_robust_update_without_thresholds_is_the_plain_one():
     robust = extended_kalman.update_one_by_one(*arguments, [math.inf] * 14)
     for one, other in zip(plain[:3], robust[:3], strict=True):
         assert (one == other).all()
-
-
-def test_fewer_than_four_satellites_still_correct_what_they_see():
-    state, P, residual, rows = random_update(1)
-    two = numpy.array([1.0, 1.0, 0.0, 0.0] * 2 + [1.0] * 6)
-    result = extended_kalman.update_one_by_one(state, P, residual, rows, SENSOR_SIGMA**2, two)
-    before, after = numpy.trace(P[:3, :3]), numpy.trace(result.covariance[:3, :3])
-    assert (after < before).all()
-    H = dense(rows, state)
-    lost = H[2]
-    variance = numpy.einsum("i...,ij...,j...->...", lost, result.covariance, lost)
-    full = extended_kalman.update_one_by_one(state, P, residual, rows, SENSOR_SIGMA**2, numpy.ones(14))
-    assert (variance > numpy.einsum("i...,ij...,j...->...", lost, full.covariance, lost)).all()
-
-
-def test_torch_gives_what_numpy_gives(torch):
-    state, P, residual, _ = random_update(2)
-    ins = numpy.full((3, 1, 1), 0.3)
-    position, velocity = satellites.local_orbits(SLOTS, numpy.zeros(1), *SITE)
-    arguments = (state, position[..., None], velocity[..., None], ins)
-
-    def both(kind):
-        expected, rows = gnss_ins.observe(*(kind(a) for a in arguments), 9.81)
-        H = dense(rows, kind(state))
-        scalar = extended_kalman.update_one_by_one(
-            kind(state), kind(P), kind(residual), rows, [float(s) ** 2 for s in SENSOR_SIGMA], [1.0] * 14
-        )
-        return [numpy.asarray(a) for a in (expected, H, *scalar[:3])]
-
-    for a, b in zip(both(numpy.asarray), both(torch.asarray), strict=True):
-        numpy.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * abs(a).max())

@@ -26,8 +26,8 @@ SEED = 7
 DECISIONS = 30
 FEWER = 10
 """Decisions that are compared to within rounding: what that may do takes seconds to ask. Other controls than the first
-one go on in the same world and are compared no further, nor is NumPy, whose whole episodes are those of compiled code
-by tests of their own; under other controls so are the steps of compiled code, which take a second to trace."""
+one go on in the same world and are compared no further, nor is NumPy; the steps of compiled code under other controls,
+which take a second to trace, are those of NumPy by tests of their own."""
 LATER = float(np.finfo(np.float32).eps)
 """Of a number or of one, what later decisions may differ by: agents see no finer."""
 

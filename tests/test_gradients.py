@@ -120,37 +120,14 @@ def random_policy(env, dtype, network="recurrent"):
 @pytest.mark.parametrize(
     ("name", "control", "keywords", "largest", "network"),
     [
-        ("ManeuveringTarget", "gain", {}, None, "recurrent"),
-        ("ManeuveringTarget", "gain", {}, 0.01, "recurrent"),
         ("ManeuveringTarget", "gain", {}, 0.01, "feedforward"),
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "linear"),
-        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None, "recurrent"),
-        pytest.param("ManeuveringTarget", "hypotheses", {}, None, "recurrent", marks=pytest.mark.slow),
         ("ManeuveringTarget", "kalman-net", {}, 0.01, "recurrent"),
         ("ManeuveringTarget", "student", {}, None, "recurrent"),
-        ("LooselyCoupledNavigation", "kalman-net", {"decision_interval": 2}, None, "recurrent"),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01, "recurrent"),
         ("UavAutopilot", "gain", {}, None, "recurrent"),
-        ("UavAutopilot", "kalman-net", {}, None, "recurrent"),
         ("RadarEsmTracking", "evidence", {}, 0.01, "recurrent"),
-        pytest.param(
-            "LooselyCoupledNavigation",
-            "hypotheses",
-            {"decision_interval": 1},
-            None,
-            "recurrent",
-            marks=pytest.mark.slow,
-        ),
-        ("RadarEsmTracking", "kalman-net", {}, None, "recurrent"),
-        # Their gradients take longest to compile; a decision under `evidence` is ten measurements.
-        pytest.param(
-            "TightlyCoupledNavigation",
-            "kalman-net",
-            {"max_episode_steps": 4, "decision_interval": 1},
-            None,
-            "recurrent",
-            marks=pytest.mark.slow,
-        ),
+        # Its gradient takes longest to compile; a decision is ten measurements.
         pytest.param(
             "TightlyCoupledNavigation",
             "evidence",

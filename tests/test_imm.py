@@ -1,4 +1,4 @@
-"""The interacting multiple model against golden numbers, naive loops and filterpy."""
+"""The interacting multiple model against golden numbers and naive loops."""
 
 import numpy as np
 import pytest
@@ -67,38 +67,6 @@ def test_golden_example_with_asymmetric_transition():
         *bank, _ = cycle(*bank, GOLDEN_TRANSITION, F, Qs, H, R, np.array([[z]]))
     assert bank[2][0, 0] == pytest.approx(0.670469141704, abs=1e-12)
     np.testing.assert_allclose(imm.combine(*bank)[0][:, 0], [5.9803866254, 2.15776662366], rtol=0, atol=1e-10)
-
-
-def filterpy_imm(transition):
-    filterpy = pytest.importorskip("filterpy.kalman")
-    F, Qs, H, R = golden_models()
-    mean, covariance, probabilities = golden_start()
-    filters = []
-    for j, Q in enumerate(Qs):
-        f = filterpy.KalmanFilter(dim_x=2, dim_z=1)
-        f.F, f.Q, f.H, f.R = F, Q, H, R
-        f.x, f.P = mean[:, j].copy(), covariance[:, :, j, 0].copy()
-        filters.append(f)
-    return filterpy.IMMEstimator(filters, probabilities[:, 0], transition)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_agrees_with_filterpy_on_every_step(seed):
-    rng = np.random.default_rng(seed)
-    transition = rng.dirichlet(np.ones(2), size=2)
-    peer = filterpy_imm(transition)
-    F, Qs, H, R = golden_models()
-    bank = golden_start()
-    for k in range(60):
-        z = k + 0.05 * k**2 * (k > 30) + rng.normal()
-        peer.predict()
-        peer.update(np.array([[z]]))
-        *bank, _ = cycle(*bank, transition, F, Qs, H, R, np.array([[z]]))
-        mean, covariance = imm.combine(*bank)
-        # An IMM amplifies rounding, and filterpy inverts S: eleven digits remain after 60 steps.
-        np.testing.assert_allclose(bank[2][:, 0], peer.mu, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(mean[:, 0], np.ravel(peer.x), rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(covariance[:, :, 0], peer.P, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

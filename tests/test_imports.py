@@ -1,6 +1,8 @@
 """Imports run one way, a file knows only its own room and those before it; and slow libraries wait until needed."""
 
 import ast
+import functools
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -35,33 +37,29 @@ PAPERS = {path.stem for path in (ROOT / "papers").iterdir()}
 PAGES = {path.stem for path in (ROOT / "docs" / "make").glob("*.py")}
 
 
-def imported_modules(file: Path, types: bool = True) -> Iterator[list[str]]:
-    """Everything that a file imports, part by part; what only type checkers import where ``types``."""
+@functools.cache
+def imports_of(file: Path) -> list[tuple[list[str], bool]]:
+    """Everything that a file imports, part by part, and whether only type checkers import it."""
     package = ["filtergym", *(part for part in file.parent.parts if part != "filtergym")]
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    for_types = {
-        inside
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-        for inside in ast.walk(node)
-    }
-    for node in ast.walk(tree):
-        if node in for_types and not types:
-            continue
+    found: list[tuple[list[str], bool]] = []
+    waiting: list[tuple[ast.AST, bool]] = [(ast.parse((ROOT / file).read_text(encoding="utf-8")), False)]
+    while waiting:
+        node, for_types = waiting.pop()
+        for_types = for_types or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) + 1 - node.level] if node.level else []
             module = [*base, *(node.module or "").split(".")] if node.module else base
-            names = [[*module, alias.name] for alias in node.names]
+            found += [([*module, alias.name], for_types) for alias in node.names]
         elif isinstance(node, ast.Import):
-            names = [alias.name.split(".") for alias in node.names]
-        else:
-            continue
-        yield from names
+            found += [(alias.name.split("."), for_types) for alias in node.names]
+        elif isinstance(node, ast.stmt | ast.Module | ast.ExceptHandler):
+            waiting += [(inside, for_types) for inside in ast.iter_child_nodes(node)]
+    return found
 
 
 def imported_rooms(file: Path) -> Iterator[str]:
     """Names of the rooms that a file imports anything from; the package itself is the front room."""
-    for first, *rest in imported_modules(file):
+    for (first, *rest), _ in imports_of(file):
         if first in PAGES:
             yield "docs/make"
         elif first == "filtergym":
@@ -91,23 +89,24 @@ def test_an_inner_room_knows_only_those_before_it(room: str) -> None:
         for name in inner
         for file in FILES
         if file.is_relative_to(f"{room}/{name}")
-        for module in imported_modules(file, types=False)
-        if module[: len(package)] == package and len(module) > len(package)
+        for module, for_types in imports_of(file)
+        if not for_types and module[: len(package)] == package and len(module) > len(package)
         if (other := module[len(package)]) != name
         and (other in environments or inner.index(other) > inner.index(name))
     }
     assert not wrong
 
 
-@pytest.mark.parametrize("room", INNER_ROOMS)
-def test_every_inner_room_is_small_and_says_what_it_is(room: str) -> None:
-    assert {path.name for path in (ROOT / room).iterdir() if path.suffix == ".py"} == {"__init__.py"}
-    for inner in INNER_ROOMS[room]:
-        files = {path.name for path in (ROOT / room / inner).glob("*.py")}
-        assert len(files) <= 16 or inner in folders().values(), (
-            f"{room}/{inner} holds more files than one looks through"
-        )
-        assert ast.get_docstring(ast.parse((ROOT / room / inner / "__init__.py").read_text(encoding="utf-8")))
+def test_every_inner_room_is_small_and_says_what_it_is() -> None:
+    for room, inner in INNER_ROOMS.items():
+        assert {path.name for path in (ROOT / room).glob("*.py")} == {"__init__.py"}
+        for name in inner:
+            files = {path.name for path in (ROOT / room / name).glob("*.py")}
+            assert len(files) <= 16 or name in folders().values(), (
+                f"{room}/{name}: more than one looks through"
+            )
+            words = (ROOT / room / name / "__init__.py").read_text(encoding="utf-8")
+            assert ast.get_docstring(ast.parse(words))
 
 
 def test_the_check_sees_every_kind_of_import() -> None:
@@ -128,13 +127,11 @@ def test_the_check_sees_every_kind_of_import() -> None:
 def test_every_module_of_mathematics_is_imported_by_a_test() -> None:
     modules = {path.stem for path in (ROOT / "filters").glob("*.py")} - {"__init__"}
     package = "filtergym.filters"
+    imported = re.compile(rf"^from {package}(?:\.(\w+))? import (\(.*?\)|.*?$)", re.M | re.S)
     tested = set()
     for file in (ROOT / "tests").glob("test_*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module == package:
-                tested |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package}."):
-                tested.add((node.module or "").removeprefix(f"{package}."))
+        for module, names in imported.findall(file.read_text(encoding="utf-8")):
+            tested |= {module} if module else {*re.findall(r"\w+", names)}
     assert modules - tested == set(), "each needs a test with a naive oracle"
 
 
@@ -166,15 +163,21 @@ def test_the_package_alone_brings_gymnasium_and_no_environment() -> None:
     assert imported_by("import filtergym") == set()
 
 
-@pytest.mark.parametrize("arguments", [("--help",), ("--version",)])
-def test_the_command_line_alone_brings_what_it_prints_with(arguments: tuple[str, ...]) -> None:
-    assert imported_by(COMMAND, *arguments) == {"typer", "rich"}
+def test_the_command_line_alone_brings_what_it_prints_with() -> None:
+    assert imported_by(COMMAND, "--help") == {"typer", "rich"}
 
 
 def test_listing_brings_no_library_that_computes_or_draws() -> None:
     brought = imported_by(COMMAND, "list")
     assert brought >= TASKS.keys()
     assert brought - TASKS.keys() <= {"typer", "rich", "llvmlite"}
+
+
+def test_completion_brings_no_library_that_learns_or_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = f"filtergym evaluate {next(iter(TASKS.values()))} --policy p"
+    for name, value in (("_FILTERGYM_COMPLETE", "complete_bash"), ("COMP_CWORD", "4"), ("COMP_WORDS", words)):
+        monkeypatch.setenv(name, value)
+    assert not imported_by(COMMAND) & {"torch", "stable_baselines3", "matplotlib", "plotly"}
 
 
 def test_an_evaluation_brings_one_environment_and_draws_nothing_that_nobody_keeps() -> None:
@@ -185,12 +188,15 @@ def test_an_evaluation_brings_one_environment_and_draws_nothing_that_nobody_keep
 
 
 def test_an_environment_brings_itself_alone() -> None:
+    """One after the other in one process: each adds its own task, and no library."""
+    steps = "import sys, filtergym, gymnasium\n"
     for task, id in TASKS.items():
-        steps = (
-            f"import filtergym, gymnasium\nenv = gymnasium.make({id!r})\nenv.reset(seed=0)\n"
-            "env.step(env.action_space.sample())"
+        steps += (
+            f"assert {task!r} not in sys.modules\nenv = gymnasium.make({id!r})\nenv.reset(seed=0)\n"
+            f"env.step(env.action_space.sample())\nassert {task!r} in sys.modules\n"
         )
-        assert imported_by(steps) - {"llvmlite", "scipy"} == {task}  # scipy where its constants take it
+    brought = imported_by(steps)
+    assert brought - {"llvmlite", "scipy"} == TASKS.keys()  # scipy where constants of one take it
 
 
 def test_the_folders_of_baselines_are_those_of_environments() -> None:

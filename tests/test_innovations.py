@@ -10,7 +10,6 @@ import xarray
 from filtergym.evaluation.statistics.predictions import Predictions
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.reports.tables.recording_tables import recording_tables
 
 CASES = {
     "filtergym/ManeuveringTarget-v0": ("imm", "missed-detections", ["position"], ["m"]),
@@ -73,16 +72,6 @@ def test_records_say_how_large_and_how_white_they_are(case):
         assert records["innovation_correlation", group].value == pytest.approx(
             products[0] / products[1], rel=1e-9
         )
-
-
-def test_the_terminal_shows_them_in_eighty_columns(case):
-    _, _, groups, units, dataset = case
-    for width in (80, 200):
-        tables = recording_tables(tidy_records(dataset), {}, False, width)
-        titles = [str(column.header) for table in tables for column in table.columns]
-        for group, unit in zip(groups, units, strict=True):
-            assert f"error of prediction,\n{group}, {unit}" in titles
-        assert any(title.startswith("correlation") for title in titles)
 
 
 def test_without_tracks_or_for_a_smoother_nothing_is_said():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from filtergym.filters import kalman
-from scipy.linalg import solve_discrete_are
 from scipy.stats import multivariate_normal
 
 
@@ -62,37 +61,6 @@ def test_matrices_shared_by_the_batch_mean_the_same_for_everyone():
     updated = kalman.update(*predicted, z, shared["H"], shared["R"])
     for one, other in zip(updated, kalman.update(*predicted, z, wide["H"], wide["R"]), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_long_run_settles_at_the_riccati_solution(seed):
-    s = system(seed, 4, 2, 1)
-    F, Q, H, R = (s[k][..., 0] for k in "FQHR")
-    P = 10.0 * np.eye(4)[..., None]
-    for _ in range(500):
-        _, prior = kalman.predict(np.zeros((4, 1)), P, F, Q)
-        P = kalman.update(np.zeros((4, 1)), prior, np.zeros((2, 1)), H, R).covariance
-        assert abs(P[..., 0] - P[..., 0].T).max() < 1e-9 * abs(P).max()
-        assert np.linalg.eigvalsh(P[..., 0]).min() > 0
-    np.testing.assert_allclose(prior[..., 0], solve_discrete_are(F.T, H.T, Q, R), rtol=1e-7)
-
-
-def test_consistent_filter_has_chi_square_innovations_and_errors():
-    rng = np.random.default_rng(0)
-    runs, T = 4000, 2.0
-    F, Q = map(np.array, kalman.white_acceleration(T, 0.5))
-    H, R = np.array([[1.0, 0.0]]), np.array([[4.0]])
-    truth = rng.normal(size=(2, runs))
-    mean, P = np.zeros((2, runs)), np.repeat(np.eye(2)[..., None], runs, axis=2)
-    for _ in range(10):
-        truth = F @ truth + np.array([[T**2 / 2], [T]]) * 0.5 * rng.normal(size=runs)
-        z = truth[:1] + 2.0 * rng.normal(size=runs)
-        result = kalman.update(*kalman.predict(mean, P, F, Q), z, H, R)
-        mean, P = result.mean, result.covariance
-        assert abs(result.squared_distance.mean() - 1.0) < 4 * np.sqrt(2 / runs)
-    error = mean - truth
-    nees = np.einsum("ib,ib->b", error, np.linalg.solve(np.moveaxis(P, -1, 0), error.T[..., None])[..., 0].T)
-    assert abs(nees.mean() - 2.0) < 4 * np.sqrt(4 / runs)
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3])

@@ -1,7 +1,5 @@
 """Learned estimators: the filters of kalman-net against matrices written out, their training, their files."""
 
-import json
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -16,7 +14,7 @@ from filtergym.envs.radar_esm_tracking import kalman_net as fusion
 from filtergym.envs.tightly_coupled_navigation import kalman_net as satellites
 from filtergym.envs.uav_autopilot import kalman_net as aircraft
 from filtergym.evaluation.competitors.kinds import kind_of
-from filtergym.filters import coordinated_turn, gnss_ins, kalman, loosely_coupled, packed_covariance
+from filtergym.filters import coordinated_turn, gnss_ins, loosely_coupled, packed_covariance
 from models import Asked, make_model
 
 import filtergym
@@ -67,32 +65,6 @@ def episodes(id, count, steps, name="kalman-net", **keywords):
     return model, initial, found
 
 
-def test_who_has_one():
-    assert HAVING == [FUSION, RADAR, ESM, SATELLITES, AIRCRAFT]
-
-
-def test_of_a_radar_zero_answers_are_a_kalman_filter():
-    model, initial, measurements = episodes(RADAR, 8, 60, undisturbed=0.0)
-    assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
-    estimator = Asked(EstimatorMaker(NAME, network)(model.task))
-    memory = estimator.start(initial, 8)
-    H = np.eye(2, 4)
-    mean, P = [initial.mean[:, i] for i in range(8)], [initial.covariance[:, :, i] for i in range(8)]
-    for measurement in measurements:
-        said = estimator.update(measurement, memory)
-        memory = said[2]
-        for i in range(8):
-            F, Q = (np.array(part) for part in kalman.white_acceleration(measurement.interval[i], 1.0, 2))
-            mean[i], P[i] = F @ mean[i], F @ P[i] @ F.T + Q
-            if measurement.available[i]:
-                K = P[i] @ H.T @ np.linalg.inv(H @ P[i] @ H.T + np.diag(measurement.variance[:, i]))
-                mean[i] = mean[i] + K @ (measurement.position[:, i] - H @ mean[i])
-                P[i] = P[i] - K @ H @ P[i]
-    # The frame is a rotation to 1e-10: its direction is that of a speed larger by a rounding.
-    np.testing.assert_allclose(said[0], np.stack(mean, axis=1), rtol=1e-9)
-    np.testing.assert_allclose(said[1], np.stack(P, axis=2), rtol=1e-8, atol=1e-6)
-
-
 def test_of_an_ins_zero_answers_are_the_augmented_filter():
     competitors = {"augmented": "augmented", "net": EstimatorMaker(NAME, network)}
     dataset = filtergym.evaluate(FUSION, competitors, episodes=16, horizon=300)
@@ -101,11 +73,10 @@ def test_of_an_ins_zero_answers_are_the_augmented_filter():
         np.testing.assert_allclose(net, augmented, rtol=0.0, atol=1e-11)
 
 
-@pytest.mark.parametrize("plant", ["U", "P"])
-def test_of_an_aircraft_zero_answers_are_the_papers_filter(plant):
+def test_of_an_aircraft_zero_answers_are_the_papers_filter():
     """In a closed loop: what the autopilot is told is the same, too."""
     competitors = {"kalman": "kalman", "net": EstimatorMaker(NAME, network)}
-    dataset = filtergym.evaluate(AIRCRAFT, competitors, episodes=8, horizon=300, plant=plant)
+    dataset = filtergym.evaluate(AIRCRAFT, competitors, episodes=4, horizon=150)
     for name in ("error", "nees", "control_signal"):
         paper, net = dataset[name].values
         np.testing.assert_allclose(net, paper, rtol=0.0, atol=1e-10)
@@ -114,7 +85,7 @@ def test_of_an_aircraft_zero_answers_are_the_papers_filter(plant):
 @pytest.mark.parametrize("plant", ["U", "P"])
 def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
-    model, initial, measurements = episodes(AIRCRAFT, 16, 60, plant=plant)
+    model, initial, measurements = episodes(AIRCRAFT, 8, 60, plant=plant)
     design, p, task = model.task.design, model.task.parameters, model.task
     assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
     F, B, H = design.model.F, design.model.B[:, 0], design.H
@@ -125,7 +96,7 @@ def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
     state = bank.start(initial)
     for measurement in measurements:
         before, state = state, bank.predict(state, measurement)
-        action = rng.uniform(-1.2, 1.2, (2 * (L + m), 16))
+        action = rng.uniform(-1.2, 1.2, (2 * (L + m), 8))
         P_before, M_before = bank.covariance(before), packed_covariance.unpack(before.gain_covariance, len(F))
         state = bank.act(state, measurement, action)
         for i, a in enumerate(np.clip(action, -1.0, 1.0).T):
@@ -150,9 +121,8 @@ def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
             np.testing.assert_allclose(of_gain, rest @ M, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("class_change", [0.0, 0.02])
-def test_of_radar_and_esm_zero_answers_are_the_papers_algorithm(class_change):
-    stay = np.eye(3) * (1.0 - 1.5 * class_change) + 0.5 * class_change
+def test_of_radar_and_esm_zero_answers_are_the_papers_algorithm():
+    stay = np.eye(3) * (1.0 - 1.5 * 0.02) + 0.5 * 0.02
     competitors = {"paper": "quasi-optimal", "net": EstimatorMaker(NAME, network)}
     keywords = {"class_transition": tuple(map(tuple, stay.tolist()))}
     dataset = filtergym.evaluate(ESM, competitors, "class-change", episodes=16, **keywords)
@@ -216,7 +186,7 @@ def test_of_radar_and_esm_any_answer_is_what_the_description_says():
 def test_of_satellites_zero_answers_are_the_third_hypothesis_of_the_paper():
     """Without apertures: the bank's tracking loops expect what all three hypotheses predict."""
     competitors = {"singer": "singer", "net": EstimatorMaker(NAME, network)}
-    dataset = filtergym.evaluate(SATELLITES, competitors, episodes=8, aperture=False, **SHORT[SATELLITES])
+    dataset = filtergym.evaluate(SATELLITES, competitors, episodes=4, aperture=False, **SHORT[SATELLITES])
     singer, net = dataset["error"].values
     np.testing.assert_allclose(net, singer, rtol=0.0, atol=1e-9)
     singer, net = dataset["nees"].values
@@ -304,11 +274,11 @@ def test_covariance_of_the_augmented_filter_under_any_gain_is_josephs():
 
 
 @pytest.mark.parametrize(("id", "name"), TRAINED)
-@pytest.mark.parametrize("answer", [-0.999, 0.999, "random"])
+@pytest.mark.parametrize("answer", [0.999, "random"])
 def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, name, answer):
     """An evaluation refuses what is not finite, symmetric and positive definite."""
     maker = EstimatorMaker(name, lambda model: network(model, answer))
-    cost = filtergym.evaluate(id, {"net": maker}, episodes=16, **SHORT.get(id, {}))["cost"]
+    cost = filtergym.evaluate(id, {"net": maker}, episodes=8, **SHORT.get(id, {}))["cost"]
     # The gains of a student are its network's, and nothing keeps those that nobody has trained from losing the track.
     assert float(cost.max()) < 1e6 or name == "student"
     assert np.isfinite(cost).all()
@@ -337,58 +307,21 @@ def test_the_estimator_is_the_policy_in_its_bank(id, name):
                 np.testing.assert_array_equal(values, told[name])
 
 
-@pytest.mark.parametrize("id", [FUSION, ESM, AIRCRAFT])
-def test_an_evaluation_keeps_how_well_a_network_inside_a_filter_predicted(id):
-    """Log-likelihood and normalised innovation squared of every measurement that was received."""
-    found = filtergym.evaluate(id, {"net": EstimatorMaker(NAME, network)}, episodes=16, **SHORT.get(id, {}))
-    told = found[["log_likelihood", "nis", "nis_degrees"]].to_array().values
-    received = found["nis_degrees"].values > 0.0
-    assert received.any()
-    assert np.isfinite(told[:, received]).all()
-
-
-@pytest.fixture
-def stored(tmp_path):
+def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
     from filtergym.agents.training_run import RunOptions, new_run
 
-    model = make_model(RADAR, NAME)
-    path = tmp_path / "net.safetensors"
-    write_arrays(path, network(model, 0.3).arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
-    return path
-
-
-def test_a_file_is_an_estimator(stored, command):
     pytest.importorskip("stable_baselines3")
-    assert kind_of(load_policy(problem_of(RADAR).task, stored)) == "estimator"
-    code, out, _ = command("evaluate", RADAR, "--policy", stored, "--policy", "imm", "--episodes", 2)
+    path = tmp_path / "net.safetensors"
+    arrays = network(make_model(RADAR, NAME), 0.3).arrays
+    write_arrays(path, arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
+    assert kind_of(load_policy(problem_of(RADAR).task, path)) == "estimator"
+    code, out, _ = command("evaluate", RADAR, "--policy", path, "--policy", "imm", "--episodes", 2)
     assert code == 0
-    assert [line for line in out.splitlines() if line.startswith(str(stored)[:4])]
-
-
-def test_a_file_is_refused_elsewhere(stored):
+    assert [line for line in out.splitlines() if line.startswith(str(path)[:4])]
     with pytest.raises(ValueError, match=f"was trained on '{RADAR}', not on {FUSION}"):
-        filtergym.evaluate(FUSION, [str(stored)], episodes=1)
+        filtergym.evaluate(FUSION, [str(path)], episodes=1)
     with pytest.raises(ValueError, match="does not act: of kind estimator"):
-        filtergym.make_policy(RADAR, str(stored))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"interface": "1"}, r"its interface .1., now 2\): train it again"),
-        ({"fields": json.dumps(["innovation_along"])}, "is not a learned policy of filtergym"),
-        ({"control": "gain"}, "was trained on other fields"),
-    ],
-)
-def test_a_file_that_does_not_fit(stored, change, message):
-    from safetensors import safe_open
-    from safetensors.numpy import load_file, save_file
-
-    with safe_open(stored, "numpy") as file:
-        header = file.metadata()
-    save_file(load_file(stored), stored, header | change)
-    with pytest.raises(ValueError, match=message):
-        filtergym.evaluate(RADAR, [str(stored)], episodes=1)
+        filtergym.make_policy(RADAR, str(path))
 
 
 def test_training_of_an_environment_without_one(command, tmp_path, monkeypatch):

@@ -1,8 +1,5 @@
 """The engine's noise: every measurement takes its own row of its own episode, whoever else flies or starts."""
 
-import copy
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,13 +7,11 @@ from contract import BACKENDS, Subject, assert_properties
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import episode_noise
-from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.compiled import share_world
-from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
+from filtergym.envs.engine.episode_noise import identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import OWN_PAY, reference
-from filtergym.evaluation.running.rollout import start_lanes
-from models import make_model
+from models import KINDS, make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -36,9 +31,8 @@ def either_way(request, monkeypatch):
     if request.param:
         pytest.importorskip("llvmlite")
     monkeypatch.setattr(episode_noise, "AVAILABLE", request.param)
-    monkeypatch.setattr(
-        episode_noise, "AHEAD", 16 * 7
-    )  # lanes restart in the middle of a block, and at its end
+    # Lanes restart in the middle of a block, and at its end.
+    monkeypatch.setattr(episode_noise, "AHEAD", 16 * 7)
 
 
 def test_every_measurement_takes_its_own_row(monkeypatch, either_way):
@@ -85,22 +79,6 @@ def test_every_measurement_takes_its_own_row(monkeypatch, either_way):
         np.testing.assert_array_equal(row, then, err_msg="what was taken has been written over")
 
 
-def test_both_ways_give_the_same_bits():
-    pytest.importorskip("llvmlite")
-    task = make_model("filtergym/TightlyCoupledNavigation-v0", "gain", backend="numpy").task
-    found = []
-    for compiled in (True, False):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(episode_noise, "AVAILABLE", compiled)
-            noise = EpisodeNoise(task, 5)
-            rows = list(noise.begin(identities_of_seeds(range(5))))
-            for _ in range(4):
-                rows.append(noise.row)
-                noise.advance()
-        found.append(np.concatenate([row.ravel() for row in rows]))
-    np.testing.assert_array_equal(*found)
-
-
 def test_identities_of_seeds_are_those_of_environments_that_are_reset():
     seeds = [5, 0, 2**40]
     identities = identities_of_seeds(seeds)
@@ -113,12 +91,13 @@ def test_identities_of_seeds_are_those_of_environments_that_are_reset():
         identities[0, 0] = 1
 
 
+@pytest.mark.parametrize("env_id", KINDS)
 def test_lanes_on_every_backend(env_id):
     for backend in [one for one in BACKENDS if one != "torch"]:
         assert_properties(Subject(env_id, backend=backend), [restart_at_different_times_as_single_ones])
     if "compiled" in BACKENDS:
         # One of two in turn: for either, programs of both algorithms are traced.
-        kind = ("relative", "log-relative")[list(catalogue()).index(env_id) % 2]
+        kind = ("relative", "log-relative")[KINDS.index(env_id) % 2]
         assert_runs_beside_as_lanes_of_its_own(Subject(env_id, backend="compiled"), kind)
 
 
@@ -196,36 +175,3 @@ def assert_runs_beside_as_lanes_of_its_own(subject, kind):
             np.testing.assert_array_equal(found[0], ours[0])
             np.testing.assert_array_equal(found[1], others[0])
         np.testing.assert_array_equal(lanes.observe(), own.observe())
-
-
-def test_copies_go_on_as_the_original(either_way):
-    for again in (copy.deepcopy, lambda noise: pickle.loads(pickle.dumps(noise))):
-        assert_goes_on_as_the_original(again)
-
-
-def assert_goes_on_as_the_original(again):
-    noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
-    for lane in range(3):
-        noise.seed(lane, np.random.default_rng(lane))
-    noise.begin(noise.draw_identities(range(3)))
-    noise.advance()
-    first, other, snapshot = noise.row, again(noise), noise.snapshot()
-    noise.advance()
-    other.advance()
-    np.testing.assert_array_equal(noise.row, other.row)
-    following, drawn = noise.row, noise.draw_identities([1])
-    np.testing.assert_array_equal(other.draw_identities([1]), drawn)
-    for _ in range(2):
-        noise.restore(snapshot)
-        noise.advance()
-        np.testing.assert_array_equal(noise.row, following)
-        np.testing.assert_array_equal(noise.draw_identities([1]), drawn)
-    assert (first != following).any()
-
-
-def test_lanes_that_were_started_by_seeds_equal_environments():
-    model = make_model(ID, backend="numpy")
-    lanes = start_lanes(model, [3, 8])
-    for lane, seed in enumerate((3, 8)):
-        env = gym.make(ID, backend="numpy", disable_env_checker=True)
-        np.testing.assert_array_equal(env.reset(seed=seed)[0], lanes.observe()[lane])

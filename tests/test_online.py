@@ -46,7 +46,7 @@ def test_the_same_measurements_give_the_same_bits(id, name, options, monkeypatch
     maker = find_competitor(problem, name)
     keywords = {"horizon": count, **getattr(maker, "task_keywords", {}), **options}
     kind = kind_of(maker)
-    control = control_of(maker, kind, None, problem.task, name)
+    control = control_of(maker, None, problem.task, name)
     model = make_model(problem.task, control, backend="auto", **keywords)
     flown = run_competitor(model, maker, kind, seeds, with_measurement)
     begun = []

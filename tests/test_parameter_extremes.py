@@ -160,7 +160,6 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
     ("environment", "parameters"),
     [
         ("UavAutopilot", {"actuator_disturbance": 0.0}),
-        ("UavAutopilot", {"gain_decades": 1e6}),
         ("UavAutopilot", {"lift_incidence": -1e6}),
         ("UavAutopilot", {"sensor_sigmas": (0.5, 1e-6, 0.5), "wide_band_scale": 1e6}),
         (
@@ -170,9 +169,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ),
         ("ManeuveringTarget", {"glint_factor": 1e6}),
         ("ManeuveringTarget", {"coloured_sigma": (0.0, 1e5)}),
-        ("ManeuveringTarget", {"bias": 1e5}),
         ("UavAutopilot", {"moment_rate": 1e6}),
-        ("UavAutopilot", {"sensor_bias": (0.0, 1e6)}),
         ("UavAutopilot", {"sensor_coloured": (0.0, 1e6)}),
         (
             "UavAutopilot",
@@ -187,8 +184,6 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
         ),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e5}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "coloured": 1e5}),
-        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "drift": 1e6}),
-        ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "fixed_drift": -1e6}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "drift_factor": (1e6, 1e6)}),
         ("LooselyCoupledNavigation", {"sampling_interval": 1e3, "receiver_factor": (1e-6, 1e-6)}),
         ("TightlyCoupledNavigation", {"strength": (0.0, 1e6)}),
@@ -204,40 +199,6 @@ def test_what_no_filter_can_answer_is_refused(environment, parameters):
     with pytest.raises(ValueError, match=r"must") as caught:
         make_model(environment, **parameters)
     assert caught.type is ValueError, "not one of NumPy or SciPy, which names no parameter"
-
-
-def deviations(one, other):
-    """Largest difference of means in standard deviations, of two runs."""
-    return max(
-        float(np.max(np.abs(x - y) / np.sqrt(np.einsum("iin->in", P))))
-        for (x, P), (y, _) in zip(one, other, strict=True)
-    )
-
-
-def flown(backend, initial_sigmas):
-    """Means and covariances of an aircraft whose elevator may be anywhere at the start, in closed loop."""
-    keywords = {"control": "mode", "scenario": "gust-front", "horizon": 60, "decision_interval": 1}
-    model = make_model(
-        "filtergym/UavAutopilot-v0", backend=backend, initial_sigmas=initial_sigmas, **keywords
-    )
-    lanes = Lanes(model, 3)
-    for lane in range(3):
-        lanes.seed(lane, np.random.default_rng(lane))
-    lanes.restart()
-    rng, found = np.random.default_rng(0), []
-    for step in range(DECISIONS):
-        for own, _ in lanes.decide(actions(model.action_space, rng, step)):
-            found.append((np.array(model.mean(own)), np.array(model.covariance(own))))
-    return found
-
-
-def test_backends_differ_by_what_the_last_digit_of_a_parameter_makes():
-    """Where the loop is ill-conditioned they differ by more than rounding: by no more than NumPy from itself."""
-    sigmas = (1.0, 1.0, 1.0, 1e6, 1.146)
-    own = flown("numpy", sigmas)
-    beside = flown("numpy", tuple(float(np.nextafter(sigma, np.inf)) for sigma in sigmas))
-    assert deviations(own, beside) > 1e-4
-    assert deviations(own, flown("compiled", sigmas)) < 10.0 * deviations(own, beside)
 
 
 @pytest.mark.parametrize(("control", "intensity"), [("mode", 0.0), ("weights", 1e-300)])

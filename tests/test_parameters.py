@@ -5,9 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from filtergym.envs.contract.parameters import TaskParameters, check_length, parameter, square_matrix
-from models import make_model
-
-from filtergym.commands.terminal import parse_settings
 
 
 @dataclass(frozen=True)
@@ -80,30 +77,3 @@ def test_sizes_that_depend_on_others():
         check_length("sigmas", (1.0, 2.0), 3)
     with pytest.raises(ValueError, match="transition must have 2 rows"):
         square_matrix("transition", ((1.0,),), 2)
-
-
-TARGET, NAVIGATION = "ManeuveringTarget", "TightlyCoupledNavigation"
-
-
-@pytest.mark.parametrize(
-    ("id", "setting", "message"),
-    [
-        (TARGET, "polar_measurements=false", "polar_measurements must be True or False, got 'false'"),
-        (NAVIGATION, "urban=true", "urban must be True or False, got 'true'"),
-        (NAVIGATION, "aperture=1", "aperture must be True or False, got 1"),
-        (
-            TARGET,
-            "maneuver_steps=[1.5,2.5]",
-            r"maneuver_steps\[0\] must be an integer of at least 1, got 1.5",
-        ),
-        (TARGET, "track=5", "track must be a sequence of rows, got 5"),
-        (TARGET, "legs=5", "legs must be a sequence of rows, got 5"),
-        (NAVIGATION, "satellites=2", "satellites must be a sequence of integers, got 2"),
-        (TARGET, "range_sigma='100'", "range_sigma must be a finite number above 0.0, got '100'"),
-        (TARGET, "range_sigma=wide", "range_sigma must be a finite number above 0.0, got 'wide'"),
-        (TARGET, "horizon='50'", "horizon must be an integer of at least 1, got '50'"),
-    ],
-)
-def test_types_are_checked_also_from_the_command_line(id, setting, message):
-    with pytest.raises(ValueError, match=message):
-        make_model(id, **parse_settings([setting]))

@@ -204,71 +204,6 @@ def assert_shows_what_python_says(driver):
     return shown
 
 
-@pytest.mark.slow
-@in_browser
-def test_the_pointer_is_the_target(driver):
-    from selenium.webdriver.common.action_chains import ActionChains
-
-    for name, value in (("period", 2), ("noise", 50), ("missed", 20)):
-        set_slider(driver, name, value)
-    map = driver.find_element("css selector", "#playground .map")
-    box = map.rect
-    moves = ActionChains(driver, duration=300)
-    for angle in np.linspace(0.0, 2.0 * np.pi, 12):
-        moves.move_to_element_with_offset(map, int(300 * np.cos(angle)), int(120 * np.sin(angle)))
-    moves.perform()
-    goal = WIDTH * (0.5 + 300 / box["width"]), 0.5 * WIDTH * box["height"] / box["width"]
-    wait(
-        driver, "const t = playground.target; return Math.hypot(t.x - t.pointer.x, t.y - t.pointer.y) < 1e-6"
-    )
-    wait(driver, "return playground.track.steps.length > 150")
-    target = driver.execute_script("return [playground.target.x, playground.target.y]")
-    np.testing.assert_allclose(target, goal, atol=2.0 * WIDTH / box["width"])  # a pixel is that large
-    shown = assert_shows_what_python_says(driver)
-    assert {step["sigma_x"] for step in shown} == {50}
-    np.testing.assert_allclose(np.diff([step["time"] for step in shown]), 2.0, rtol=1e-9)
-    assert 0.05 < np.mean([not step["seen"] for step in shown]) < 0.4
-    assert not (np.abs(errors_of(shown)) > 6.0).any()
-    set_slider(driver, "glint", 50)
-    wait(driver, "return playground.track.steps.length > 220")
-    assert (np.abs(errors_of(shown_steps(driver)[1])) > 6.0).sum() > 3
-
-
-def errors_of(steps):
-    """Errors of the plots in the deviations that they state, ``(plots, 2)``."""
-    seen = [step for step in steps if step["seen"]]
-    return np.array([[(step[a] - step[f"truth_{a}"]) / step[f"sigma_{a}"] for a in "xy"] for step in seen])
-
-
-@pytest.mark.slow
-@in_browser
-def test_keys_and_touch_steer_the_target(driver):
-    from selenium.webdriver.common.keys import Keys
-
-    map = driver.find_element("css selector", "#playground .map")
-    heading = "return [playground.target.heading, playground.target.turn]"
-    driver.execute_script("arguments[0].focus()", map)
-    driver.execute_cdp_cmd("Input.dispatchKeyEvent", {"type": "keyDown", "key": "ArrowRight"})
-    before = driver.execute_script(heading)[0]
-    wait(driver, f"return playground.target.heading > {before} + 20")
-    assert driver.execute_script(heading)[1] > 0.0
-    driver.execute_cdp_cmd("Input.dispatchKeyEvent", {"type": "keyUp", "key": "ArrowRight"})
-    map.send_keys(Keys.SPACE)
-    time = driver.execute_script("return playground.time")
-    assert driver.execute_script("return playground.paused")
-    driver.execute_async_script("setTimeout(arguments[0], 200)")
-    assert driver.execute_script("return playground.time") == time
-    box = map.rect
-    touch = {"x": box["x"] + 30, "y": box["y"] + 40}
-    driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [touch]})
-    pointer = driver.execute_script("return playground.target.pointer")
-    scale = WIDTH / box["width"]
-    assert pointer["x"] == pytest.approx(30 * scale, abs=2 * scale)
-    assert pointer["y"] == pytest.approx((box["height"] - 40) * scale, abs=2 * scale)
-    driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    assert driver.execute_script("return playground.target.pointer") is None
-
-
 DROP = """
 const held = new DataTransfer();
 held.items.add(new File([arguments[0]], 'mine.csv', {type: 'text/csv'}));
@@ -302,18 +237,6 @@ def test_a_table_is_run_as_python_runs_it(driver):
     ):
         driver.execute_script(DROP, broken)
         wait(driver, f"return {STATUS}.includes('{complaint}')")
-
-
-@pytest.mark.slow
-@in_browser
-def test_the_target_stays_on_the_map_however_slow_the_page_is(driver):
-    """At the border itself it would be held, and slide along it."""
-    shares = driver.execute_script(
-        "playground.advance(3000);"
-        "const truths = playground.track.steps.map((s) => s.truth_y / playground.target.height);"
-        "return [Math.min(...truths), Math.max(...truths)]"
-    )
-    assert 0.0 < shares[0] < shares[1] < 1.0
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Programs as competitors: what they are told, what becomes of their mistakes, and that nothing is left of them."""
 
-import ast
 import json
 import os
 import shutil
@@ -16,6 +15,7 @@ import pytest
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.task import Component, named_arrays
+from filtergym.evaluation.competitors import program_process
 from filtergym.evaluation.competitors.program_process import ENDED, LATE, WRONG, Limits, ProgramProcess
 from filtergym.evaluation.competitors.programs import (
     LIMITS,
@@ -25,12 +25,10 @@ from filtergym.evaluation.competitors.programs import (
     limit_programs,
     rows_of,
 )
-from filtergym.evaluation.running.parallel import Workers
 from filtergym.evaluation.running.rollout import measure_time, rollout, start_lanes
 from filtergym.evaluation.storage.dataset import FAULTS
 from models import make_model
 
-import filtergym
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -75,14 +73,17 @@ for k, line in enumerate(sys.stdin):
             print("debugging")
         if how == "twice":
             print(json.dumps(own))
-        if how == "flood":
-            while True:
-                print("x" * 10_000, end="")
         if how == "errors":
             print("e" * 1_000_000, file=sys.stderr)
         if how == "one track":
             own["mean"][0][0] = None
+        if how == "flood":
+            while True:
+                print("x" * 10_000, end="")
     tell(own)
+    if k == 3 and how == "afterwards":
+        time.sleep(0.1)
+        tell(own)
 """
 
 
@@ -109,6 +110,7 @@ def hold(tmp_path):
 def run(command, steps=4, N=8, **limits):
     """Ask a program about some measurements; returns means ``(steps, 2, N)``, and the estimator."""
     estimator = Program(command, Limits(**limits))(task_of())
+    estimator.last = steps
     initial, measurement = given(N)
     memory, means = estimator.start(initial, N), []
     for _ in range(steps):
@@ -164,13 +166,18 @@ def test_a_program_steers_the_tracking_loops_where_it_says_a_number(tmp_path):
         ("words", WRONG, 2, "its 'mean' is not 8 lists of 2 numbers"),
         ("prints", WRONG, 2, "it has answered with no object of JSON: 'debugging"),
         ("twice", WRONG, 3, "it has written more than an answer"),
+        ("afterwards", WRONG, 3, "it has written more than an answer"),
         ("flood", WRONG, 2, "it has answered with a line of more than"),
         ("no hello", WRONG, 0, "it has answered with no object of JSON: 'welcome"),
         ("no licence", ENDED, 0, "it has ended with exit status 1: RuntimeError: no licence"),
         pytest.param("memory", ENDED, 2, "exit status 1: MemoryError", marks=LINUX),
     ],
 )
-def test_a_mistake_loses_all_tracks_with_its_reason_from_there_on(how, fault, first, words, hold):
+def test_a_mistake_loses_all_tracks_with_its_reason_from_there_on(
+    how, fault, first, words, hold, monkeypatch
+):
+    if how == "hang":
+        monkeypatch.setattr(program_process, "END_SECONDS", 0.1)
     with pytest.warns(UserWarning, match=f"measurement {first + 1}: .*; 8 episodes are lost") as noted:
         means, estimator = run(hold(how), seconds=0.3 if how == "hang" else 10.0, memory=1000.0)
     [told] = [str(one.message) for one in noted if "program" in str(one.message)]
@@ -269,8 +276,9 @@ def adopted_zombie(pid):
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def test_nothing_is_left_of_a_process_that_hangs():
+def test_nothing_is_left_of_a_process_that_hangs(monkeypatch):
     """Nor of what it has begun, nor where Ctrl-C ends the wait for its answer."""
+    monkeypatch.setattr(program_process, "END_SECONDS", 0.1)
     process = ProgramProcess(["sh", "-c", "read question; sleep 100 & echo $!; sleep 100"], Limits())
     inner = int(process.exchange(b"?\n", None, 100))
     own = process._process.pid
@@ -307,7 +315,6 @@ def test_a_process_ends_with_its_rollout(hold):
 
 @LINUX
 def test_its_time_is_that_of_its_process(hold):
-    """A program that does nothing but wait takes next to none of the time that passes."""
     model = make_model(ID, horizon=4)
     found = measure_time(model, Program(hold()), "estimator", [0, 1])
     assert found.own
@@ -422,44 +429,3 @@ def test_the_filter_in_cpp_is_the_one_in_numpy(tmp_path, examples):
     ]
     subprocess.run([*words, "-o", tmp_path / "kalman"], check=True)
     agree(Program(str(tmp_path / "kalman")), examples("mine:Mine"))
-
-
-def test_the_client_is_short_and_needs_nothing():
-    text = (CLIENTS / "client.py").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 35
-    imported = [
-        alias.name
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    ]
-    assert set(imported) <= sys.stdlib_module_names
-
-
-@pytest.mark.slow
-def test_the_node_of_ros_is_typed(tmp_path):
-    api = pytest.importorskip("mypy.api")
-    words = [
-        "--ignore-missing-imports",
-        "--check-untyped-defs",
-        "--follow-imports=silent",
-        f"--cache-dir={tmp_path}",
-    ]
-    said, errors, code = api.run([*words, str(CLIENTS / "ros2_bridge.py")])
-    assert code == 0, said + errors
-
-
-@pytest.mark.slow
-def test_jobs_run_a_process_each_and_find_the_same(tmp_path):
-    """A script that imports what lies beside it, in processes that begin without their folder on the path."""
-    shutil.copy(CLIENTS / "client.py", tmp_path)
-    (tmp_path / "hold.py").write_text(
-        "from client import serve\n"
-        "serve(lambda hello, initial: lambda measurement: (initial['mean'], initial['covariance']))\n"
-    )
-    program = {"hold": Program(f"{sys.executable} {tmp_path / 'hold.py'}"), "imm": "imm"}
-    alone = filtergym.evaluate(ID, program, episodes=600, horizon=3)
-    with Workers(2) as workers:
-        shared = filtergym.evaluate(ID, program, episodes=600, horizon=3, workers=workers)
-    assert not np.nan_to_num(alone["lost"]).any()
-    assert shared.identical(alone)

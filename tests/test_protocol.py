@@ -49,16 +49,14 @@ def length(env):
 
 
 def test_every_environment(env_id):
-    assert_properties(Subject(env_id, backend="numpy"), PROPERTIES)
+    assert_properties(Subject(env_id, backend="numpy"), [says_how_long_each_scenario_is])
 
 
-def test_pictures_of_every_kind():
-    assert_properties([Subject(id) for id in KINDS], [draws_without_a_trace_and_copies_alike])
-
-
-def test_float32_on_every_backend(env_id):
+@pytest.mark.parametrize("id", KINDS)
+def test_every_kind(id):
+    assert_properties(Subject(id, backend="numpy"), PROPERTIES)
     for backend in BACKENDS:
-        assert_properties(Subject(env_id, backend=backend), [rounds_float64_to_float32])
+        assert_properties(Subject(id, backend=backend), [rounds_float64_to_float32])
 
 
 def refuses_keywords_as_a_client_expects_who_tries_them(subject):
@@ -89,7 +87,7 @@ def says_how_long_each_scenario_is(subject):
     for name, scenario in {None: task.scenarios[task.default_scenario], **task.scenarios}.items():
         parameters = task.Parameters(**scenario.parameters)
         expected = parameters.horizon // parameters.decision_interval
-        for make in (gym.make, make_three):
+        for make in (gym.make, make_three)[: 1 + (name is None)]:
             env = make(subject.id, scenario=name, backend="numpy")
             assert env.spec.max_episode_steps == expected, name
 
@@ -164,10 +162,10 @@ def draws_without_a_trace_and_copies_alike(subject):
 PROPERTIES = (
     refuses_keywords_as_a_client_expects_who_tries_them,
     says_in_its_spec_how_long_an_episode_is,
-    says_how_long_each_scenario_is,
     limits_only_whom_asks,
     is_aware_of_time,
     rounds_a_single_environment_as_a_vector,
+    draws_without_a_trace_and_copies_alike,
 )
 
 
@@ -179,14 +177,17 @@ def elsewhere():
         yield pool
 
 
-def test_episodes_go_on_in_another_process(env_id, short, elsewhere):
+@pytest.mark.parametrize("id", KINDS)
+def test_episodes_go_on_in_another_process(id, short, elsewhere):
     for make in (gym.make, make_three):
-        env = make(env_id, **short)
+        env = make(id, **short)
         env.reset(seed=3)
         actions = actions_for(env, 5)
         continued(env, actions[:2])
         there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
         assert_all_equal(continued(env, actions[2:]), there)
+        again = elsewhere.submit(make, env.spec if make is gym.make else id).result(timeout=120)
+        assert again.unwrapped.task.id == id
 
 
 # --- keywords
@@ -207,8 +208,7 @@ FLIGHT = Trajectory(
 )
 
 
-@pytest.mark.parametrize("velocity", [False, True])
-@pytest.mark.parametrize("make", [gym.make, make_three])
+@pytest.mark.parametrize(("make", "velocity"), [(gym.make, True), (make_three, False)])
 def test_a_trajectory_survives_json(make, velocity):
     moving = np.gradient(FLIGHT.position, FLIGHT.time, axis=0) if velocity else None
     flight = Trajectory(FLIGHT.time, FLIGHT.position, moving, "mine")
@@ -239,35 +239,23 @@ def test_the_path_of_a_file_is_a_scenario(tmp_path):
 # --- wrong arguments
 
 MAKING = {
-    "scenario=[]": ({"scenario": []}, "a scenario is a name, a Trajectory or the path.*got \\[\\].*paper"),
     "scenario list": ({"scenario": ["paper", "atc"]}, "a scenario is a name.*got \\['paper', 'atc'\\]"),
-    "scenario number": ({"scenario": 3}, "a scenario is a name.*got 3"),
-    "scenario empty": ({"scenario": ""}, "unknown scenario ''"),
     "scenario dictionary": ({"scenario": {"tme": [0, 1]}}, "a trajectory as a dictionary has time.*got 'tme'"),
     "scenario half": ({"scenario": {"time": [0, 1], "position": [[0, 0], [1]]}}, "scenario as a dictionary: "),
-    "scenario words": ({"scenario": {"time": "ab", "position": [[0, 0]]}}, "scenario as a dictionary: "),
     "control": ({"control": 0}, "unknown control 0: choose from evidence, gains, gain"),
-    "control list": ({"control": ["gain"]}, "unknown control .*did you mean 'gain'"),
-    "reward": ({"reward": 0}, "unknown reward 0"),
     "reward list": ({"reward": ["cost"]}, "unknown reward .*did you mean 'cost'"),
     "backend": ({"backend": 1}, "unknown backend 1"),
     "render_mode": ({"render_mode": "rgb"}, "unknown render_mode 'rgb'.*rgb_array"),
     "detailed_info": ({"detailed_info": "no"}, "detailed_info must be True or False, got 'no'"),
     "dtype": ({"dtype": "float16"}, "unknown dtype 'float16': did you mean 'float"),
     "dtype class": ({"dtype": np.float32}, "unknown dtype .*choose from float64, float32"),
-    "dtype none": ({"dtype": None}, "unknown dtype None: choose from float64, float32"),
     "task": ({"task": 5}, "an environment is named by its id.*got 5"),
 }  # fmt: skip
 MAKING_VECTORS = {
     "num_envs word": ({"num_envs": "2"}, "num_envs must be an integer of at least 1, got '2'"),
-    "num_envs fraction": ({"num_envs": 2.0}, "num_envs must be an integer of at least 1, got 2.0"),
-    "num_envs zero": ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"),
-    "num_envs boolean": ({"num_envs": True}, "num_envs must be an integer of at least 1, got True"),
     "threads": ({"threads": "2"}, "threads must be an integer of at least 1, got '2'"),
     "autoreset_mode": ({"autoreset_mode": "samestep"}, "unknown autoreset_mode 'samestep': did you mean 'SameStep'"),
-    "autoreset_mode number": ({"autoreset_mode": 1}, "unknown autoreset_mode 1: choose from NextStep"),
     "max_episode_steps": ({"max_episode_steps": 0}, "max_episode_steps must be an integer of at least 1, got 0"),
-    "max_episode_steps word": ({"max_episode_steps": "9"}, "max_episode_steps must be an integer of at least 1"),
     "device": ({"device": "cuda"}, "works on the CPU only, got device 'cuda'"),
     "render_mode human": ({"render_mode": "human"}, "a window for one episode: use gymnasium.make"),
 }  # fmt: skip
@@ -288,20 +276,15 @@ def test_wrong_arguments(face):
 
 RESETS = {
     "seed word": ({"seed": "1"}, "a seed is None or an integer of at least 0, got '1'"),
-    "seed fraction": ({"seed": 1.0}, "a seed is None or an integer of at least 0, got 1.0"),
     "seed negative": ({"seed": -1}, "a seed is None or an integer of at least 0, got -1"),
-    "seed boolean": ({"seed": True}, "a seed is None or an integer of at least 0, got True"),
     "options list": ({"options": [1]}, r"options of a reset are a dictionary or None, got \[1\]"),
-    "options word": ({"options": "reset_mask"}, "options of a reset are a dictionary or None"),
+    "unknown option": ({"options": {"reset_masks": 1}}, "unknown option of a reset 'reset_masks'"),
 }
 RESETS_OF_VECTORS = {
-    "seeds words": ({"seed": ["1", "2"]}, "a seed is None or an integer of at least 0, got '1'"),
     "seeds few": ({"seed": [1]}, "expected 2 seeds, one for each sub-environment, got 1"),
     "seeds negative": ({"seed": [1, -1]}, "a seed is None or an integer of at least 0, got -1"),
-    "unknown": ({"options": {"reset_masks": 1}}, "unknown option of a reset 'reset_masks': did you mean 'reset_mask'"),
     "mask": ({"options": {"reset_mask": "all"}}, "'reset_mask'. must be a boolean array .*got 'all'"),
     "shortened ragged": ({"options": {"shortened_by": [[1], [1, 2]]}}, "'shortened_by'. must hold 2 integers"),
-    "shortened fraction": ({"options": {"shortened_by": [0.5, 1.0]}}, "'shortened_by'. must hold 2 integers"),
 }  # fmt: skip
 
 
@@ -321,12 +304,6 @@ def test_wrong_arguments_of_a_reset(face):
     env, untouched = (face(ID, **many) for _ in range(2))
     for keywords, message in (RESETS if face is TaskEnv else RESETS | RESETS_OF_VECTORS).values():
         assert_refused_without_a_trace(env, untouched, keywords, message)
-
-
-def test_options_of_a_single_environment():
-    message = "unknown option of a reset 'reset_mask': choose from scenario, parameters"
-    assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), {"options": {"reset_mask": [True]}}, message)
-    TaskEnv(ID).reset(options={})
 
 
 def test_seeds_may_be_numpys():
@@ -360,12 +337,12 @@ def test_gradients_flow_through_float32():
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
-    monkeypatch.setattr(rendering, "MAX_PICTURES", 2)
-    count, keywords = 4, {"render_mode": "rgb_array", "horizon": 4, "control": "weights"}
-    vector = TaskVectorEnv(ID, count, autoreset_mode=mode, **keywords)
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
+    keywords = {"render_mode": "rgb_array", "horizon": 4, "control": "weights"}
+    vector = TaskVectorEnv(ID, 2, autoreset_mode=mode, **keywords)
     single = TaskEnv(ID, **keywords)
-    single.picture.caption = "sub-environment 1"
-    vector.reset(seed=3), single.reset(seed=4)
+    single.picture.caption = "sub-environment 0"
+    vector.reset(seed=3), single.reset(seed=3)
     actions = actions_for(vector, 7)
     for step, action in enumerate(actions):
         if mode is AutoresetMode.DISABLED and step == 4:
@@ -374,17 +351,15 @@ def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
         if mode is AutoresetMode.NEXT_STEP and step == 4:
             single.reset()
         else:
-            single.step(action[1])
+            single.step(action[0])
         if mode is AutoresetMode.SAME_STEP and finished.all():
             single.reset()
     assert single.picture.count == {"NextStep": 2, "SameStep": 3, "Disabled": 3}[mode.value]
     frames = vector.render()
     assert isinstance(frames, tuple)
-    assert len(frames) == count
-    np.testing.assert_array_equal(frames[1], single.render())
-    assert [frame.min() < 255 for frame in frames] == [True, True, False, False]
+    np.testing.assert_array_equal(frames[0], single.render())
+    assert [frame.min() < 255 for frame in frames] == [True, False]
     assert {frame.shape for frame in frames} == {(608, 960, 3)}
-    assert (frames[0] != frames[1]).any()
     vector.close()
 
 
@@ -410,25 +385,6 @@ def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_m
     assert env.pictures is None
 
 
-@pytest.mark.slow
-def test_video_of_a_vector(tmp_path):
-    pytest.importorskip("moviepy")
-    from moviepy import VideoFileClip
-
-    if not hasattr(gym.wrappers.vector, "RecordVideo"):
-        pytest.skip("this version of Gymnasium records no vectors")
-    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=3)
-    env = gym.wrappers.vector.RecordVideo(env, str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
-    env.reset(seed=0)
-    for action in actions_for(env, 4):
-        env.step(action)
-    env.close()
-    with VideoFileClip(str(tmp_path / "videos" / "rl-video-episode-0.mp4")) as clip:
-        assert tuple(clip.size) == (1920, 608)
-        # The reset's frame and one for each of three steps, at ten a second.
-        assert clip.duration == pytest.approx(0.4, abs=0.11)
-
-
 # --- copies
 
 WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
@@ -439,20 +395,13 @@ def test_copies_of_vectors_are_drawn_alike(monkeypatch):
     env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
     env.reset(seed=3)
     actions = actions_for(env, 5)
-    continued(env, actions[:2])
-    env.render()
-    other = pickle.loads(pickle.dumps(env))
-    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-    drawn = other.render()
-    np.testing.assert_array_equal(env.render(), drawn)
-    # What was closed is drawn anew.
+    continued(env, actions)
+    drawn = env.render()
+    # What was closed is drawn anew, and can then be copied as before.
     env.close()
     again = pickle.loads(pickle.dumps(env))
     np.testing.assert_array_equal(again.render(), drawn)
-    # Closed and drawn again, it can be copied as before.
-    again.close()
-    again.render()
-    np.testing.assert_array_equal(copy.deepcopy(again).render(), again.render())
+    np.testing.assert_array_equal(copy.deepcopy(again).render(), drawn)
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -464,16 +413,3 @@ def test_copies_of_what_is_wrapped(way):
     other = WAYS[way](env)
     assert other.spec == env.spec
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-
-
-@pytest.mark.slow
-def test_specs_are_enough_for_spawned_processes():
-    here = gym.make(ID, scenario=FLIGHT, dtype="float32", horizon=4)
-    make = functools.partial(gym.make, here.spec)
-    there = gym.vector.AsyncVectorEnv([make], context="spawn")
-    try:
-        together, _ = there.reset(seed=8)
-        assert together.dtype == np.float32
-        np.testing.assert_array_equal(together[0], here.reset(seed=8)[0])
-    finally:
-        there.close()

@@ -1,36 +1,21 @@
 """The problems of benchmarks/public_problems.py: their equations, the reading of stored sets."""
 
-import importlib.util
 import json
 import math
-import sys
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 import scipy
-from filtergym.baselines import catalogue as baselines
-from filtergym.envs.engine import registration
+from models import load_module
 
 ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module")
 def problems():
-    """The module with its environments; forgotten afterwards."""
-    known = set(registration.USER_TASKS)
-    spec = importlib.util.spec_from_file_location(
-        "benchmarks_public_problems", ROOT / "benchmarks" / "public_problems.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    sys.modules.pop(spec.name)
-    for id in set(registration.USER_TASKS) - known:
-        for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
-            table.pop(id, None)
+    """The module with its environments."""
+    yield from load_module(ROOT / "benchmarks" / "public_problems.py", "benchmarks_public_problems")
 
 
 def test_records_hold_the_tables_of_their_figures(problems):

@@ -2,7 +2,6 @@
 
 import math
 
-import gymnasium
 import numpy
 import pytest
 from filtergym.baselines.catalogue import baselines_of
@@ -21,16 +20,9 @@ from filtergym.papers import radar_esm_class_fusion as reproduction
 
 ID = "filtergym/RadarEsmTracking-v0"
 WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}
-NEVER_REFUSED = {"association_error": 1e-12}
 
 
 # --- the paper's experiment at 20000 episodes
-
-
-@pytest.fixture(scope="module")
-def paper():
-    """The paper's algorithm on 20000 targets of any class."""
-    return evaluate(ID, ["quasi-optimal"], "paper", 20000, seed=2008).isel(policy=0)
 
 
 def root(mean_squares):
@@ -39,100 +31,11 @@ def root(mean_squares):
     return value, mean_squares.std() / math.sqrt(len(mean_squares)) / (2.0 * value)
 
 
-@pytest.mark.claims
-def test_errors_by_class(paper):
-    """Published RMSE (M = 20000) and its standard error, windows 0.5-10, 10-30 and 30-60 s."""
-    table = {
-        (0, 1): ((9.04, 0.02), (7.06, 0.02), (6.85, 0.01)),
-        (0, 2): ((2.83, 0.01), (1.33, 0.005), (1.29, 0.005)),
-        (1, 1): ((11.22, 0.02), (9.91, 0.02), (9.84, 0.01)),
-        (1, 2): ((6.06, 0.02), (4.17, 0.01), (4.12, 0.01)),
-        (2, 1): ((13.80, 0.02), (13.19, 0.02), (13.13, 0.01)),
-        (2, 2): ((13.46, 0.03), (11.75, 0.01), (11.72, 0.01)),
-    }
-    true_class = paper["true_class"].values[:, 0]
-    squares = paper["error"].values ** 2
-    for (s, component), row in table.items():
-        for (first, last), (expected, published) in zip(WINDOWS.values(), row, strict=True):
-            value, error = root(squares[true_class == s, first - 1 : last, component].mean(axis=1))
-            assert abs(value - expected) < 4.0 * math.hypot(error, published), (s, component, first, value)
-    for (first, last), expected in zip(WINDOWS.values(), (1091.0, 492.3, 325.3), strict=True):
-        value, error = root(squares[:, first - 1 : last, 0].mean(axis=1))
-        assert abs(value - expected) < 4.0 * error
-
-
-@pytest.mark.claims
-def test_recognition_by_class(paper):
-    table = (
-        (0.747, 0.862, 0.963, 0.996, 0.999),
-        (0.628, 0.738, 0.897, 0.980, 0.996),
-        (0.668, 0.785, 0.917, 0.985, 0.997),
-    )
-    true_class = paper["true_class"].values[:, 0]
-    for s, row in enumerate(table):
-        P = paper["true_class_probability"].values[true_class == s]
-        for second, expected in zip((2, 5, 10, 20, 30), row, strict=True):
-            at = P[:, 2 * second - 1]
-            # Published with M = 20000 and rounded to 0.001.
-            error = math.hypot(at.std() / math.sqrt(len(at)), at.std() / math.sqrt(20000)) + 0.0005
-            assert abs(at.mean() - expected) < 4.0 * error, (s, second, at.mean())
-        first = 0.5 * ((P >= 0.9).argmax(axis=1) + 1)
-        for share, published in ((0.5, (4.0, 5.5, 4.0)[s]), (0.9, (8.0, 12.5, 11.0)[s])):
-            # On a grid of 0.5 s: so many flights are decided at the published quantile, fewer one step before.
-            error = math.sqrt(share * (1.0 - share) * (1.0 / len(first) + 3.0 / 20000))
-            assert (first <= published).mean() > share - 4.0 * error
-            assert (first <= published - 0.5).mean() < share + 4.0 * error
-
-
-@pytest.mark.claims
-def test_calibration(paper):
-    """Classes and types drawn as assumed: mean square error over mean reported variance is 1."""
-    for i, component in enumerate(("range", "range_rate", "acceleration")):
-        for first, last in WINDOWS.values():
-            squares = paper["error"].values[:, first - 1 : last, i] ** 2
-            ratio = squares.mean() / paper[f"variance_{component}"].values[:, first - 1 : last].mean()
-            assert ratio == pytest.approx(1.0, abs=0.03)
-
-
-@pytest.mark.claims
-def test_one_sensor_alone():
-    """Published medians of the first P >= 0.9 by radar and by ESM alone, and mean P(true) by radar."""
-    dataset = evaluate(ID, ["radar-only", "esm-only"], "paper", 4000, seed=1)
-    for s, (radar, esm, at_10, at_60) in enumerate(
-        (((23.5), (4, 4), 0.641, 0.965), ((23.5), (6, 6), 0.492, 0.956), ((9.5), (6, 8), 0.706, 0.993))
-    ):
-        of = dataset["true_class"].values[0, :, 0] == s
-        P = dataset["true_class_probability"].sel(policy="radar-only").values[of]
-        first = numpy.where((P >= 0.9).any(axis=1), 0.5 * ((P >= 0.9).argmax(axis=1) + 1), math.inf)
-        # A quantile's standard error by the spread of order statistics.
-        low, high = numpy.quantile(
-            first, [0.5 - 2.0 / math.sqrt(len(first)), 0.5 + 2.0 / math.sqrt(len(first))]
-        )
-        assert low - 0.5 <= radar <= high + 0.5
-        for second, expected in ((10, at_10), (60, at_60)):
-            at = P[:, 2 * second - 1]
-            error = at.std() * math.sqrt(1.0 / len(at) + 1.0 / 20000) + 0.0005
-            assert abs(at.mean() - expected) < 4.0 * error
-        P = dataset["true_class_probability"].sel(policy="esm-only").values[of]
-        first = 0.5 * ((P >= 0.9).argmax(axis=1) + 1)
-        assert esm[0] <= numpy.median(first) <= esm[1]
-
-
-@pytest.mark.claims
-def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_its_repair():
-    dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 1500)
-    records = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
-    assert records["quasi-optimal", "sure_and_wrong", ""].low > 0.1
-    assert records["joint-type", "sure_and_wrong", ""].high < 0.02
-    cheaper = records["joint-type", "relative_cost_difference", ""]
-    assert cheaper.high < 0.0
-
-
 # --- exact errors
 
 
-@pytest.mark.parametrize("target", range(3))
-def test_non_adaptive_and_ideal_have_their_exact_errors(target):
+def test_non_adaptive_and_ideal_have_their_exact_errors():
+    target = 1
     dataset = evaluate(
         ID, ["non-adaptive", "ideal", "known-class-bound"], "paper", 1500, true_class=f"S{target}"
     )
@@ -146,14 +49,6 @@ def test_non_adaptive_and_ideal_have_their_exact_errors(target):
                 assert abs(value - experiment.rms(exact[i], (first, last))) < 4.0 * error
     bound = dataset["mean_square"].sel(policy="known-class-bound").values[0].T
     assert bound == pytest.approx(experiment.exact_mean_squares(p, target, target), rel=1e-9)
-
-
-def test_exact_errors_after_a_minute():
-    """Published to 0.01 (range to 0.01 m), the columns being the filters of S0, S1, S2 on an S0 target."""
-    p = make_model(ID, scenario="paper").task.parameters
-    last = numpy.array([numpy.sqrt(experiment.exact_mean_squares(p, 0, c)[:, -1]) for c in range(3)])
-    expected = [(279.77, 6.85, 1.29), (279.78, 8.71, 2.17), (279.79, 11.74, 5.86)]
-    assert last == pytest.approx(numpy.array(expected), abs=0.0055)
 
 
 # --- the ideal filter
@@ -224,12 +119,6 @@ def test_ideal_switches_its_model_at_the_change():
                 assert 0.5 * episode.measurement.scan[lane] >= first
             governed = now
         assert changes == 1
-
-
-def test_ideal_does_not_depend_on_what_the_bank_does():
-    one = evaluate(ID, ["ideal"], "class-change", 20)
-    mixing = evaluate(ID, ["ideal"], "class-change", 20, class_transition=experiment.leaking(0.05))
-    assert (mixing["error"].values == one["error"].values).all()
 
 
 def test_ideal_keeps_its_bound_where_the_class_changes():
@@ -327,30 +216,11 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
         lanes.decide(action)
 
 
-def test_forgetting_nothing_is_the_joint_posterior():
-    model = make_model(ID, "weights", "random", decision_interval=1)
-    joint, kept = baselines.JointType(model), baselines.ForgettingJointType(model, change=0.0)
-    state = None
-    lanes = start_lanes(model, range(8))
-    for step in range(60):
-        shown = lanes.observe()
-        action, state = kept.predict(shown, state, numpy.full(8, step == 0))
-        assert action == pytest.approx(joint.predict(shown)[0], rel=1e-8, abs=1e-12)
-        lanes.decide(action)
-
-
-def test_the_printed_rule_by_weights_is_zero_evidence():
-    """Where nothing is refused, all decisions are those that (8) uses."""
-    dataset = evaluate(ID, ["quasi-optimal", "ungated"], "paper", 200, **NEVER_REFUSED)
-    assert dataset["error"][0].values == pytest.approx(dataset["error"][1].values, rel=1e-7, abs=1e-8)
-
-
 def test_most_probable_names_the_largest():
     dataset = evaluate(ID, ["quasi-optimal", "most-probable"], "random", 50)
     largest = dataset["mode_probability"].sel(policy="quasi-optimal").values.argmax(axis=-1)
     named = dataset["mode_probability"].sel(policy="most-probable").values
-    assert (named.argmax(axis=-1) == largest).all()
-    assert (named.max(axis=-1) == 1.0).all()
+    numpy.testing.assert_array_equal(named, numpy.eye(3)[largest])
 
 
 def test_policies_fit_other_numbers_of_classes_and_types():
@@ -361,51 +231,6 @@ def test_policies_fit_other_numbers_of_classes_and_types():
     }  # fmt: skip
     dataset = evaluate(ID, list(baselines_of(ID).names), "random", 4, horizon=20, **two)
     assert numpy.isfinite(dataset["cost"].values[:-1]).all()
-
-
-# --- no leak: what is optimal is not beaten
-
-
-def significance(dataset, name, optimum):
-    """Mean cost above the optimum's on the same episodes, in standard errors."""
-    cost = dataset["cost"].mean("time")
-    difference = (cost.sel(policy=name) - cost.sel(policy=optimum)).values
-    return difference.mean() / (difference.std() / math.sqrt(len(difference)) + 1e-300)
-
-
-@pytest.mark.claims
-def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
-    """Types redrawn, nothing refused: posterior weights minimise the mean square error."""
-    names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "paper", 600, **NEVER_REFUSED)
-    for name in names:
-        assert significance(dataset, name, "quasi-optimal") > -3.0, name
-
-
-@pytest.mark.claims
-def test_refused_decisions_are_all_that_can_be_won_on_paper():
-    """The agent is shown them; with one emitter they are as good as any, and nothing beats using them."""
-    names = ["ungated", "quasi-optimal", "joint-type", "leaky", "radar-only"]
-    dataset = evaluate(ID, names, "paper", 2000)
-    for name in names[1:]:
-        assert significance(dataset, name, "ungated") > 3.0, name
-
-
-@pytest.mark.claims
-def test_nothing_beats_the_joint_posterior_for_one_type():
-    names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "fixed-type", 600, **NEVER_REFUSED)
-    for name in names:
-        assert significance(dataset, name, "joint-type") > -3.0, name
-
-
-@pytest.mark.claims
-def test_nothing_beats_the_ideal_filter():
-    names = [*baselines_of(ID).policies, "ideal"]
-    for scenario in ("paper", "class-change"):
-        dataset = evaluate(ID, names, scenario, 300)
-        for name in names:
-            assert significance(dataset, name, "ideal") > -3.0, name
 
 
 # --- metrics
@@ -502,57 +327,20 @@ def test_time_quantile_is_the_order_statistic_and_knows_the_censored():
     assert time_quantile(Bootstrap(101), first, chosen, seconds, 0.999).value == math.inf
 
 
-def test_short_runs_report_what_they_reach():
-    dataset = evaluate(ID, ["quasi-optimal"], "paper", 20, horizon=12, true_class="S1")
-    windows = {r.window for r in tidy_records(dataset) if r.metric == "mean_true_class_probability"}
-    assert windows == {"2 s", "5 s"}
-    components = {r.component for r in tidy_records(dataset) if r.metric == "sure_and_wrong"}
-    assert components == {"", "S1"}
-
-
-# --- bad input
-
-
-@pytest.mark.parametrize(
-    ("keywords", "reason"),
-    [
-        ({"composition": [[0.5, 0.5, 0.5, 0.0]] * 3}, r"composition\[0\] must sum to 1"),
-        ({"association_error": 1.2}, "association_error must be .* below 1.0, got 1.2"),
-        ({"true_class": "S7"}, "true_class must be one of 'random', 'S0', 'S1', 'S2', got 'S7'"),
-        ({"class_change": (0.5, 20.0)}, r"class_change\[0\] must be .* above 0.5, got 0.5"),
-        ({"scenario": "fixed_type"}, "did you mean 'fixed-type'"),
-        ({"control": "gain"}, "unknown control 'gain'"),
-        ({"range_scale": 0.0}, "range_scale must be .* above 0"),
-    ],
-)
-def test_environment_refuses_bad_input_with_the_reason(keywords, reason):
-    with pytest.raises(ValueError, match=reason):
-        gymnasium.make(ID, **keywords)
-
-
 # --- the reproduction
 
 
-@pytest.fixture(scope="module")
-def reproduced():
+@pytest.mark.slow
+def test_reproduction_has_a_verdict_for_every_claim_and_four_figures():
     done = []
-    return reproduction.reproduce(done.append, 400), done
-
-
-@pytest.mark.slow
-def test_reproduction_reports_its_progress(reproduced):
-    assert sum(reproduced[1]) == pytest.approx(reproduction.STEPS)
-
-
-@pytest.mark.slow
-def test_reproduction_has_a_verdict_for_every_claim_and_four_figures(reproduced):
-    result = reproduced[0]
+    result = reproduction.reproduce(done.append, 400)
+    assert sum(done) == pytest.approx(reproduction.STEPS)
     verdicts = {claim.key: claim.verdict for claim in result.claims}
-    assert {key: verdicts[key] for key in ("D1, one type for each target", "D3", "D4")} == {
-        "D1, one type for each target": "not reproduced",
-        "D3": "reproduced",
-        "D4": "reproduced in part",
-    }
+    assert [verdicts[key] for key in ("D1, one type for each target", "D3", "D4")] == [
+        "not reproduced",
+        "reproduced",
+        "reproduced in part",
+    ]
     assert {f"figure_{i}" for i in range(1, 5)} <= {name[:8] for name in result.figures}
     assert all(caption for _, caption in result.figures.values())
     for table in result.tables:
@@ -569,11 +357,6 @@ def test_recognition_verdict():
     assert claims.recognition_verdict([bad, bad, bad]) == "not reproduced"
     # Not certain enough.
     assert claims.recognition_verdict([measured(0.991, 0.001)] * 3) == "not reproduced"
-
-
-def test_reproduction_refuses_too_few_episodes():
-    with pytest.raises(ValueError, match="at least 100"):
-        reproduction.reproduce(lambda _: None, 5)
 
 
 # --- the picture

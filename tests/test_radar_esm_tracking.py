@@ -1,4 +1,4 @@
-"""RadarEsmTracking: the paper's numbers by Monte Carlo, no truth in sight, NumPy and torch alike."""
+"""RadarEsmTracking: what is shown, the printed recursion, no truth in sight, the frequencies of its world."""
 
 import math
 
@@ -9,7 +9,6 @@ from filtergym.envs.radar_esm_tracking.picture import RadarEsmTrackingPicture
 from filtergym.envs.radar_esm_tracking.task import TASK
 from filtergym.filters import class_fusion, imm
 
-SCENARIOS = tuple(TASK.scenarios)
 LEAKY = ((0.9, 0.08, 0.02), (0.0, 0.7, 0.3), (0.25, 0.05, 0.7))
 
 
@@ -50,127 +49,6 @@ def leaves(value):
             yield from leaves(item)
     else:
         yield value
-
-
-# --- the paper's numbers
-
-
-@pytest.fixture(scope="module")
-def monte_carlo():
-    """Squared errors, reported variances and P(true class) of 6000 targets of each class, 120 scans."""
-    results = []
-    for s in range(3):
-        model = make(true_class=f"S{s}")
-        errors, variances, probabilities = [], [], []
-        for _, _, state in roll(model, draw(model, 6000, 2008 + s)):
-            covariance = model.covariance(state)
-            errors.append(model.error(state) ** 2)
-            variances.append(numpy.stack([covariance[i, i] for i in range(3)]))
-            probabilities.append(state.filter.probabilities[s])
-        results.append((numpy.stack(errors), numpy.stack(variances), numpy.stack(probabilities)))
-    return results
-
-
-@pytest.mark.claims
-def test_errors_of_the_paper_policy(monte_carlo):
-    """The table of adaptive RMSE (M = 20000), within four standard errors of the difference."""
-    table = {
-        (0, 1): ((9.04, 0.02), (7.06, 0.02), (6.85, 0.01)),
-        (0, 2): ((2.83, 0.01), (1.33, 0.005), (1.29, 0.005)),
-        (1, 1): ((11.22, 0.02), (9.91, 0.02), (9.84, 0.01)),
-        (1, 2): ((6.06, 0.02), (4.17, 0.01), (4.12, 0.01)),
-        (2, 1): ((13.80, 0.02), (13.19, 0.02), (13.13, 0.01)),
-        (2, 2): ((13.46, 0.03), (11.75, 0.01), (11.72, 0.01)),
-        **{(s, 0): ((1091.0, 4.0), (492.3, 2.0), (325.3, 1.5)) for s in range(3)},
-    }
-    for (s, component), row in table.items():
-        for (first, last), (expected, published) in zip(((1, 20), (20, 60), (60, 120)), row, strict=True):
-            means = monte_carlo[s][0][first - 1 : last, component].mean(axis=0)
-            rmse = math.sqrt(means.mean())
-            own = means.std() / math.sqrt(means.size) / (2.0 * rmse)
-            assert abs(rmse - expected) < 4.0 * math.hypot(own, published), (s, component, first, rmse)
-
-
-@pytest.mark.claims
-def test_recognition_of_the_paper_policy(monte_carlo):
-    table = (
-        (0.747, 0.862, 0.963, 0.996, 0.999),
-        (0.628, 0.738, 0.897, 0.980, 0.996),
-        (0.668, 0.785, 0.917, 0.985, 0.997),
-    )
-    for s, row in enumerate(table):
-        for seconds, expected in zip((2, 5, 10, 20, 30), row, strict=True):
-            P = monte_carlo[s][2][2 * seconds - 1]
-            # The published one has M = 20000; 0.0005 is its rounding.
-            error = math.hypot(P.std() / math.sqrt(P.size), P.std() / math.sqrt(20000)) + 0.0005
-            assert abs(P.mean() - expected) < 4.0 * error, (s, seconds, P.mean())
-        first = 0.5 * ((monte_carlo[s][2] >= 0.9).argmax(axis=0) + 1)
-        assert abs(numpy.median(first) - (4.0, 5.5, 4.0)[s]) <= 0.5
-
-
-@pytest.mark.claims
-def test_the_paper_filter_is_bayesian(monte_carlo):
-    """Uniform classes, redrawn types: mean squared error over mean reported variance is 1 within 3 %."""
-    squared = sum(result[0] for result in monte_carlo)
-    reported = sum(result[1] for result in monte_carlo)
-    for first, last in ((1, 20), (20, 60), (60, 120)):
-        ratio = squared[first - 1 : last].mean(axis=(0, 2)) / reported[first - 1 : last].mean(axis=(0, 2))
-        assert ratio == pytest.approx(numpy.ones(3), abs=0.03)
-
-
-@pytest.mark.claims
-def test_class_probabilities_are_calibrated():
-    model = make(horizon=20)
-    states = [state for *_, state in roll(model, draw(model, 20000, 5))]
-    P = numpy.concatenate([states[k].filter.probabilities.ravel() for k in (4, 9)])
-    true = numpy.concatenate(
-        [(states[k].truth.target_class == numpy.arange(3)[:, None]).ravel() for k in (4, 9)]
-    )
-    for low in numpy.arange(0.0, 1.0, 0.1):
-        chosen = (low <= P) & (low + 0.1 > P)
-        # Three entries of a lane and two times share a draw: count each lane once.
-        error = 0.5 / math.sqrt(chosen.sum() / 2.0)
-        assert abs(true[chosen].mean() - P[chosen].mean()) < 4.0 * error
-
-
-@pytest.mark.claims
-def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_repairs_it():
-    model = make("fixed-type")
-    p = model.task.parameters
-    *_, (_, _, state) = roll(model, draw(model, 4000, 7))
-    floor = numpy.array(p.composition)
-    joint = class_fusion.constant_class_log_likelihood(
-        state.filter.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
-    )
-    repaired = imm.softmax(state.filter.accumulated + joint)
-    wrong = state.truth.target_class != numpy.arange(3)[:, None]
-
-    def sure_and_wrong(P):
-        return ((P >= 0.9) & wrong).any(axis=0).mean()
-
-    assert sure_and_wrong(state.filter.probabilities) > 0.1
-    # A posterior is wrong in at most a tenth of the runs in which it is sure at 0.9.
-    assert sure_and_wrong(repaired) < 0.04
-
-
-# --- the task's contract
-
-
-def test_fields_and_shapes():
-    for control in TASK.controls:
-        model = make("random", control)
-        uniforms, normals, rows = draw(model, 8, 0)
-        state = model.measure(model.begin(uniforms, normals), next(rows))
-        observation = model.observe(state)
-        assert observation.shape == (len(model.fields), 8)
-        assert len({f.name for f in model.fields}) == len(model.fields)
-        assert observation.dtype == numpy.float64
-        action = numpy.zeros(8, dtype=int) if control == "mode" else numpy.zeros((3, 8))
-        state = model.act(state, action)
-        assert model.error(state).shape == (3, 8)
-        assert model.covariance(state).shape == (3, 3, 8)
-        assert model.cost(state).shape == (8,)
-        assert model.records(state)["mode_probability"].shape == (3, 8)
 
 
 def test_observation_shows_what_it_names():
@@ -299,11 +177,10 @@ WORLDS = {
 """Parameters of what is and nothing else; no filter may know them."""
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
-@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
-def test_nothing_but_the_measurement_reaches_the_bank(scenario, transition):
+@pytest.mark.parametrize("scenario", ["random", "glint"])
+def test_nothing_but_the_measurement_reaches_the_bank(scenario):
     """A bank made for another world shows and estimates the same from the same measurements."""
-    more = {"horizon": 40, **({} if transition is None else {"class_transition": transition})}
+    more = {"horizon": 20, "class_transition": LEAKY}
     model, other = make(scenario, **more), make(scenario, **{**more, **WORLDS})
     uniforms, normals, rows = draw(model, 8, 11)
     episode = model.begin(uniforms, normals)
@@ -319,74 +196,6 @@ def test_nothing_but_the_measurement_reaches_the_bank(scenario, transition):
         episode, theirs = model.act(episode, action), other.filter.act(theirs, measurement, action)
         assert numpy.array_equal(model.mean(episode), other.filter.mean(theirs))
         assert numpy.array_equal(model.covariance(episode), other.filter.covariance(theirs))
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_lanes_do_not_know_their_neighbours(scenario):
-    """A lane gives the same bits in any batch, also next to lanes at other times."""
-    model = make(scenario, horizon=30)
-    uniforms, normals, rows = draw(model, 16, 2)
-    rows = list(rows)
-    wide = model.begin(uniforms, normals)
-    narrow = model.begin(uniforms[:, :8], normals[:, :8])
-    for row in rows[:9]:
-        wide = model.act(model.measure(wide, row), numpy.zeros((3, 16)))
-    # Lanes 0 to 7 start again at scan 0 beside lanes 8 to 15 at scan 9.
-    fresh = model.begin(uniforms, normals)
-    first = numpy.arange(16) < 8
-
-    def merged(a, b):
-        if isinstance(a, dict):
-            return {name: merged(x, b[name]) for name, x in a.items()}
-        if isinstance(a, tuple):
-            return type(a)(*(merged(x, y) for x, y in zip(a, b, strict=True)))
-        return numpy.where(first, a, b)
-
-    wide = wide._replace(truth=merged(fresh.truth, wide.truth), filter=merged(fresh.filter, wide.filter))
-    for row in rows[9:]:
-        wide, narrow = model.measure(wide, row), model.measure(narrow, row[:, :8])
-        assert numpy.array_equal(model.observe(wide)[:, :8], model.observe(narrow))
-        wide, narrow = model.act(wide, numpy.zeros((3, 16))), model.act(narrow, numpy.zeros((3, 8)))
-        assert numpy.array_equal(model.cost(wide)[:8], model.cost(narrow))
-
-
-@pytest.mark.parametrize("scenario", ["paper", "crowded", "silent", "class-change"])
-@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
-def test_torch_plays_the_same_episode(torch, scenario, transition):
-    more = {"horizon": 50, **({} if transition is None else {"class_transition": transition})}
-    ours, theirs = make(scenario, **more), make(scenario, xp=torch, **more)
-    uniforms, normals, rows = draw(ours, 8, 6)
-    a = ours.begin(uniforms, normals)
-    b = theirs.begin(torch.asarray(uniforms), torch.asarray(normals))
-    rng = numpy.random.default_rng(1)
-    for row in rows:
-        action = rng.uniform(-1.0, 1.0, (3, 8))
-        a, b = ours.measure(a, row), theirs.measure(b, torch.asarray(row))
-        # Recursions of 50 scans; exp and log differ in the last digit between the libraries.
-        assert theirs.observe(b).numpy() == pytest.approx(ours.observe(a), rel=1e-8, abs=1e-9)
-        a, b = ours.act(a, action), theirs.act(b, torch.asarray(action))
-        assert theirs.cost(b).numpy() == pytest.approx(ours.cost(a), rel=1e-8)
-    assert [tuple(x.shape) for x in leaves(b)] == [x.shape for x in leaves(a)]
-
-
-def test_gradient_from_cost_to_evidence(torch):
-    """Derivative of the summed cost by torch against central differences."""
-    model = make("random", xp=torch, horizon=6)
-    uniforms, normals, rows = draw(model, 8, 8)
-    rows = [torch.asarray(row) for row in rows]
-
-    def total(action):
-        state = model.begin(torch.asarray(uniforms), torch.asarray(normals))
-        result = 0.0
-        for row in rows:
-            state = model.act(model.measure(state, row), action)
-            result = result + model.cost(state).sum()
-        return result
-
-    action = torch.asarray(numpy.random.default_rng(0).uniform(-0.3, 0.3, (3, 8)))
-    assert torch.autograd.gradcheck(
-        total, (action.clone().requires_grad_(True),), eps=1e-6, rtol=1e-6, atol=1e-7
-    )
 
 
 def test_other_emitter_is_heard_as_often_as_stated():
@@ -439,7 +248,7 @@ def test_random_targets_are_silent_crowded_or_change_or_none_of_it():
 
 
 def test_glint_is_as_frequent_and_as_large_as_stated():
-    model = make("glint", horizon=60)
+    model = make("glint", horizon=20)
     uniforms, normals, rows = draw(model, 1000, 15)
     state, factors = model.begin(uniforms, normals), []
     for row in rows:
@@ -457,30 +266,21 @@ def test_glint_is_as_frequent_and_as_large_as_stated():
 
 def test_silent_targets_radiate_in_bursts():
     model = make("silent")
-    *_, (_, _, state) = roll(model, draw(model, 2000, 13))
+    *_, (_, _, state) = roll(model, draw(model, 1000, 13))
     looks = state.measurement.scan[0] // model.task.parameters.esm_period + 1
     heard = (state.filter.used_counts + state.filter.refused_counts).sum(axis=0).mean() / looks
-    assert heard == pytest.approx(0.08 / 0.48, abs=0.015)
+    assert heard == pytest.approx(0.08 / 0.48, abs=0.02)
 
 
 @pytest.mark.parametrize(
     ("keywords", "reason"),
     [
         ({"composition": ((0.5, 0.5, 0.5, 0.0),) * 3}, r"composition\[0\] must sum to 1"),
-        ({"recognition": ((1.0, 0.1), (0.0, 1.0))}, r"recognition\[0\] must sum to 1"),
-        ({"prior": (0.5, 0.6, -0.1)}, r"prior\[2\] must be .* got -0.1"),
         ({"class_transition": ((1.0, 0.0), (0.0, 1.0))}, "class_transition must have 3 rows"),
-        ({"true_class": "S3"}, "true_class must be one of 'random', 'S0', 'S1', 'S2', got 'S3'"),
-        ({"emitter": "sometimes"}, "emitter must be one of"),
         ({"association_error": 1.0}, "association_error must be .* below 1"),
         ({"second_emitter_probability": (0.0, 1.5)}, r"second_emitter_probability\[1\] must be .* at most 1"),
         ({"silence_start": (0.0, 0.1), "silence_end": (0.0, 0.1)}, "must not both be 0"),
         ({"acceleration_sigma": (1.0, 2.0)}, "acceleration_sigma must be 3 numbers"),
-        ({"range_sigma": 0.0}, "range_sigma must be .* above 0"),
-        ({"initial_range": (2e5, 1e5)}, "initial_range must be in ascending order"),
-        ({"horizon": 0}, "horizon must be an integer of at least 1"),
-        ({"decision_interval": 0}, "decision_interval must be an integer of at least 1"),
-        ({"esm_period": 2.5}, "esm_period must be an integer"),
     ],
 )
 def test_bad_parameters_are_refused_with_the_reason(keywords, reason):

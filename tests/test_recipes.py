@@ -8,10 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-import filtergym
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "recipes"
@@ -84,18 +81,3 @@ def test_page_names_every_recipe():
     assert sorted(set(re.findall(r"\bwith_\w+\.(?:py|sh)\b", page))) == RECIPES
     for file in FOLDER.glob("*.txt"):
         assert f"--install {file.stem}" in page or f"`{file.stem}`" in page, file
-
-
-def test_a_function_is_a_policy():
-    """Of observations in a batch; the control is the environment's first where none is named."""
-    torch = pytest.importorskip("torch")
-    id = "filtergym/ManeuveringTarget-v0"
-
-    def nothing(observation):
-        return torch.zeros(len(observation), 2, requires_grad=True)
-
-    names = {"mine": filtergym.FunctionPolicy(nothing, "evidence"), "imm": "imm"}
-    cost = filtergym.evaluate(id, names, episodes=4, horizon=10)["cost"].values
-    np.testing.assert_allclose(cost[0], cost[1], rtol=1e-9)  # rounding of evidence against weights
-    first = filtergym.make_policy(id, filtergym.FunctionPolicy(lambda observation: observation[:, :1]))
-    assert first.control == first.task.controls[0]

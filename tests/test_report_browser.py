@@ -161,22 +161,6 @@ def test_slider_moves_the_track_and_choices_change_the_figure(wide):
     assert (before, driver.execute_script(title)) == ("RMSE of position, m", "RMSE of velocity, m/s")
 
 
-def test_a_click_on_the_legend_shows_one_alone(wide):
-    from selenium.webdriver.common.action_chains import ActionChains
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    driver = wide
-    figure = driver.find_element("css selector", "figure[data-kind=rmse]")
-    driver.execute_script("arguments[0].scrollIntoView()", figure)
-    item = figure.find_elements("css selector", ".legendtoggle")[0]
-    ActionChains(driver).move_to_element(item).click().perform()
-    visible = (
-        "return arguments[0].querySelector('.js-plotly-plot').data.filter(t => t.visible !== 'legendonly')"
-        ".map(t => t.legendgroup)"
-    )
-    WebDriverWait(driver, WAIT).until(lambda d: len(set(d.execute_script(visible, figure))) == 1)
-
-
 def test_light_and_dark(wide):
     colour = "return getComputedStyle(document.body).backgroundColor"
     line = "return document.querySelector('figure[data-kind=rmse] .js-plotly-plot').layout.font.color"

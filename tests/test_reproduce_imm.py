@@ -1,6 +1,5 @@
 """Reproduction of the IMM over alpha-beta filters: plain filters against naive ones, verdicts can fail."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -97,8 +96,9 @@ def naive_imm(recording: Recording, episode: int, reading: Reading, axes: list[i
     return numpy.array(estimates)
 
 
-@pytest.mark.parametrize("per_axis", [False, True])
-@pytest.mark.parametrize("likelihood", experiment.LIKELIHOODS)
+@pytest.mark.parametrize(
+    ("likelihood", "per_axis"), [*((kind, False) for kind in experiment.LIKELIHOODS), ("Kalman", True)]
+)
 def test_every_reading_equals_a_naive_filter(recording: Recording, likelihood: Any, per_axis: bool) -> None:
     reading = Reading((0.25, 0.8), 0.93, likelihood, per_axis)
     error, episode = interacting_multiple_model(recording, reading), 4
@@ -115,17 +115,15 @@ def test_every_reading_equals_a_naive_filter(recording: Recording, likelihood: A
 @pytest.mark.parametrize(
     ("name", "likelihood", "keywords"),
     [
-        ("imm", "gains used", {}),
-        ("imm", "gains used", {"polar_measurements": True}),
-        ("imm", "gains used", {"maneuver_steps": (51, 56)}),
+        ("imm", "gains used", {"polar_measurements": True, "maneuver_steps": (51, 56)}),
         ("imm-steady-state", "R/(1-alpha)", {}),
     ],
 )
 def test_both_readings_that_are_policies_equal_them_on_every_step(
     name: str, likelihood: Any, keywords: dict[str, Any]
 ) -> None:
-    policy = evaluate(ID, [name], "paper", 20, seed=3, **keywords)["error"].values[0]
-    recording = record_measurements(20, seed=3, **keywords)
+    policy = evaluate(ID, [name], "paper", 8, seed=3, **keywords)["error"].values[0]
+    recording = record_measurements(8, seed=3, **keywords)
     plain = interacting_multiple_model(recording, Reading(likelihood=likelihood))
     # Tolerance of the project for an IMM over 100 scans; observed 1e-10.
     numpy.testing.assert_allclose(numpy.moveaxis(plain, -1, 0), policy, rtol=0, atol=1e-7)
@@ -223,13 +221,6 @@ def test_verdict_on_the_box_follows_the_minimum() -> None:
     assert claims.box_verdict([outside, outside]) == "not reproduced"
 
 
-def test_the_box_is_the_papers() -> None:
-    inside = claims.inside_box()
-    assert inside.shape == (6, 8)
-    assert inside[2:, 2:].all()
-    assert inside.sum() == 24
-
-
 @pytest.mark.parametrize(
     ("straight", "turn", "verdict"),
     [
@@ -261,32 +252,19 @@ def test_a_window_moves_with_the_turn() -> None:
 
 
 @pytest.mark.slow
-def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
-    assert sum(results.done) == pytest.approx(paper.STEPS)
-
-
-@pytest.mark.slow
 def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
-    stated = judge_claims(claims.CLAIMS, claims.quantities(results.of))
-    keys = [claim.key for claim in stated]
-    assert keys[:2] == ["C1", "C1 re-arming"]
-    assert {"C2", "C3", "Straight legs", "Detection"} <= set(keys)
-    assert len(set(keys)) == len(keys)
-    assert all(claim.measured and claim.method for claim in stated)
+    assert sum(results.done) == pytest.approx(paper.STEPS)
+    stated = {claim.key: claim for claim in judge_claims(claims.CLAIMS, claims.quantities(results.of))}
+    assert list(stated)[:2] == ["C1", "C1 re-arming"]
+    assert {"C2", "C3", "Straight legs", "Detection"} <= stated.keys()
+    assert all(claim.measured and claim.method for claim in stated.values())
+    # With 24 episodes the size of the improvement is not certain, its direction and C3 are.
+    assert stated["C1"].verdict != "not reproduced"
+    assert stated["C1 re-arming"].verdict == "not reproduced"
+    assert stated["C3"].verdict == "reproduced"
     for table in claims.tables(results.of):
         assert all(len(row) == len(table.header) for row in table.rows)
         assert not any("nan" in cell for row in table.rows for cell in row)
-
-
-@pytest.mark.slow
-def test_verdicts_of_few_episodes(results: SimpleNamespace) -> None:
-    verdicts = {
-        claim.key: claim.verdict for claim in judge_claims(claims.CLAIMS, claims.quantities(results.of))
-    }
-    # With 24 episodes the size of the improvement is not certain, its direction and C3 are.
-    assert verdicts["C1"] != "not reproduced"
-    assert verdicts["C1 re-arming"] == "not reproduced"
-    assert verdicts["C3"] == "reproduced"
 
 
 @pytest.mark.slow
@@ -318,12 +296,3 @@ def test_figures_can_be_drawn_with_axes_named(results: SimpleNamespace) -> None:
         axes = figure.axes
         assert all(axis.get_ylabel() for axis in axes)
         assert any(axis.get_xlabel() for axis in axes)
-
-
-def test_readings_differ(recording: Recording) -> None:
-    readings = [Reading(likelihood=kind) for kind in experiment.LIKELIHOODS]
-    readings += [replace(readings[0], per_axis=True), replace(readings[0], stay=0.8)]
-    errors = [interacting_multiple_model(recording, reading) for reading in readings]
-    for i, first in enumerate(errors):
-        for second in errors[:i]:
-            assert numpy.abs(first - second).max() > 1.0

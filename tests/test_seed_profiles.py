@@ -21,7 +21,7 @@ def runs_of(counts, seed):
     return [rng.normal(loc=m, size=count) for m, count in enumerate(counts)]
 
 
-@pytest.mark.parametrize("counts", [(4,), (5, 5, 5, 5), (2, 2, 1), (3, 5, 2)])
+@pytest.mark.parametrize("counts", [(1,), (5, 5, 5, 5), (3, 5, 2)])
 def test_statistics_against_repeated_runs(counts):
     """Runs that are repeated until environments have the same number, divisible by four, are what scipy trims."""
     scores = runs_of(counts, 0)
@@ -53,11 +53,6 @@ def test_resamples_are_drawn_within_environments():
     # Environments are drawn independently of each other: of 400 resamples four standard errors.
     both = run_weights((4, 4), 400)[1:]
     assert abs(np.corrcoef(both[:, 0], both[:, 4])[0, 1]) < 4.0 / 20.0
-
-
-def test_one_run_has_no_interval_of_its_own():
-    found = interquartile_mean(np.array([0.3]), run_weights([1], 50))
-    np.testing.assert_allclose(found, 0.3, rtol=1e-15)
 
 
 def record_of(environment, reference, scores):

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib.util
 import itertools
 import shlex
 from dataclasses import replace
@@ -58,28 +59,21 @@ def trained(run, folder, **keywords):
     [
         ("env.range_sigma=50", {"range_sigma": 50}, {}),
         ("env.reward=relative", {"reward": "relative"}, {}),
+        ("env.polar_measurements=false", {"polar_measurements": False}, {}),
+        ("env.gains=[0.2, 1e-1]", {"gains": [0.2, 0.1]}, {}),
         ("algo.learning_rate=3e-4", {}, {"learning_rate": 3e-4}),
-        ("algo.learning_rate=lin_1e-3", {}, {"learning_rate": "lin_1e-3"}),
         ("algo.policy_kwargs.net_arch=[32,32]", {}, {"policy_kwargs": {"net_arch": [32, 32]}}),
         ("algo.policy_kwargs={log_std_init: -1e0}", {}, {"policy_kwargs": {"log_std_init": -1.0}}),
-        ("env.polar_measurements=false", {"polar_measurements": False}, {}),
-        ("env.track=null", {"track": None}, {}),
-        ("env.gains=[0.2, 1e-1]", {"gains": [0.2, 0.1]}, {}),
     ],
 )  # fmt: skip
 def test_settings_are_yaml(word, env, algo):
     assert parse_settings([word]) == (env, algo)
 
 
-@pytest.mark.parametrize(
-    "word", ["range_sigma=50", "env.range_sigma", "env.=1", "agent.x=1", "env..x=1", "="]
-)
-def test_other_forms_are_refused(word):
-    with pytest.raises(ValueError, match=r"--set needs env\.NAME=VALUE or algo\.NAME=VALUE"):
-        parse_settings([word])
-
-
-def test_what_is_no_yaml_is_refused():
+def test_other_forms_are_refused():
+    for word in ("range_sigma=50", "env.range_sigma", "env.=1", "agent.x=1", "env..x=1", "="):
+        with pytest.raises(ValueError, match=r"--set needs env\.NAME=VALUE or algo\.NAME=VALUE"):
+            parse_settings([word])
     with pytest.raises(ValueError, match="cannot read the value"):
         parse_settings(["env.gains=[0.2"])
 
@@ -142,10 +136,7 @@ def test_a_config_may_have_a_default_section(tmp_path):
     [
         ("", "needs sections by environment id or default"),
         ("- 1", "needs sections"),
-        (
-            "mine/Other-v0: {gamma: 0.5}",
-            "has no section filtergym/ManeuveringTarget-v0 and none called default",
-        ),
+        ("mine/Other-v0: {gamma: 0.5}", f"has no section {ID} and none called default"),
         (f"{ID}: 3", "settings of the algorithm map names to values"),
         ("env: [1]", "settings of the environment map names"),
         ("env: {", "cannot read settings"),
@@ -157,6 +148,9 @@ def test_wrong_configs_are_told(text, message, tmp_path):
     config.write_text(text)
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions("ppo", config=config))
+
+
+def test_a_config_that_is_missing_is_told(tmp_path):
     with pytest.raises(ValueError, match="cannot read settings"):
         new_run(problem_of(ID), RunOptions("ppo", config=tmp_path / "none.yml"))
 
@@ -164,19 +158,15 @@ def test_wrong_configs_are_told(text, message, tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "keywords", "overrides", "message"),
     [
+        ("pop", {}, {}, "unknown algorithm 'pop': did you mean 'ppo'"),
         ("ppo", {"range_sgma": 1.0}, {}, "unknown setting 'env.range_sgma': did you mean 'env.range_sigma'"),
-        ("ppo", {"observation": "asymmetric"}, {}, "unknown setting 'env.observation'"),
         ("ppo", {"range_sigma": -1.0}, {}, "range_sigma must be"),
         ("ppo", {"reward": "costs"}, {}, "unknown reward 'costs': did you mean 'cost'"),
         ("ppo", {"dtype": "float16"}, {}, "unknown dtype"),
-        ("ppo", {"scenario": "paper"}, {}, "is held out"),
+        ("ppo", {"scenario": "paper"}, {}, r"held out: train on a training scenario \(random"),
+        ("ppo", {"scenario": "random:0.8,paper:0.2"}, {}, "scenario 'paper' is held out"),
         ("ppo", {"control": "gian"}, {}, "unknown control"),
-        (
-            "ppo",
-            {},
-            {"learning_rte": 1.0},
-            "unknown setting 'algo.learning_rte': did you mean 'algo.learning_rate'",
-        ),
+        ("ppo", {}, {"learning_rte": 1.0}, "'algo.learning_rte': did you mean 'algo.learning_rate'"),
         ("ppo", {}, {"policy_kwargs": {"net_arc": []}}, "unknown setting 'algo.policy_kwargs.net_arc'"),
         ("ppo", {}, {"policy_kwargs": "dict(net_arch=[8])"}, "policy_kwargs maps names to values"),
         ("ppo", {}, {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
@@ -196,7 +186,7 @@ def test_shipped_hyperparameters_pass_the_check_of_settings():
         new_run(problem_of(ID), RunOptions(algorithm, control, overrides={"learning_rate": 1e-4}))
 
 
-def test_settings_reach_environment_and_algorithm():
+def test_settings_reach_the_environment():
     keywords = {"range_sigma": 60.0, "reward": "log-likelihood", "dtype": "float32"}
     env = training_environment(new_run(problem_of(ID), RunOptions("ppo", envs=2, keywords=keywords))).env
     assert env.task.parameters.range_sigma == 60.0
@@ -219,42 +209,33 @@ def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm, tmp_path):
     keywords = {"range_sigma": 60.0, "horizon": 40, "reward": "log-likelihood"}
-    run = new_run(
-        problem_of(ID), RunOptions(algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
-    )
-    run = trained(open_run(tmp_path, run, False), tmp_path)
+    options = RunOptions(algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
+
+    def asked(**more):
+        return new_run(problem_of(ID), replace(options, **more))
+
+    trained(open_run(tmp_path, asked(), False), tmp_path)
     kept = load_run(tmp_path)
     assert kept.hyperparameters["env_kwargs"] == keywords
-    for word in ("env.range_sigma=60.0", "env.horizon=40", "env.reward="):
-        assert f"--set {word}" in kept.command.replace("'", "")
     assert parse_settings(words_of(kept.command))[0] == keywords
     dataset = evaluate(ID, ["imm"], episodes=8, split="validation", range_sigma=60.0, horizon=40)
     assert kept.validation[0]["paper_cost"] == pytest.approx(float(dataset["cost"].mean()), rel=1e-12)
     # The same again goes on, other settings are refused, and none are those of the run.
-    again = new_run(
-        problem_of(ID), RunOptions(algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords=keywords)
-    )
-    open_run(tmp_path, again, True)
-    other = new_run(
-        problem_of(ID),
-        RunOptions(
-            algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords={**keywords, "range_sigma": 61.0}
-        ),
-    )
+    open_run(tmp_path, asked(steps=480), True)
     with pytest.raises(ValueError, match=r"hyperparameters.env_kwargs.range_sigma 60.0, not 61.0"):
-        open_run(tmp_path, other, True)
-    none = new_run(problem_of(ID), RunOptions(algorithm, "gain", 480, 4))
-    run = open_run(tmp_path, none, True, same=True)
+        open_run(tmp_path, asked(steps=480, keywords={**keywords, "range_sigma": 61.0}), True)
+    run = open_run(tmp_path, asked(steps=480, keywords={}, overrides={}), True, same=True)
     assert run.hyperparameters == kept.hyperparameters
     assert trained(run, tmp_path, resume=True).steps_done >= 480
     # What is exported is checked under the same parameters; an evaluation is of whatever it is asked for.
     out = tmp_path / "agent.safetensors"
     cost = export_run(tmp_path, out).exported["cost"]
-    own = evaluate(ID, [str(out)], episodes=32, split="validation", range_sigma=60.0, horizon=40)
-    assert cost == pytest.approx(float(own["cost"].mean()), rel=1e-9)
-    assert float(evaluate(ID, [str(out)], episodes=32, split="validation")["cost"].mean()) != pytest.approx(
-        cost
+    own, other = (
+        float(evaluate(ID, [str(out)], episodes=32, split="validation", **parameters)["cost"].mean())
+        for parameters in ({"range_sigma": 60.0, "horizon": 40}, {})
     )
+    assert cost == pytest.approx(own, rel=1e-9)
+    assert cost != pytest.approx(other)
 
 
 def words_of(command):
@@ -263,16 +244,13 @@ def words_of(command):
     return [word for before, word in itertools.pairwise(words) if before == "--set"]
 
 
-def rows(folder):
-    return [row for file in sorted(folder.glob("*.csv")) for row in csv.DictReader(file.open())]
-
-
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_validations_are_curves_in_the_log(algorithm, tmp_path):
     run = new_run(problem_of(ID), RunOptions(algorithm, "gain", 800, 4, overrides=SMALL[algorithm]))
-    trainer = train_bptt if algorithm == "bptt" else train_sb3
-    trainer(run, Session(tmp_path, validate_every=300))
-    validated = [row for row in rows(tmp_path / "log") if row.get("validation/cost")]
+    trained(run, tmp_path, validate_every=300)
+    [file] = (tmp_path / "log").glob("*.csv")
+    with file.open() as content:
+        validated = [row for row in csv.DictReader(content) if row.get("validation/cost")]
     assert len(validated) == len(run.validation) > 1
     for row, entry in zip(validated, run.validation, strict=True):
         # The log rounds nothing but what float to text does.
@@ -280,32 +258,17 @@ def test_validations_are_curves_in_the_log(algorithm, tmp_path):
         assert float(row["validation/paper_cost"]) == pytest.approx(entry["paper_cost"])
         assert float(row["validation/cost_vs_paper"]) == pytest.approx(entry["relative_cost_difference"][0])
         assert int(row["time/total_timesteps"]) == entry["steps"]
+    if importlib.util.find_spec("tensorboard") is not None:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-
-@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
-def test_tensorboard_shows_validations_over_environment_steps(algorithm, tmp_path):
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    run = new_run(problem_of(ID), RunOptions(algorithm, "gain", 800, 4, overrides=SMALL[algorithm]))
-    trainer = train_bptt if algorithm == "bptt" else train_sb3
-    trainer(run, Session(tmp_path, validate_every=300))
-    events = EventAccumulator(str(tmp_path / "log"))
-    events.Reload()
-    shown = [(event.step, event.value) for event in events.Scalars("validation/cost")]
-    expected = [(entry["steps"], entry["cost"]) for entry in run.validation]
-    np.testing.assert_allclose(shown, expected, rtol=1e-6)
+        events = EventAccumulator(str(tmp_path / "log"))
+        events.Reload()
+        shown = [(event.step, event.value) for event in events.Scalars("validation/cost")]
+        expected = [(entry["steps"], entry["cost"]) for entry in run.validation]
+        np.testing.assert_allclose(shown, expected, rtol=1e-6)
 
 
 # --- mixtures
-
-
-def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
-    for scenario in ({"random": 0.8, "paper": 0.2}, "random:0.8,paper:0.2"):
-        with pytest.raises(
-            ValueError, match=r"scenario 'paper' is held out: train on a training scenario \(random\)"
-        ):
-            new_run(problem_of(ID), RunOptions("ppo", scenario=scenario))
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
@@ -331,8 +294,8 @@ def test_training_on_a_mixture(algorithm, tmp_path):
         for name, weight in mixture.items()
     ]
     assert run.validation[0]["paper_cost"] == pytest.approx(sum(costs), rel=1e-12)
-    resumed = open_run(tmp_path, asked(steps=400), True)
-    assert trained(resumed, tmp_path, resume=True).steps_done >= 400
+    resumed = open_run(tmp_path, asked(steps=240), True)
+    assert trained(resumed, tmp_path, resume=True).steps_done >= 240
     assert export_run(tmp_path, tmp_path / "agent.safetensors").scenario == run.scenario
 
 
@@ -372,33 +335,12 @@ def test_options_of_a_reset_reach_the_environments_of_an_adapter():
         env.reset()
 
 
-def test_command_line(command, tmp_path):
+def test_settings_of_the_command_line(command, tmp_path):
     config = tmp_path / "mine.yml"
-    config.write_text("env: {range_sigma: 70.0}\nalgo: {hidden_size: 4, truncation: 40, n_envs: 4}\n")
-    words = (
-        "train",
-        ID,
-        "--algo",
-        "bptt",
-        "--control",
-        "gain",
-        "--steps",
-        400,
-        "--out",
-        tmp_path / "run",
-        "--no-compare",
-    )
-    code, _, errors = command(
-        *words,
-        "--config",
-        config,
-        "--set",
-        "algo.hidden_size=3",
-        "--set",
-        "env.horizon=50",
-        "--reward",
-        "log-likelihood",
-    )
+    config.write_text("env: {range_sigma: 70.0}\nalgo: {hidden_size: 4, truncation: 40, n_envs: 2}\n")
+    words = ("train", ID, "--algo", "bptt", "--control", "gain", "--no-compare", "--out", tmp_path / "run")
+    settings = ("--config", config, "--set", "algo.hidden_size=3", "--set", "env.horizon=50")
+    code, _, errors = command(*words, *settings, "--reward", "log-likelihood", "--steps", 100)
     assert code == 0, errors
     run = load_run(tmp_path / "run")
     assert run.hyperparameters["hidden_size"] == 3
@@ -407,11 +349,8 @@ def test_command_line(command, tmp_path):
         "horizon": 50,
         "reward": "log-likelihood",
     }
-    code, _, errors = command(*words, "--envs", 4, "--resume")
+    code, _, errors = command(*words, "--envs", 2, "--resume", "--steps", 100)
     assert code == 0, errors
-    code, _, errors = command(*words, "--envs", 4, "--resume", "--set", "env.horizon=60")
+    code, _, errors = command(*words, "--envs", 2, "--resume", "--set", "env.horizon=60")
     assert code == 2
     assert "hyperparameters" in errors
-    code, _, errors = command(*words, "--set", "env.horzon=60")
-    assert code == 2
-    assert "did you mean 'env.horizon'" in errors

@@ -63,20 +63,6 @@ def test_is_the_integral_that_defines_it(x):
             assert Q[i, j] == pytest.approx(2 * alpha * 1.5**2 * value, rel=1e-12)
 
 
-def test_two_half_steps_are_one_step():
-    alpha, sigma, T = 0.1, 23.7, 0.5
-    half, Q = singer.transition(alpha, T / 2), singer.process_noise(alpha, sigma, T / 2)
-    assert half @ half == pytest.approx(singer.transition(alpha, T), rel=1e-14)
-    assert half @ Q @ half.T + Q == pytest.approx(singer.process_noise(alpha, sigma, T), rel=1e-13)
-
-
-def test_acceleration_stays_stationary_and_noise_positive():
-    for alpha in (1e-6, 0.025, 0.1, 3.0):
-        Phi, Q = singer.transition(alpha, 0.5), singer.process_noise(alpha, 2.0, 0.5)
-        assert Phi[2, 2] ** 2 * 4.0 + Q[2, 2] == pytest.approx(4.0, rel=1e-14)
-        numpy.linalg.cholesky(Q)
-
-
 def test_constant_acceleration_is_the_limit():
     assert singer.transition(0.0, 2.0) == pytest.approx(
         numpy.array([[1.0, 2.0, 2.0], [0.0, 1.0, 2.0], [0.0, 0.0, 1.0]]), abs=0.0

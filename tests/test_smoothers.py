@@ -15,9 +15,9 @@ from filtergym.baselines.maneuvering_target.smoothers import (
     KalmanTurnIMMSmoother,
 )
 from filtergym.baselines.problem import problem_of
-from filtergym.baselines.table import Baselines, Variant
+from filtergym.baselines.table import Variant
 from filtergym.evaluation.competitors.filters import put_in_loop
-from filtergym.evaluation.competitors.kinds import RANKED, kind_of
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.filters import kalman
 from models import make_model
@@ -30,7 +30,6 @@ from filtergym.reports.tables.benchmark import result_of
 from filtergym.reports.tables.ranking import (
     best_of_origins,
     ranking,
-    ranking_sentence,
     remarks,
 )
 from filtergym.reports.tables.results import Settings
@@ -40,7 +39,6 @@ TARGET = "filtergym/ManeuveringTarget-v0"
 SMOOTHERS = baselines_of(TARGET).smoothers
 
 
-@pytest.mark.parametrize("scenario", ["random", "missed-detections", "irregular-scans"])
 @pytest.mark.parametrize(
     ("smoother", "estimator"),
     [
@@ -48,9 +46,9 @@ SMOOTHERS = baselines_of(TARGET).smoothers
         (KalmanTurnIMMSmoother, KalmanTurnInteractingMultipleModel),
     ],
 )
-def test_a_smoother_without_lag_says_what_its_filter_says(smoother, estimator, scenario):
+def test_a_smoother_without_lag_says_what_its_filter_says(smoother, estimator):
     found = evaluate(
-        TARGET, {"smoother": Variant(smoother, lag=0), "filter": estimator}, scenario=scenario, episodes=9
+        TARGET, {"smoother": Variant(smoother, lag=0), "filter": estimator}, scenario="random", episodes=9
     )
     for name, size in (("error", 1e5), ("nees", 1.0)):
         one, other = (found[name].sel(policy=policy).values for policy in ("smoother", "filter"))
@@ -101,54 +99,43 @@ def test_the_whole_track_is_its_least_squares_solution():
 
 
 def test_smoothers_are_marked_and_never_ranked():
-    names = ["imm", "kalman-imm", "imm-smoother", "imm-lag-5", "known-turn"]
-    found = evaluate(TARGET, names, scenario="paper", episodes=30)
-    records = tidy_records(found)
+    names = ["imm", "kalman-imm", "imm-smoother", "known-turn"]
+    dataset = evaluate(TARGET, names, scenario="paper", episodes=20, drawn_episodes=1)
+    records = tidy_records(dataset)
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
     assert min(cost, key=cost.get) == "imm-smoother"
-    assert "smoother" not in RANKED
     of_smoother = {r.metric for r in records if r.policy == "imm-smoother"}
     assert {"cost", "rmse", "anees", "relative_cost_difference"} < of_smoother
     assert not {"score", "behind_best", "log_likelihood", "anis"} & of_smoother
     assert {r.component or r.policy for r in records if r.metric == "behind_best"} <= {"kalman-imm", "imm"}
     assert [place.name for place in ranking(records)] == ["kalman-imm", "imm"]
-    assert ranking_sentence(records, "imm").startswith(
-        "On `paper` `kalman-imm` (estimator) has the lowest error cost"
-    )
     tables = results_tables(records, problem_of(TARGET).knows, 200)
-    assert "Not causal, with later measurements: imm-smoother, imm-lag-5." in tables[-1].caption
+    assert "Not causal, with later measurements: imm-smoother." in tables[-1].caption
     assert [name for name, *_ in rank_competitors(records)] == [
         "kalman-imm",
         "imm",
         "imm-smoother",
-        "imm-lag-5",
         "known-turn",
     ]
+    found = result_of(problem_of(TARGET), dataset, records, curves_of(dataset), [])
+    assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
+    assert "imm-smoother" not in " ".join([*outcome_sentences([found]), *remarks([found])])
+    page = report_html([found], Settings("filtergym benchmark", {}))
+    assert "Not causal, with later measurements: <code>imm-smoother</code>." in page
 
 
-@pytest.mark.claims
-def test_a_longer_lag_is_better_and_all_later_scans_are_best():
-    lags = {f"{lag}": Variant(KalmanIMMSmoother, lag=lag) for lag in (0, 1, 2, 5, None)}
-    found = evaluate(TARGET, lags, scenario="random", episodes=40)
-    costs = [float(found["cost"].sel(policy=name).mean()) for name in lags]
-    assert costs == sorted(costs, reverse=True)
-    assert costs[-1] < 0.4 * costs[0]
-    assert (found["lost"].values == 0.0).all()
-
-
-@pytest.mark.parametrize("name", SMOOTHERS)
-def test_shipped_smoothers_run_forward_compiled(name):
+def test_shipped_smoothers_run_forward_compiled():
     model = make_model(TARGET, horizon=40, backend="compiled")
-    looped = put_in_loop(model, SMOOTHERS[name], "smoother", name, 8)
-    assert looped.backend == "compiled"
-    assert not looped.filter.in_python
-    assert kind_of(SMOOTHERS[name]) == "smoother"
+    for name, maker in SMOOTHERS.items():
+        looped = put_in_loop(model, maker, "smoother", name, 8)
+        assert looped.backend == "compiled"
+        assert not looped.filter.in_python
+        assert kind_of(maker) == "smoother"
 
 
-@pytest.mark.parametrize("env", ["filtergym/UavAutopilot-v0", "filtergym/TightlyCoupledNavigation-v0"])
-def test_a_closed_loop_refuses_smoothers(env):
+def test_a_closed_loop_refuses_smoothers():
     with pytest.raises(ValueError, match=r"smoother 'mine' cannot run in .* a closed loop"):
-        evaluate(env, {"mine": PythonSmoother}, episodes=1)
+        evaluate("filtergym/UavAutopilot-v0", {"mine": PythonSmoother}, episodes=1)
 
 
 class PythonSmoother:
@@ -235,8 +222,8 @@ def test_what_is_not_finite_loses_the_episode():
     np.testing.assert_array_equal(errors[0, [0, 2]], errors[1, [0, 2]])
 
 
-@pytest.mark.parametrize("name", ["imm-smoother", "imm-turn-smoother"])
-def test_episodes_of_a_recording_are_smoothed_each_to_its_end_without_truth(name):
+def test_episodes_of_a_recording_are_smoothed_each_to_its_end_without_truth():
+    name = "imm-turn-smoother"
     made = dataclasses.replace(record(TARGET, scenario="random", episodes=3, horizon=24), truth=None)
     lengths = np.array([24, 7, 4])
     there = np.arange(made.seconds.shape[1]) < lengths[:, None]
@@ -269,21 +256,6 @@ def test_recordings_are_shown_to_smoothers_but_not_to_references():
     assert not {"known-turn", "known-input-bound"} & set(names)
 
 
-def test_a_table_of_baselines_names_smoothers_as_what_they_are():
-    table = Baselines(TARGET, {}, smoothers={"mine": PythonSmoother})
-    assert table.names == ("mine",)
-
-
-def test_reports_mark_smoothers_and_compare_them_with_nobody():
-    names = ["imm", "kalman-imm", "imm-smoother", "known-turn"]
-    dataset = evaluate(TARGET, names, scenario="paper", episodes=20, drawn_episodes=1)
-    found = result_of(problem_of(TARGET), dataset, tidy_records(dataset), curves_of(dataset), [])
-    assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
-    assert "imm-smoother" not in " ".join([*outcome_sentences([found]), *remarks([found])])
-    page = report_html([found], Settings("filtergym benchmark", {}))
-    assert "Not causal, with later measurements: <code>imm-smoother</code>." in page
-
-
 class Holds:
     """The initial estimate, whatever is measured."""
 
@@ -304,18 +276,8 @@ class HoldsToTheEnd(Holds):
         return np.stack(means, axis=1), np.stack(covariances, axis=2)
 
 
-@pytest.mark.parametrize(
-    ("env", "keywords"),
-    [
-        ("filtergym/LooselyCoupledNavigation-v0", {"horizon": 40, "axes": 2}),
-        ("filtergym/RadarEsmTracking-v0", {"horizon": 24}),
-        (
-            "filtergym/TightlyCoupledNavigation-v0",
-            {"scenario": "rates-lost", "horizon": 12, "decision_interval": 3},
-        ),
-    ],
-)
-def test_every_open_loop_takes_a_smoother(env, keywords):
+def test_another_open_loop_takes_a_smoother():
+    env, keywords = "filtergym/LooselyCoupledNavigation-v0", {"horizon": 40, "axes": 2}
     makers = {"smoother": HoldsToTheEnd, "estimator": Holds}
     found = evaluate(env, makers, episodes=9, backend="numpy", **keywords)
     for name in ("error", "cost", "nees", "lost"):

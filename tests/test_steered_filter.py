@@ -63,7 +63,7 @@ def estimates(model, episode):
 def test_a_traced_policy_does_what_it_does_when_it_is_asked(environment, name, options):
     problem = import_problem(f"filtergym/{environment}-v0")
     maker = find_competitor(problem, name)
-    control = control_of(maker, "policy", None, problem.task, name)
+    control = control_of(maker, None, problem.task, name)
     keywords = {"horizon": HORIZON, **getattr(maker, "task_keywords", {}), **options}
     model = make_model(problem.task, control, backend="compiled", **keywords)
     asked = run_competitor(model, maker, "policy", SEEDS, estimates)

@@ -168,11 +168,6 @@ def test_a_filter_that_is_right_passes_and_one_with_a_mistake_does_not(radar):
 # --- what is done
 
 
-def lengthened(test):
-    """Stream of the unaltered measurements."""
-    return test.streams[UNALTERED.name]
-
-
 @pytest.fixture(
     scope="module", params=["filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"]
 )
@@ -188,7 +183,7 @@ def arrays(part):
 
 
 def test_nothing_is_altered_before_it_happens_and_truth_belongs_to_what_is_measured(tested):
-    plain = lengthened(tested)
+    plain = tested.streams[UNALTERED.name]
     for name, stream in tested.streams.items():
         if stream is None:
             continue
@@ -206,7 +201,7 @@ def test_nothing_is_altered_before_it_happens_and_truth_belongs_to_what_is_measu
 
 def test_each_alteration_does_what_it_says():
     test = CrashTest(problem_of("filtergym/ManeuveringTarget-v0").experiment("paper", 8), 0, None, SHORT)
-    plain, streams = lengthened(test), test.streams
+    plain, streams = test.streams[UNALTERED.name], test.streams
     k = SETTLED
     interval = {name: stream.measurements.interval[:, 0] for name, stream in streams.items()}
     T = interval[UNALTERED.name][0]
@@ -296,13 +291,6 @@ def test_what_keeps_something_to_itself_cannot_be_restored(radar):
     assert (found.verdict, found.reason) == ("failed", "another estimate 1 measurement after it was restored")
 
 
-def test_who_needs_the_truth_is_refused(radar):
-    problem = problem_of("filtergym/ManeuveringTarget-v0")
-    test = CrashTest(problem.experiment(None, 8), 0, None, [UNALTERED._replace(length=8)])
-    with pytest.raises(ValueError, match="of kind reference and cannot run online"):
-        unaltered(test, problem.competitor("known-turn"))
-
-
 def test_the_command_prints_a_line_each_and_writes_both_files(command, tmp_path, monkeypatch):
     monkeypatch.setattr(CrashTest.__init__, "__defaults__", (None, SHORT[:3]))
     written = tmp_path / "found.json", tmp_path / "found.html"
@@ -316,9 +304,4 @@ def test_the_command_prints_a_line_each_and_writes_both_files(command, tmp_path,
     page = written[1].read_text()
     assert "nothing is received for 10 scans" in page
     assert "<script" not in page
-
-
-def test_what_has_answered_already_is_refused(command):
-    code, _, said = command("stress", "filtergym/ManeuveringTarget-v0", "file:mine.csv")
-    assert code == 2
-    assert "has answered already, and a crash test asks" in said
+    assert "has answered already" in command("stress", "filtergym/ManeuveringTarget-v0", "file:mine.csv")[2]

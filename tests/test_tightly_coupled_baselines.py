@@ -6,13 +6,12 @@ import numpy
 import pytest
 import scipy.linalg
 import scipy.stats
-from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import VAGUE, FaultHypotheses
-from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from filtergym.envs.tightly_coupled_navigation.parameters import LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.satellite_faults import SatelliteFaults
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.running.rollout import rollout
@@ -28,43 +27,17 @@ from filtergym import evaluate, tidy_records
 from filtergym.papers import multi_hypothesis_ins_gnss as paper
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
-KNOWN = baselines_of(ID)
 
 
 # --- reference and bound
 
 
-@pytest.fixture(scope="module")
-def matched():
-    """All policies where Singer's filter is optimal."""
-    names = [*KNOWN.policies, "known-mode", "known-mode-bound"]
-    return evaluate(ID, names, "matched", episodes=16, horizon=150, decision_interval=1)
-
-
-@pytest.mark.claims
-def test_known_mode_is_the_singer_filter_where_all_is_singer(matched):
+def test_known_mode_is_the_singer_filter_where_all_is_singer():
+    names = ["known-mode", "singer"]
+    matched = evaluate(ID, names, "matched", episodes=4, horizon=60, decision_interval=1)
     one, other = (matched["error"].sel(policy=name).values for name in ("known-mode", "singer"))
     # Both form the same numbers; the bank adds mixing with weights of zero, in another order.
     numpy.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.claims
-def test_nobody_beats_the_optimal_filter_where_it_is_optimal(matched):
-    """A policy that is significantly better than the optimum has found a leak."""
-    cost = matched["cost"].mean("time")
-    for name in KNOWN.policies:
-        difference = (cost.sel(policy=name) - cost.sel(policy="known-mode")).values
-        assert difference.mean() > -3 * difference.std() / math.sqrt(len(difference)) - 1e-9, name
-
-
-@pytest.mark.claims
-def test_bound_is_what_the_optimal_filter_reaches(matched):
-    squares = (matched["error"].sel(policy="known-mode") ** 2).values[:, 50:]
-    mean_square = matched["mean_square"].sel(policy="known-mode-bound").values[:, 50:]
-    ratio = (squares / mean_square).mean(axis=1)
-    error = ratio.std(axis=0) / math.sqrt(len(ratio))
-    # 17 components, 16 runs: five standard errors, and room for their own scatter.
-    assert (abs(ratio.mean(axis=0) - 1.0) < 5 * error + 0.15).all()
 
 
 def test_bound_is_the_dense_recursion():
@@ -88,7 +61,7 @@ def test_bound_is_the_dense_recursion():
     run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
     bounds = [episode.filter.own.mean for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
-    assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
+    assert numpy.stack([s.disturbances["stuck"].now for _, s in seen]).any(axis=0).all()
     p, S = model.task.parameters, model.task.satellites
     identity = numpy.eye(17)[:, :, None, None]
     F = [
@@ -103,7 +76,8 @@ def test_bound_is_the_dense_recursion():
     for i in (8, 9, 10):
         Q[LINE][i, i] = 0.0  # the acceleration of straight flight is zero, not nearly
     for lane in range(8):
-        coloured, decay = seen[0][1].coloured_deviation[lane], seen[0][1].coloured_decay[lane]
+        colour = seen[0][1].disturbances["coloured"]
+        coloured, decay = colour.deviation[lane], colour.process.decay[lane]
         P = numpy.diag([*model.task.world.initial_sigma[:, 0] ** 2, *[coloured**2] * S])
         mode = int(seen[0][1].mode[lane])
         for (said, truth), mean_square in zip(seen, bounds, strict=True):
@@ -119,7 +93,7 @@ def test_bound_is_the_dense_recursion():
             H = numpy.hstack([dense(rows, truth.state)[..., lane], numpy.eye(len(rows), S)])
             R = numpy.array(model.task.sensor_variance) * truth.noise_factor[:, lane] ** 2
             there = said.available[:, lane] > 0.0
-            there[2 * S : 2 * S + 3] &= truth.stuck[lane] == 0.0
+            there[2 * S : 2 * S + 3] &= truth.disturbances["stuck"].now[lane] == 0.0
             H, R = H[there], numpy.diag(R[there])
             P = P - P @ H.T @ numpy.linalg.solve(H @ P @ H.T + R, H @ P)
             # Subtraction of the dense form: 100 m^2 and 1e-6 (rad/s)^2 stand in one matrix.
@@ -129,49 +103,10 @@ def test_bound_is_the_dense_recursion():
 
 @pytest.fixture(scope="module")
 def on_random():
-    names = ["multi-hypothesis", "sticky", "singer", "known-mode", "known-mode-bound"]
-    return evaluate(ID, names, episodes=32, horizon=400)
-
-
-@pytest.mark.claims
-def test_known_mode_is_no_worse_than_singer_on_any_leg(on_random):
-    records = {
-        (r.policy, r.component): r.value for r in tidy_records(on_random) if r.metric == "rmse_by_hypothesis"
-    }
-    for hypothesis in HYPOTHESES:
-        for component in ("position", "velocity"):
-            name = f"{component} {hypothesis}"
-            assert records["known-mode", name] <= 1.02 * records["singer", name], name
-
-
-@pytest.mark.claims
-def test_known_mode_reports_an_honest_covariance(on_random):
-    nees = on_random["nees"].sel(policy="known-mode").values.mean(axis=1) / 17
-    # At rest velocity and acceleration are known exactly; the filter keeps a little noise: below one.
-    assert 0.5 < nees.mean() < 1.0 + 4 * nees.std() / math.sqrt(len(nees))
-
-
-@pytest.mark.claims
-def test_bound_is_below_the_reference(on_random):
-    bound = on_random["mean_square"].sel(policy="known-mode-bound").values.mean(axis=1)
-    squares = (on_random["error"].sel(policy="known-mode").values ** 2).mean(axis=1)
-    difference = squares - bound
-    assert (difference.mean(axis=0) > -4 * difference.std(axis=0) / math.sqrt(len(squares))).all()
+    return evaluate(ID, ["singer", "known-mode", "known-mode-bound"], episodes=16, horizon=400)
 
 
 # --- the bank over faults
-
-
-@pytest.mark.claims
-def test_the_bank_over_faults_is_honest_and_no_better_than_its_reference():
-    names = ["stuck-check", "fault-hypotheses", "known-mode"]
-    data = evaluate(ID, names, episodes=64, seed=4, split="validation")
-    cost, nees = data["cost"].mean("time"), data["nees"].sel(policy="fault-hypotheses").mean("time") / 17
-    paired = (cost.sel(policy="fault-hypotheses") - cost.sel(policy="known-mode")).values
-    assert paired.mean() > -3.0 * paired.std() / math.sqrt(len(paired))
-    assert cost.sel(policy="fault-hypotheses").median() < cost.sel(policy="stuck-check").median()
-    # Within a factor of two: moments of mixtures, and rest that is known better than it is said to be.
-    assert 0.5 < float(nees.mean()) < 2.0
 
 
 def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
@@ -189,7 +124,7 @@ def test_the_bank_over_faults_leaves_a_satellite_that_jumps_to_its_own_error():
     for _episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
         truth = _episode.truth
     errors = (found[-1][0] * found[-1][1]).sum(axis=1)
-    place = truth.faults.ramp_satellite.astype(int)
+    place = truth.disturbances["ramp"].satellites[0].astype(int)
     lanes = numpy.arange(8)
     before = (found[90][0] * found[90][1]).sum(axis=1)
     # What was there before, 2 m of the prior, is left in.
@@ -214,7 +149,7 @@ def test_the_bank_over_satellite_faults_believes_the_fault_that_is_there():
     estimator = Watched(model.task)
     for episode, _ in rollout(model, estimator, episode_seeds("test", 4, 8), kind="estimator"):
         truth = episode.truth
-    place, lanes = truth.faults.ramp_satellite.astype(int), numpy.arange(8)
+    place, lanes = truth.disturbances["ramp"].satellites[0].astype(int), numpy.arange(8)
     assert found[38].weights[0].min() > 0.9
     last = found[-1]
     assert last.weights.sum(axis=0) == pytest.approx(1.0, rel=1e-12)
@@ -274,8 +209,6 @@ def test_sticky_changes_the_chain_of_the_bank():
     assert policies.chain(0.998) == pytest.approx(
         numpy.array(make_model(ID).task.parameters.transition), abs=1e-15
     )
-    error = evaluate(ID, ["sticky", "multi-hypothesis"], episodes=4, horizon=40)["error"]
-    assert (error.sel(policy="sticky") != error.sel(policy="multi-hypothesis")).any()
 
 
 def observed(model, **values):
@@ -319,7 +252,7 @@ def test_stuck_check_switches_stuck_accelerometers_off():
             return action, state
 
     states = [episode for episode, _ in rollout(model, Watched(model), episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([s.truth.stuck for s in states]) > 0.0
+    stuck = numpy.stack([s.truth.disturbances["stuck"].now for s in states]) > 0.0
     assert stuck.any()
     # A decision is told of the measurements since the last one; the first of one.
     first = [max(0, (k - 1) * model.task.decision_interval + 1) for k in range(len(actions))]
@@ -399,16 +332,6 @@ def test_robust_is_between_the_paper_and_hubers_update():
     assert abs(error.sel(policy="robust") - error.sel(policy="paper")).max() > 1e-3
 
 
-def test_fixed_robust_is_the_same_under_every_reach():
-    costs = [
-        evaluate(ID, ["fixed-robust-tuned"], episodes=8, horizon=60, backend="numpy", noise_reach=reach)[
-            "cost"
-        ]
-        for reach in (0.3, 1.0)
-    ]
-    numpy.testing.assert_allclose(*costs, rtol=1e-9)
-
-
 def test_accelerometers_are_noisier_while_they_repeat_themselves():
     model = make_model(ID, "robust", scenario="accelerometer-failure")
     state = model.filter.start(Initial(numpy.zeros((17, 2)), numpy.stack([numpy.eye(17)] * 2, axis=2)))
@@ -462,7 +385,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
 
     estimator.bank.predict = watched
     told = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([episode.truth.stuck for episode in told])
+    stuck = numpy.stack([episode.truth.disturbances["stuck"].now for episode in told])
     there = numpy.stack([episode.measurement.available for episode in told])
     assert stuck.any()
     assert (there == 0.0).any()
@@ -516,7 +439,7 @@ def test_metrics_follow_from_the_dataset(on_random):
     value = records["singer", "rmse_by_hypothesis", "velocity singer"].value
     assert value == pytest.approx(math.sqrt(squares[mode == SINGER].mean()), rel=1e-12)
     cost = numpy.sort(run["cost"].values.mean(axis=1))
-    assert records["singer", "cost_median", ""].value == cost[15]
+    assert records["singer", "cost_median", ""].value == cost[7]
     # A filter that believes one hypothesis for ever follows every change to it at once, and no other.
     assert records["singer", "adaptation_time", "rest to singer"].value == pytest.approx(0.01, rel=1e-12)
     assert records["singer", "adaptation_censored", "singer to constant-velocity"].value == 1.0
@@ -524,25 +447,6 @@ def test_metrics_follow_from_the_dataset(on_random):
     # A reference says what it estimates, not what it expects.
     assert not {m for p, m, _ in records if p == "known-mode"} & {"track_loss_rate", "adaptation_time"}
     assert not [r for r in records if r[0] == "known-mode-bound" and r[1] == "cost_median"]
-
-
-@pytest.mark.claims
-def test_loss_of_track_is_found_and_timed():
-    dataset = evaluate(
-        ID, ["singer", "constant-velocity"], "paper", episodes=12, leg_steps=(150, 1000), horizon=280
-    )
-    records = {(r.policy, r.metric): r for r in tidy_records(dataset)}
-    assert records["singer", "track_loss_rate"].value == 1.0
-    assert 0.67 <= records["singer", "track_loss_time"].value <= 0.77
-    assert records["constant-velocity", "track_loss_rate"].value == 0.0
-    assert ("constant-velocity", "track_loss_time") not in records
-
-
-def test_known_mode_keeps_its_tracking_loops():
-    model = make_model(ID, "evidence", "paper", leg_steps=(40, 80), horizon=120)
-    run = rollout(model, references.KnownMode, episode_seeds("test", 6, 8))
-    available = [episode.measurement.available for episode, _ in run]
-    assert numpy.stack(available).min() == 1.0
 
 
 # --- reproduction
@@ -566,21 +470,6 @@ def test_filters_side_by_side_are_the_filters_alone():
             numpy.testing.assert_allclose(run.nis, nis[: len(run.nis)], rtol=1e-5)
     # 3 runs of 40 steps with 14 degrees: standard error 0.035; at rest a little below one.
     assert 0.75 < known.nis.mean() < 1.14
-
-
-@pytest.mark.claims
-def test_slower_adaptation_without_rates():
-    keywords = {"horizon": 300, "leg_steps": (200, 1000)}
-    quick, slow = (
-        experiment.waits_of(
-            experiment.simulate("paper", {"adaptive": 16}, **keywords, **more)["adaptive"], REST, LINE
-        )
-        for more in ({}, {"rate_sigma": experiment.NOTHING})
-    )
-    assert 0.01 <= quick.mean <= 0.03
-    assert slow.never == 0
-    # 0.48 s after a leg 1 of 1000 steps; the position is less well known after 200.
-    assert 0.3 < slow.mean < 0.6
 
 
 def fake_run(episodes, steps, motion, lost):

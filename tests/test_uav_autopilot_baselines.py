@@ -32,6 +32,8 @@ ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])
 NAMES = list(baselines_of(ID).benchmark)
 EPISODES = 100
+SAME = ("kalman", "steady-kalman", "matched", "known-noise-bound")
+"""Those that are one filter where the noise is nominal."""
 
 
 @cache
@@ -174,24 +176,6 @@ def innovations_of_matched(
     return numpy.stack(nis, axis=-1)[:episodes], numpy.stack(innovation, axis=-1)[:episodes]
 
 
-@BOTH
-@pytest.mark.claims
-def test_matched_filter_is_consistent_and_attains_the_bound_where_noise_changes(plant: str) -> None:
-    dataset = run(plant, "random")
-    matched = dataset.sel(policy="matched")
-    n = dataset.sizes["component"]
-    four_errors(matched["nees"].values.mean(axis=1) / n, 1.0)
-    four_errors(innovations_of_matched(plant, "random")[0].mean(axis=1), 1.0)
-    ratio = (matched["error"] ** 2).mean("time") / dataset["mean_square"].sel(
-        policy="known-noise-bound"
-    ).mean("time")
-    for component in dataset["component"].values:
-        four_errors(ratio.sel(component=component).values, 1.0)
-    # The paper's filter does not know, and shows it: the test can fail.
-    nees = dataset.sel(policy="kalman")["nees"].values.mean(axis=1) / n
-    assert nees.mean() - 1.0 > 10.0 * nees.std() / math.sqrt(len(nees))
-
-
 def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
     """Matrices written out, one episode: levels, dropouts, coloured and constant errors, a slow actuator."""
     keywords = {"sensor_bias": (0.5, 1.0), "actuator_lag": 1.5, "undisturbed": 0.0, "horizon": 60}
@@ -212,7 +196,7 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
     for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, 2)):
         pass
     lane, truth = 1, seen[0][1]
-    psi, kick = truth.coloured_decay[:, lane], truth.coloured_kick[:, lane]
+    psi, kick = (each[:, lane] for each in truth.disturbances["coloured"].process)
     initial = numpy.square(model.task.parameters.value("initial_sigmas"))
     initial[n - 1] *= truth.levels.values[0, lane] ** 2
     x, P = numpy.zeros(n + m), numpy.diag([*initial, *(kick**2 / (1.0 - psi**2))])
@@ -227,7 +211,7 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
         dropped += int((~there).sum())
         H, R = C[there], numpy.diag((sigmas * truth.sensor_level[:, lane])[there] ** 2)
         S = H @ P @ H.T + R
-        nu = (measurement.reading[:, lane] - truth.sensor_bias[:, lane])[there] - H @ x
+        nu = (measurement.reading[:, lane] - truth.disturbances["bias"][:, lane])[there] - H @ x
         K = P @ H.T @ numpy.linalg.inv(S)
         x, P = x + K @ nu, (numpy.eye(n + m) - K @ H) @ P
         if there.any():
@@ -237,13 +221,13 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
         numpy.testing.assert_allclose(covariance[..., lane], P[:n, :n], rtol=0, atol=1e-10)
     assert dropped > 0
     assert (kick > 0.0).all()
-    assert (truth.sensor_bias[:, lane] != 0.0).all()
+    assert (truth.disturbances["bias"][:, lane] != 0.0).all()
 
 
 @BOTH
 def test_bound_is_the_covariance_of_the_nominal_filter_when_the_noise_is_nominal(plant: str) -> None:
     model = make_model(ID, "gain", "paper-noise", plant=plant)
-    bound = run(plant, "paper-noise")["mean_square"].sel(policy="known-noise-bound").values[0]
+    bound = run(plant, "paper-noise", 2, SAME)["mean_square"].sel(policy="known-noise-bound").values[0]
     d = model.task.design  # type: ignore[attr-defined]
     P = numpy.diag(numpy.square(model.task.parameters.value("initial_sigmas")))
     Q = d.model.scaled_noise + d.model.other_noise
@@ -256,22 +240,20 @@ def test_bound_is_the_covariance_of_the_nominal_filter_when_the_noise_is_nominal
 
 @BOTH
 def test_matched_is_the_paper_filter_where_the_noise_is_nominal(plant: str) -> None:
-    for scenario in ("paper-noise", "paper-step"):
-        dataset = run(plant, scenario, names=("kalman", "matched"))
-        # One filter written twice, 600 measurements of a stable loop.
-        for name in ("error", "cost"):
-            one, two = (dataset[name].sel(policy=p).values for p in ("kalman", "matched"))
-            numpy.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
-        for name, two in zip(("nis", "innovation"), innovations_of_matched(plant, scenario), strict=True):
-            one = dataset[name].sel(policy="kalman").values
-            if name == "nis":
-                one = one / dataset["nis_degrees"].sel(policy="kalman").values
-            numpy.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
+    dataset = run(plant, "paper-noise", 2, SAME)
+    # One filter written twice, 600 measurements of a stable loop.
+    for name in ("error", "cost"):
+        one, two = (dataset[name].sel(policy=p).values for p in ("kalman", "matched"))
+        numpy.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
+    nis, innovation = innovations_of_matched(plant, "paper-noise", 2)
+    told = dataset.sel(policy="kalman")
+    numpy.testing.assert_allclose(told["nis"] / told["nis_degrees"], nis, rtol=0, atol=1e-9)
+    numpy.testing.assert_allclose(told["innovation"], innovation, rtol=0, atol=1e-9)
 
 
 @BOTH
 def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
-    dataset = run(plant, "paper-noise")
+    dataset = run(plant, "paper-noise", 2, SAME)
     error = dataset["error"].sel(policy=["kalman", "steady-kalman"])
     gap = numpy.abs(error.diff("policy")).max(["policy", "episode", "component"]).values
     model = make_model(ID, "gain", "paper-noise", plant=plant)
@@ -281,68 +263,7 @@ def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
     assert gap[0] > 0.1
 
 
-@BOTH
-@pytest.mark.claims
-def test_a_bound_does_not_depend_on_the_control_and_nobody_beats_it(plant: str) -> None:
-    dataset = run(plant, "random")
-    bound = dataset["mean_square"].sel(policy="known-noise-bound").mean(["episode", "time"])
-    for name in NAMES:
-        if name in ("true-state", "known-noise-bound"):
-            continue
-        squares = (dataset["error"].sel(policy=name) ** 2).mean("time")
-        low = squares.mean("episode") - 4.0 * squares.std("episode") / math.sqrt(squares.sizes["episode"])
-        assert (low < bound * 1.0001).all() or (squares.mean("episode") > bound).all()
-        assert (squares.mean("episode") + 4.0 * squares.std("episode") / math.sqrt(EPISODES) > bound).all()
-
-
-@BOTH
-def test_the_bound_told_of_a_slow_actuator_holds_for_the_filter_that_is_not(plant: str) -> None:
-    if plant == "P":
-        pytest.skip("plant P has no actuator")
-    dataset = run("U", "actuator-lag", 400, ("kalman", "known-noise-bound"))
-    squares = (dataset["error"].sel(policy="kalman") ** 2).mean("time").values
-    above = squares - dataset["mean_square"].sel(policy="known-noise-bound").mean("time").values
-    error = above.std(axis=0) / math.sqrt(len(above))
-    # The actuator concerns two of the five components; in the others the filter may reach the bound.
-    assert (above.mean(axis=0) > -4.0 * error).all()
-    assert (above.mean(axis=0) > 4.0 * error).sum() == 2
-
-
 # ---------------------------------------------------------------- no leak
-
-
-@BOTH
-@pytest.mark.claims
-def test_nobody_beats_the_optimal_filter_in_its_own_scenario(plant: str) -> None:
-    """White noise, nominal and known: the loop's cost is least with the Kalman filter (separation)."""
-    dataset = run(plant, "paper-noise")
-    cost = dataset["cost"].values[:, :, 200:550].mean(axis=2)
-    paper_cost = cost[NAMES.index("kalman")]
-    for name in NAMES:
-        if name in ("kalman", "matched", "true-state", "known-noise-bound"):
-            continue
-        difference = cost[NAMES.index(name)] - paper_cost
-        assert difference.mean() > -4.0 * difference.std(ddof=1) / math.sqrt(len(difference)), name
-    floor = cost[NAMES.index("true-state")] - paper_cost
-    assert floor.mean() < -10.0 * floor.std() / math.sqrt(len(floor))
-
-
-def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
-    """Why the comparison above stops before the end: no leak, but the optimum is that of an endless loop."""
-
-    class RestAtTheEnd(module.Kalman):
-        def act(
-            self, observation: numpy.ndarray, state: Any, start: numpy.ndarray
-        ) -> tuple[numpy.ndarray, Any]:
-            left = self.task.horizon * (1.0 - observation[:, self.model.columns(["time"])[0]])
-            decades = numpy.where(left < 9.5, -0.6, 0.0)
-            return decades[:, None] / self.task.parameters.gain_decades, None
-
-    dataset = evaluate(ID, {"kalman": module.Kalman, "resting": RestAtTheEnd}, "paper-noise", 200)
-    saved = dataset["cost"].values[0].mean(axis=1) - dataset["cost"].values[1].mean(axis=1)
-    assert saved.mean() > 4.0 * saved.std(ddof=1) / math.sqrt(200)
-    assert saved.mean() < 0.002 * dataset["cost"].values[0].mean()
-    numpy.testing.assert_array_equal(*(dataset["cost"].values[:, :, :589]))
 
 
 # ---------------------------------------------------------------- policies
@@ -393,47 +314,7 @@ def test_adaptive_policy_by_hand() -> None:
         numpy.testing.assert_allclose(action[:, 0], wanted, rtol=1e-12)
 
 
-def test_adaptive_policy_follows_gusts_and_is_misled_by_a_worse_sensor() -> None:
-    action_field = [f.name for f in make_model(ID, "gain").fields].index("action")
-    seen: list[numpy.ndarray] = []
-
-    class Watched(module.InnovationAdaptive):
-        def act(
-            self, observation: numpy.ndarray, state: Any, start: numpy.ndarray
-        ) -> tuple[numpy.ndarray, Any]:
-            seen.append(observation[:, action_field].mean())
-            return super().act(observation, state, start)
-
-    for scenario in ("gust-front", "sensor-degradation"):
-        seen.clear()
-        dataset = evaluate(ID, {"kalman": module.Kalman, "watched": Watched}, scenario, 50)
-        assert numpy.mean(seen[400:]) > numpy.mean(seen[50:149]) + 0.02
-        after = dataset["cost"].values[:, :, 400:].mean(axis=2)
-        difference = after[1] - after[0]
-        t = difference.mean() / (difference.std(ddof=1) / math.sqrt(50))
-        assert t < -4.0 if scenario == "gust-front" else t > 4.0
-
-
 # ---------------------------------------------------------------- metrics
-
-
-def step_records(episodes: int) -> dict[str, Record]:
-    dataset = evaluate(ID, ["kalman"], "paper-step", episodes)
-    return {r.metric: r for r in tidy_records(dataset) if r.window in ("transient", "steady")}
-
-
-@pytest.mark.claims
-def test_step_response_of_the_mean_output() -> None:
-    found = step_records(6400)
-    # The averaged response has noise of 0.003: the response without noise is 0.46 s, 0.54 s, no overshoot.
-    assert found["rise_time"].value == pytest.approx(0.46, abs=0.021)
-    assert found["settling_time"].value == pytest.approx(0.54, abs=0.061)
-    value, low, high = found["mean_output"].value, found["mean_output"].low, found["mean_output"].high
-    assert value is not None
-    assert low is not None
-    assert high is not None
-    assert abs(value - 1.0) < high - low
-    assert found["overshoot"].value == pytest.approx(0.0, abs=0.04)
 
 
 def hand_made(output: numpy.ndarray, **more: Any) -> xarray.Dataset:
@@ -496,25 +377,9 @@ def test_alarms_by_hand() -> None:
     )
 
 
-def test_a_nominal_filter_detects_a_gust_front_and_raises_few_false_alarms() -> None:
-    found = {r.metric: r for r in tidy_records(run("U", "gust-front", 200, ("kalman",))) if r.window == "all"}
-    for name in ("missed_faults", "false_alarms"):
-        assert 0.0 <= (found[name].value or 0.0) < 0.1
-    # At least one measurement, and less than half of the shortest time that is left.
-    assert 0.02 <= (found["detection_delay"].value or 0.0) < 2.5
-
-
-def test_node_four_is_white_for_the_paper_filter_alone() -> None:
-    r = [x for x in tidy_records(run("U", "paper-noise")) if x.metric == "innovation_autocorrelation"]
-    found = {(x.policy, x.window): x.value for x in r}
-    limit = 4.0 / math.sqrt(EPISODES * 350)
-    assert abs(found["kalman", "steady"] or 1.0) < limit
-    assert abs(found["over-smoothed", "steady"] or 0.0) > 10 * limit
-
-
 def test_lost_loops_are_counted_and_every_number_stays_finite() -> None:
     dataset = evaluate(
-        ID, ["kalman", "raw-sensors"], "paper-noise", 10, plant="P", sensors=("position",), horizon=3000
+        ID, ["kalman", "raw-sensors"], "paper-noise", 10, plant="P", sensors=("position",), horizon=1500
     )
     assert numpy.isfinite(dataset["cost"].values).all()
     assert numpy.abs(dataset["output"].values).max() == 1e4
@@ -614,19 +479,6 @@ def test_an_imm_over_equal_gusts_is_one_filter(plant):
     numpy.testing.assert_allclose(error.sel(policy="imm"), error.sel(policy="one"), rtol=0, atol=1e-10)
 
 
-@pytest.mark.claims
-def test_who_learns_the_noise_flies_better_where_it_changes():
-    """Each where its kind of change is meant; intervals of paired differences, 40 episodes."""
-    for scenario, names in (
-        ("sensor-degradation", ("mehra", "sage-husa", "variational-bayes", "gust-imm")),
-        ("gust-front", ("gust-imm",)),
-    ):
-        cost = evaluate(ID, ["kalman", *names], scenario, 40)["cost"].mean("time")
-        for name in names:
-            difference = (cost.sel(policy=name) - cost.sel(policy="kalman")).values
-            assert difference.mean() < -4.0 * difference.std() / math.sqrt(40), (scenario, name)
-
-
 # ---------------------------------------------------------------- the bank over levels
 
 
@@ -663,44 +515,3 @@ def test_a_slow_error_in_the_bank_is_the_one_of_the_told_filter() -> None:
     }
     error = evaluate(ID, makers, "paper-noise", 8, **keywords)["error"]
     numpy.testing.assert_allclose(error.sel(policy="bank"), error.sel(policy="matched"), rtol=0, atol=1e-9)
-
-
-@pytest.mark.claims
-def test_the_banks_win_where_they_should_and_the_told_filter_stays_the_limit() -> None:
-    """Paired differences of 60 episodes, four standard errors; the told filter is below all."""
-    better = {"random": ("level-bank", "level-bank-vague"), "gyro-bias": ("level-bank-vague",)}
-    names = ["kalman", "gust-imm", "level-bank", "level-bank-vague", "matched"]
-    for scenario, winners in better.items():
-        cost = evaluate(ID, names, scenario, 60)["cost"].mean("time")
-
-        def errors(one: str, two: str, cost: Any = cost) -> float:
-            difference = (cost.sel(policy=one) - cost.sel(policy=two)).values
-            return float(difference.mean() / (difference.std(ddof=1) / math.sqrt(len(difference))))
-
-        for name in winners:
-            assert errors(name, "kalman") < -4.0, (scenario, name)
-        for name in names[:-1]:
-            assert errors(name, "matched") > -3.0, (scenario, name)
-
-
-def test_who_knows_the_command_and_no_measurement_scores_below_zero() -> None:
-    """Nothing in an episode can be recited: commands and noise are drawn anew."""
-
-    class OpenLoop:
-        kind = "estimator"
-
-        def __init__(self, task: Any) -> None:
-            self.task, d = task, task.design
-            self.F, self.B = d.model.F, d.model.B
-            self.covariance = d.state_covariance[:, :, None]
-
-        def start(self, initial: Any, N: int) -> Any:
-            return initial.mean
-
-        def update(self, measurement: Any, memory: Any) -> Any:
-            mean = self.F @ memory + self.B * measurement.control
-            return mean, self.covariance + 0.0 * measurement.number, mean
-
-    cost = evaluate(ID, {"kalman": "kalman", "open": OpenLoop}, "random", 60)["cost"].mean("time")
-    difference = (cost.sel(policy="open") - cost.sel(policy="kalman")).values
-    assert difference.mean() > 4.0 * difference.std(ddof=1) / math.sqrt(len(difference))

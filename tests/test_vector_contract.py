@@ -1,13 +1,15 @@
 """The native vector of every environment against Gymnasium's own vector of single environments."""
 
 import copy
+import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from contract import Subject, assert_properties
+from contract import BACKENDS, Subject, assert_properties, continued
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.vector import AutoresetMode
+from models import KINDS
 
 import filtergym  # noqa: F401  (registers the environments)
 
@@ -21,8 +23,9 @@ def test_vectors_of_every_control(env_id, control):
     assert_properties(Subject(env_id, control), BY_CONTROL)
 
 
-def test_vectors_of_every_environment(env_id):
-    assert_properties(Subject(env_id), BY_ENVIRONMENT)
+@pytest.mark.parametrize("env_id", KINDS)
+def test_vectors_of_every_kind_of_environment(env_id):
+    assert_properties(Subject(env_id), BY_KIND)
 
 
 # --- what two vectors return
@@ -133,6 +136,12 @@ def assert_equal_in_company(subject, count, mode):
             np.testing.assert_array_equal(one, other, err_msg="what was returned has been written over")
 
 
+BY_CONTROL = (equals_a_vector_of_single_environments,)
+
+
+# --- of every kind of environment
+
+
 def goes_back_to_a_snapshot_as_often_as_one_likes(subject):
     made = subject.native(3, autoreset_mode=AutoresetMode.SAME_STEP, reward="relative")
     env, (first, *others) = made.unwrapped, subject.actions(made, 3, range(5))
@@ -152,17 +161,10 @@ def goes_back_to_a_snapshot_as_often_as_one_likes(subject):
         subject.native(2).unwrapped.fleet.restore(snapshot)
 
 
-BY_CONTROL = (equals_a_vector_of_single_environments, goes_back_to_a_snapshot_as_often_as_one_likes)
-
-
-# --- of every environment
-
-
-def pays_every_reward_as_the_single_environment(subject):
-    for reward in ("cost", "log-likelihood", "relative"):
-        ours, theirs = subject.native(3, reward=reward), subject.synchronous(3, reward=reward)
-        ours.reset(seed=1), theirs.reset(seed=1)
-        assert_same_steps(ours, theirs, subject.actions(ours, 3, range(8)))
+def pays_as_the_single_environment(subject):
+    ours, theirs = subject.native(3, reward="relative"), subject.synchronous(3, reward="relative")
+    ours.reset(seed=1), theirs.reset(seed=1)
+    assert_same_steps(ours, theirs, subject.actions(ours, 3, range(8)))
 
 
 def draws_the_noise_of_long_episodes_in_blocks(subject):
@@ -241,8 +243,35 @@ def ends_where_it_is_limited(subject):
     assert ends == [False] * 4 + [True], "the task's own horizon still ends the episode"
 
 
-BY_ENVIRONMENT = (
-    pays_every_reward_as_the_single_environment,
+def copies_go_on_as_the_original(subject):
+    """Single and many, on each backend that is here, by each way to copy."""
+    for backend in BACKENDS:
+        assert_copies_go_on(subject.native(3, backend=backend), 8, backend)
+        if (
+            backend != "torch"
+        ):  # single environments go on to the end of an episode of five decisions, vectors beyond
+            assert_copies_go_on(subject.single(backend=backend), 2, backend)
+
+
+def assert_copies_go_on(env, steps, told):
+    """Copies from the middle of an episode return what the original does, in the next episode, too."""
+    env.reset(seed=3)
+    env.action_space.seed(0)
+    first, then = ([env.action_space.sample() for _ in range(n)] for n in (3, steps))
+    continued(env, first)
+    others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    expected = continued(env, then)
+    following = env.reset()[0]
+    for other in others:
+        for one, two in zip(expected, continued(other, then), strict=True):
+            np.testing.assert_array_equal(one, two, err_msg=told)
+        np.testing.assert_array_equal(following, other.reset()[0], err_msg=told)
+
+
+BY_KIND = (
+    pays_as_the_single_environment,
+    goes_back_to_a_snapshot_as_often_as_one_likes,
+    copies_go_on_as_the_original,
     draws_the_noise_of_long_episodes_in_blocks,
     seeds_each_sub_environment,
     has_the_same_noise_under_every_control,

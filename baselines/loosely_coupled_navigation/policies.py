@@ -11,7 +11,8 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
-from ...envs.loosely_coupled_navigation.fault_bank import FEW, TRAINING, VAGUE, FaultBank
+from ...envs.loosely_coupled_navigation.fault_bank import FaultBank
+from ...envs.loosely_coupled_navigation.fault_prior import FEW, TRAINING, VAGUE
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import select_nested

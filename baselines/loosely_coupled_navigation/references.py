@@ -52,6 +52,7 @@ class _Matched:
         "the true intensities of all noises, every change of the receiver's, each outlier, and onset, end and rate of "
         "the spoofing"
     )
+    disturbances = ("coloured", "outage", "jamming", "spoofing", "noise_changes", "outliers")
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:
         self.xp, self.sampling = task.xp, task.parameters.sampling
@@ -62,7 +63,7 @@ class _Matched:
         xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
-        decay, kick = truth.receiver_decay, truth.receiver_kick
+        decay, kick = truth.disturbances["coloured"].process
         lost = 1.0 - decay * decay
         wandering = xp.where(lost > 0.0, kick * kick / xp.where(lost > 0.0, lost, 1.0), 0.0)
         covariance = receiver_faults.FaultCovariance(
@@ -77,7 +78,7 @@ class _Matched:
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
-        decay, kick = truth.receiver_decay, truth.receiver_kick
+        decay, kick = truth.disturbances["coloured"].process
         receiver = decay * memory.receiver
         P = receiver_faults.predict_fault(
             memory.covariance,
@@ -87,8 +88,9 @@ class _Matched:
             decay[None],
             (kick * kick)[None],
         )
-        since = s.step * (truth.number - truth.spoofing[0] + 1.0)
-        pull = xp.where(within(truth.number, truth.spoofing), truth.spoofing_rate * since, 0.0)
+        spoofing = truth.disturbances["spoofing"]
+        since = s.step * (truth.number - spoofing.window[0] + 1.0)
+        pull = xp.where(within(truth.number, spoofing.window), spoofing.strength * since, 0.0)
         available = measurement.available
         innovation = available * ((measurement.ins - (measurement.fix - pull)) - (delta - receiver))
         along = receiver_faults.measured_direction(P, xp.ones((1, 1)))

@@ -67,10 +67,7 @@ class DeadReckoning(KalmanModel):
             dead_reckoning.calibrate(odometry.displacement, self.scale, self.heading_offset),
             odometry.available,
             measurement.interval,
-            drift=self.drift,
-            acceleration=self.acceleration,
-            correlation_time=self.correlation_time,
-            deviation=self.deviation,
+            dead_reckoning.Noise(self.drift, self.acceleration, self.correlation_time, self.deviation),
         )
         return self.track(measurement, self.update_estimate(predicted, measurement))
 

@@ -8,8 +8,9 @@ from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...envs.maneuvering_target.semi_markov import SemiMarkov
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.maneuvering_target.world import Measurement, Plots
+from ...envs.maneuvering_target.world import Measurement
 from ...filters import data_association, kalman
+from ...filters.data_association import Plots
 from ...filters.ordered_sums import ordered_sum
 from ...filters.semi_markov import Hypotheses
 from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
@@ -38,7 +39,7 @@ class AllPlots(KalmanModel):
         if plots is None:
             return super().update_estimate(predicted, measurement, H)
         density = self.density(plots)
-        return data_association.update_position(*predicted, *plots, self.detection_probability, density)
+        return data_association.update_position(*predicted, plots, self.detection_probability, density)
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
         """Tell how well one plot was predicted, nothing of several: densities of different numbers of plots cannot be
@@ -76,5 +77,5 @@ class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
         each = Plots(plots.position[:, :, None], plots.variance[:, :, None], plots.available[:, None])
         density = self.density(plots)
         return data_association.update_position(
-            table.mean, table.covariance, *each, self.detection_probability, density
+            table.mean, table.covariance, each, self.detection_probability, density
         )

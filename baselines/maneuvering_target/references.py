@@ -11,6 +11,9 @@ from ...filters import bounds, kalman
 from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
+DISTURBANCES = ("glint", "coloured", "bias", "clutter")
+"""All are told to the reference. The bound is told of none: each but false plots, which it never takes, adds errors."""
+
 
 class TurnMemory(NamedTuple):
     """State of :class:`KnownTurn`."""
@@ -42,6 +45,8 @@ class KnownTurn(KalmanModel):
         "when every manoeuvre begins and ends, its acceleration or turn rate, the variance and bias of every scan, the "
         "deviation and correlation time of coloured errors, and which plot is the target's"
     )
+
+    disturbances = DISTURBANCES
 
     def initialise(self, given: Input) -> TurnMemory:
         """Start where everyone starts; a coloured error is stationary from the start."""
@@ -103,6 +108,7 @@ class KnownInputBound(ConstantVelocityModel):
 
     kind, traceable = "bound", True
     knows = "the acceleration in every scan"
+    disturbances = DISTURBANCES
 
     def start(self, initial: Initial, truth: Truth) -> Array:
         """Covariance of the start."""

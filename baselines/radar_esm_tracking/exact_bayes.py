@@ -205,15 +205,8 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
 
     def look(self, measurement: Measurement) -> Array:
         """Likelihood of this scan's look, ``(J, 2, V, N)``."""
-        return emitters.look_likelihood(
-            self.grid,
-            self.confusion,
-            self.other_confusion,
-            measurement.decision,
-            measurement.bearing_difference,
-            self.deviation,
-            measurement.looked,
-        )
+        look = emitters.Look(measurement.looked, measurement.decision, measurement.bearing_difference)
+        return emitters.look_likelihood(self.grid, self.confusion, self.other_confusion, look, self.deviation)
 
     def of_classes(self, table: Array, points: list[list[int]]) -> Array:
         """Sum over j and e of P(j | s) P(i | s) T0(j, e), ``(S, N)``; over some points of the grid for each type."""

@@ -36,6 +36,7 @@ class _KnownDraw:
         "the true class at every scan, in which scans there is glint, how strong and how lasting the radar's coloured "
         "errors are, and how its white ones are correlated"
     )
+    disturbances = ("glint",)
     traceable = True
 
     def __init__(self, task: RadarEsmTracking) -> None:

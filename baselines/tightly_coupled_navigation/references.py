@@ -41,6 +41,7 @@ class _KnownMode:
     """
 
     traceable = True
+    disturbances = ("stuck", "noisy", "hidden", "no_rates", "coloured", "reflections", "ramp", "aperture")
     knows_acceleration = 0.0
     """Standard deviation of what it is told of it, m/s^2."""
 
@@ -52,7 +53,10 @@ class _KnownMode:
     def start(self, initial: Initial, truth: Truth) -> Track:
         """Start where everyone starts."""
         mean, covariance = range_errors.start(
-            initial.mean, initial.covariance, self.task.satellites, truth.coloured_deviation**2
+            initial.mean,
+            initial.covariance,
+            self.task.satellites,
+            truth.disturbances["coloured"].deviation ** 2,
         )
         return Track(mean, pack(covariance), truth.mode)
 
@@ -92,8 +96,9 @@ class _KnownMode:
         moved_by = xp.where(jumped, track.mode, truth.mode)
         axis = xp.take(self.axis, moved_by, axis=-1)[:, :, None]
         noise = xp.take(noises, moved_by, axis=-1)[:, :, None]
-        kept = truth.coloured_decay
-        gained = truth.coloured_deviation**2 * (1.0 - kept * kept)
+        coloured = truth.disturbances["coloured"]
+        kept = coloured.process.decay
+        gained = coloured.deviation**2 * (1.0 - kept * kept)
         mean, covariance = range_errors.predict(
             track.mean[:, None],
             unpack(track.covariance, self.size)[:, :, None],
@@ -137,7 +142,7 @@ class _KnownMode:
         available = [measurement.available[j] for j in range(len(nominal))]
         # A reading that is held was already used when it was new.
         for j in range(forces.start, forces.stop):
-            available[j] = available[j] * (1.0 - truth.stuck)
+            available[j] = available[j] * (1.0 - truth.disturbances["stuck"].now)
         return variance, available
 
 
@@ -173,7 +178,7 @@ class KnownMode(_KnownMode):
         expected, rows = self.readings_and_jacobian(measurement, track.mean)
         residual = measurement.readings - expected
         ranges = task.sensors[0].readings
-        off = truth.range_error - truth.coloured
+        off = truth.range_error - truth.disturbances["coloured"].level
         residual = xp.concat([residual[ranges] - off, residual[ranges.stop :]])
         variance, available = self.sensors(measurement, truth)
         update = extended_kalman.update_one_by_one(
@@ -213,7 +218,7 @@ class KnownModeBound(_KnownMode):
         """Bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
         track = self.predict_track(truth, memory, self.noises)
-        state = xp.concat([truth.state, truth.coloured])
+        state = xp.concat([truth.state, truth.disturbances["coloured"].level])
         expected, rows = self.readings_and_jacobian(measurement, state)
         update = extended_kalman.update_one_by_one(
             track.mean,

@@ -19,6 +19,7 @@ class TrueState:
     kind = "reference"
     traceable = True
     knows = "the whole state"
+    disturbances = None
 
     def __init__(self, task: UavAutopilot) -> None:
         self.task = task
@@ -43,11 +44,12 @@ class _KnownNoise:
     kind = "reference"
     traceable = True
     knows: str
+    disturbances = ("noisy_sensors", "coloured", "bias", "dropouts")
 
     def __init__(self, task: UavAutopilot) -> None:
         self.task, self.xp = task, task.xp
         model, n, m = task.design.true_model, len(task.components), len(task.sensors)
-        errors = m if task.world.sensors_are_coloured else 0
+        errors = m if task.parameters.sensor_coloured[1] else 0
         pack, size = packed_covariance.pack, n + errors
         self.rows = [(i, n + k) if errors else (i,) for k, i in enumerate(task.measured)]
         """Coordinates that each sensor reads the sum of."""
@@ -80,12 +82,13 @@ class _KnownNoise:
         covariance = self.initial_covariance * (1.0 + self.gust * (truth.level**2 - 1.0))
         if self.size == self.n:
             return covariance
-        stationary = truth.coloured_kick**2 / (1.0 - truth.coloured_decay**2)
+        process = truth.disturbances["coloured"].process
+        stationary = process.kick**2 / (1.0 - process.decay**2)
         return covariance + self.xp.matmul(self.placed, stationary)
 
     def decays(self, truth: Truth) -> Array:
         """What is left of each coordinate's deviation beside what F says, ``(size, N)``."""
-        return self.xp.concat([self.xp.ones_like(truth.state), truth.coloured_decay])
+        return self.xp.concat([self.xp.ones_like(truth.state), truth.disturbances["coloured"].process.decay])
 
     def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
         """Packed covariance predicted with the disturbance of the interval before this measurement."""
@@ -94,7 +97,7 @@ class _KnownNoise:
         if self.size > self.n:
             decays = self.decays(truth)
             predicted = packed_covariance.pack(decays[:, None] * decays[None]) * predicted
-            noise = noise + self.xp.matmul(self.placed, truth.coloured_kick**2)
+            noise = noise + self.xp.matmul(self.placed, truth.disturbances["coloured"].process.kick ** 2)
         return predicted + noise
 
     def update_covariance(
@@ -104,7 +107,7 @@ class _KnownNoise:
         return packed_covariance.update_coordinates(
             mean,
             covariance,
-            measurement.reading - truth.sensor_bias,
+            measurement.reading - truth.disturbances["bias"],
             self.rows,
             self.sensor_variances(truth),
             measurement.available,
@@ -129,7 +132,7 @@ class Matched(_KnownNoise):
 
     def start(self, initial: Start, truth: Truth) -> Initial:
         """Start where everyone starts, with the true covariance, packed."""
-        mean = self.xp.concat([initial.mean, 0.0 * truth.sensor_bias])[: self.size]
+        mean = self.xp.concat([initial.mean, 0.0 * truth.disturbances["bias"]])[: self.size]
         return Initial(mean, self.start_covariance(truth))
 
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
@@ -166,7 +169,7 @@ class KnownNoiseBound(_KnownNoise):
 
     def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array]:
         """Bound after this measurement."""
-        zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.sensor_bias])[: self.size])
+        zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.disturbances["bias"]])[: self.size])
         predicted = self.predict_covariance(memory, truth)
         after = self.update_covariance(zero, predicted, measurement, truth).covariance
         return after[self.diagonal[: self.n]], after

@@ -52,7 +52,7 @@ from filtergym.commands.terminal import (
     console,
     progress_bar,
 )
-from filtergym.reports.tables.records import write_records
+from filtergym.reports.tables.export import write_records
 from filtergym.reports.tables.results import read_results, settings_of
 
 PROGRAM = "python docs/make"

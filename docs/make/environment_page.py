@@ -15,7 +15,7 @@ from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.parameters import Limits, field_limits
 from filtergym.envs.contract.task import Task, field_texts
 from filtergym.envs.engine.backend import make_model
-from filtergym.envs.engine.catalogue import nearest
+from filtergym.envs.engine.catalogue import catalogue, nearest
 from filtergym.papers.grid import markdown_table
 
 PARTS_SHOWN = 4
@@ -156,6 +156,16 @@ TABLES = {
     "scenarios": _scenarios,
 }
 """Of the task, by their names; that of the policies stands beside them."""
+
+
+def causes_table() -> str:
+    """Make the table of what evaluations of all environments split costs by, in Markdown."""
+    rows = []
+    for cls in catalogue().values():
+        causes = cls(cls.Parameters()).causes
+        rows.append((cls.__name__, "; ".join(f"`{cause.name}`, {cause.phrase}" for cause in causes)))
+    rows.append(("all", "`start`, the start of the track; `other`, what remains"))
+    return "\n".join(markdown_table(("environment", "causes"), rows))
 
 
 def environment_table(problem: Problem, name: str) -> str:

@@ -37,6 +37,7 @@ training_TightlyCoupledNavigation := --gated
 training_TightlyCoupledNavigation-ppo := --residual-to fixed-robust-tuned
 training_TightlyCoupledNavigation-kalman-net := --control kalman-net
 episodes_TightlyCoupledNavigation := 400
+crash_test_TightlyCoupledNavigation := --episodes 16 --steps 1000
 
 PAPERS := imm-alpha-beta kalman-bucy-ins-gnss multi-hypothesis-ins-gnss radar-esm-class-fusion uav-autopilot-kalman
 
@@ -58,7 +59,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -130,6 +131,14 @@ $(DONE)/harm-%: $(DONE)/ship-%
 	$(BIN)/python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*) > build/harm-$*.txt
 	$(table) build/harm-$*.txt --name harm/$* \
 	  --command "python benchmarks/harm.py filtergym/$*-v0 --episodes $(call episodes,$*)"
+	$(finish)
+
+crash_test = $(strip benchmarks/crash_test.py filtergym/$*-v0 $(crash_test_$*))
+
+$(DONE)/stress-%: $(DONE)/ship-%
+	$(BIN)/python $(crash_test) > build/stress-$*.txt
+	$(table) build/stress-$*.txt --name stress/$* --command "python $(crash_test)" \
+	  --note "23 alterations, of which some do not apply."
 	$(finish)
 
 cross = arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfpu=fpv4-sp-d16 -mfloat-abi=hard

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from filtergym.baselines.problem import problem_of
 
-from filtergym.exports.c_source import export_c, file_stem
+from filtergym.exports.c_filter import file_stem
+from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 
 FOLDER = Path(__file__).parent.parent / "playground"

@@ -14,7 +14,7 @@ from command_line import command_line_markdown
 from docutils import nodes
 from docutils.parsers.rst import directives
 from docutils.statemachine import StringList
-from environment_page import environment_table
+from environment_page import causes_table, environment_table
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.figures.print_layout import save
 from filtergym.evaluation.storage.files import write_text
@@ -251,12 +251,16 @@ class RecordTable(_Rendered):
 
 
 class EnvironmentTable(_Rendered):
-    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, of the code."""
+    """``{environment-table} NAME``: actions, fields, measurement, parameters, scenarios or policies, of the code; and
+    ``{environment-table} causes``, of all environments.
+    """
 
     option_spec: ClassVar[Any] = {"environment": directives.unchanged_required}
 
     def markdown(self) -> str:
         """Return the table."""
+        if self.name_given == "causes":
+            return causes_table()
         if "environment" not in self.options:
             raise ValueError("the option environment is missing, such as `:environment: ManeuveringTarget`")
         return environment_table(problem_of(environment_id(self.options["environment"])), self.name_given)

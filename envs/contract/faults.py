@@ -1,7 +1,7 @@
 """What a world may do to its sensors: the parts that it lists, and the errors that more than one environment has."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -13,35 +13,55 @@ if TYPE_CHECKING:
     from .task import Task
 
 
-class Numbers(NamedTuple):
-    """Random numbers of one measurement that a disturbance takes."""
+class Step(NamedTuple):
+    """A measurement, as a disturbance meets it."""
 
+    number: Array
+    """Of the measurement, from 1 on, ``(N,)``."""
+    interval: Array | float
+    """s since the measurement before, ``(N,)``, or one number where all are the same."""
     normals: Array
-    """``(normals, N)``."""
+    """Standard normal numbers that it takes, ``(normals, N)``."""
     uniforms: Array
-    """``(row_uniforms, N)``."""
+    """Uniform numbers that it takes, ``(row_uniforms, N)``."""
+
+
+def undisturbed(draws: Draws, parameters: Any) -> Array | None:
+    """Return whether nothing goes wrong in an episode, booleans ``(N,)``; None where no episode is like that.
+
+    It is drawn where it is asked for first.
+
+    Args:
+        draws: what fixes the scenario of each episode.
+        parameters: of the task, with the probability ``undisturbed``.
+    """
+    if not parameters.undisturbed:
+        return None
+    drawn = draws.drawn.get("undisturbed")
+    return draws.event("undisturbed", parameters.undisturbed) if drawn is None else drawn
 
 
 class Disturbance(ABC):
-    """One thing that a world may do to its sensors, with a name, a draw, an effect and a cause.
+    """One thing that a world may do to its sensors, with a name, draws, an effect and causes.
 
-    It is drawn with the episode, moves on with every measurement, and acts where a method says so: on errors, on what
-    is read, or on the whole measurement. What it has drawn and where it stands is its state, nested NamedTuples of
-    arrays ``(..., N)``. By default nothing is drawn, nothing moves and nothing is changed.
+    It is drawn with the episode, moves on with every measurement, and acts where a method says so: on the deviations of
+    the white errors, on errors, on what is read, or on the whole measurement. What it has drawn and where it stands is
+    its state, nested NamedTuples of arrays ``(..., N)``. By default nothing is drawn, nothing moves and nothing is
+    changed.
 
     Args:
         task: with its parameters.
 
     Attributes:
-        name: under which the truth holds its state.
-        cause: circumstance by which an evaluation splits costs; None where others, such as ``OUTLIER``, say it.
+        name: under which the truth holds its state, and by which a reference says that it knows it.
+        causes: circumstances by which an evaluation splits costs.
         initial_normals: standard normal numbers that it takes at the start of the track.
         normals: standard normal numbers that it takes at each measurement.
         row_uniforms: uniform numbers that it takes at each measurement.
     """
 
     name: ClassVar[str]
-    cause: ClassVar[Cause | None] = None
+    causes: ClassVar[tuple[Cause, ...]] = ()
     initial_normals: int = 0
     normals: int = 0
     row_uniforms: int = 0
@@ -50,47 +70,58 @@ class Disturbance(ABC):
         self.parameters, self.xp = task.parameters, task.xp
 
     @classmethod
-    @abstractmethod
     def is_in(cls, parameters: Any) -> bool:
-        """Whether a task of these parameters has it."""
+        """Whether a task of these parameters has it; by default every one has."""
+        return True
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> Any:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Any:
         """Draw what holds for an episode, and return the state at the start of the track.
 
         Args:
             draws: what fixes the scenario of each episode.
             normals: ``(initial_normals, N)``.
-            truth: of the world, without disturbances.
+            zero: ``(N,)``.
         """
         return None
 
-    def advance(self, state: Any, interval: Array | float, numbers: Numbers) -> Any:
-        """State at a measurement, from that at the one before.
-
-        Args:
-            state: of :meth:`begin`, or the one before.
-            interval: s since the measurement before, ``(N,)``, or one number where all are the same.
-            numbers: that it takes.
+    def complete(self, state: Any, draws: Draws) -> Any:
+        """Return the state of :meth:`begin` with what only some scenarios draw, after all that every one draws: so the
+        others take as many numbers as without it.
         """
         return state
 
+    def quiet(self, state: Any, calm: Array) -> Any:
+        """Return the state of :meth:`complete` as it is in an episode in which nothing goes wrong.
+
+        Args:
+            state: at the start of the track.
+            calm: where the episode is like that, booleans ``(N,)``.
+        """
+        return state
+
+    def advance(self, state: Any, step: Step) -> Any:
+        """State at a measurement, from that at the one before."""
+        return state
+
+    def change_deviations(self, state: Any, deviations: Array) -> Array:
+        """Standard deviations of the white errors over the usual ones, ``(..., N)``, with what it does to them."""
+        return deviations
+
     def change_errors(self, state: Any, errors: Array) -> Array:
-        """Errors in units of the stated standard deviations, ``(n, N)``, with what it does to them."""
+        """Errors, ``(n, N)`` in the world's units of them, with what it does to them."""
         return errors
 
     def change_reading(self, state: Any, reading: Array) -> tuple[Any, Array]:
         """State and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
         return state, reading
 
-    def change_measurement(
-        self, state: Any, measurement: Any, numbers: Numbers, feedback: Any
-    ) -> tuple[Any, Any]:
+    def change_measurement(self, state: Any, measurement: Any, step: Step, feedback: Any) -> tuple[Any, Any]:
         """State and measurement with what it does to them.
 
         Args:
             state: of :meth:`advance`.
             measurement: the world's NamedTuple, with what was missed.
-            numbers: that :meth:`advance` was given.
+            step: that :meth:`advance` was given.
             feedback: of a closed loop, see :meth:`.World.advance`.
         """
         return state, measurement
@@ -105,12 +136,13 @@ class Disturbance(ABC):
 
 
 class Disturbances:
-    """All that a world may do to its sensors, in the order in which it takes random numbers and acts.
+    """All that a world may do to its sensors, in the order in which it acts and takes random numbers of measurements.
 
     States are a mapping from names.
 
     Args:
         parts: the disturbances.
+        drawn: the same in the order in which they are drawn with an episode; default: that order.
 
     Attributes:
         initial_normals: standard normal numbers that all take together at the start of the track.
@@ -118,40 +150,74 @@ class Disturbances:
         row_uniforms: uniform numbers of a measurement.
     """
 
-    def __init__(self, parts: Sequence[Disturbance]) -> None:
+    def __init__(self, parts: Sequence[Disturbance], drawn: Sequence[Disturbance] | None = None) -> None:
         self.parts = tuple(parts)
+        self.drawn = tuple(parts if drawn is None else drawn)
         self.initial_normals = sum(part.initial_normals for part in parts)
         self.normals = sum(part.normals for part in parts)
         self.row_uniforms = sum(part.row_uniforms for part in parts)
 
     @classmethod
-    def of(cls, task: "Task", kinds: Sequence[type[Disturbance]]) -> "Disturbances":
-        """Return those of some kinds that a task has."""
-        return cls([kind(task) for kind in kinds if kind.is_in(task.parameters)])
+    def of(
+        cls,
+        task: "Task",
+        kinds: Sequence[type[Disturbance]],
+        drawn: Sequence[type[Disturbance]] = (),
+    ) -> "Disturbances":
+        """Return those of some kinds that a task has.
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> dict[str, Any]:
+        Args:
+            task: with its parameters.
+            kinds: in the order in which they act.
+            drawn: those that are drawn first; the others follow in the order of ``kinds``.
+        """
+        parts = [kind(task) for kind in kinds if kind.is_in(task.parameters)]
+        order = *drawn, *kinds
+        return cls(parts, sorted(parts, key=lambda part: order.index(type(part))))
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> dict[str, Any]:
         """Draw each: the states at the start of the track."""
-        states, used = {}, 0
+        shares, used = {}, 0
         for part in self.parts:
-            states[part.name] = part.begin(draws, normals[used : used + part.initial_normals], truth)
+            shares[part.name] = normals[used : used + part.initial_normals]
             used += part.initial_normals
-        return states
+        return self._draw(lambda part: part.begin(draws, shares[part.name], zero))
 
-    def share(self, normals: Array, uniforms: Array) -> dict[str, Numbers]:
+    def complete(self, states: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
+        """States with what only some scenarios draw."""
+        return self._draw(lambda part: part.complete(states[part.name], draws))
+
+    def _draw(self, draw: Callable[[Disturbance], Any]) -> dict[str, Any]:
+        """Call what draws a state for each, and return the states in the order in which they act."""
+        states = {part.name: draw(part) for part in self.drawn}
+        return {part.name: states[part.name] for part in self.parts}
+
+    def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
+        """States as they are where nothing goes wrong, see :func:`undisturbed`."""
+        if calm is None:
+            return states
+        return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
+
+    def share(
+        self, number: Array, interval: Array | float, normals: Array, uniforms: Array
+    ) -> dict[str, Step]:
         """Hand out the random numbers of a measurement, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
-        shares, n, u = {}, 0, 0
+        steps, n, u = {}, 0, 0
         for part in self.parts:
-            shares[part.name] = Numbers(normals[n : n + part.normals], uniforms[u : u + part.row_uniforms])
+            own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
+            steps[part.name] = Step(number, interval, *own)
             n, u = n + part.normals, u + part.row_uniforms
-        return shares
+        return steps
 
-    def advance(
-        self, states: Mapping[str, Any], interval: Array | float, numbers: Mapping[str, Numbers]
-    ) -> dict[str, Any]:
+    def advance(self, states: Mapping[str, Any], steps: Mapping[str, Step]) -> dict[str, Any]:
         """States at a measurement."""
-        return {
-            part.name: part.advance(states[part.name], interval, numbers[part.name]) for part in self.parts
-        }
+        return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
+
+    def change_deviations(self, states: Mapping[str, Any], deviations: Array) -> Array:
+        """Standard deviations of the white errors over the usual ones with what each does to them."""
+        for part in self.parts:
+            deviations = part.change_deviations(states[part.name], deviations)
+        return deviations
 
     def change_errors(self, states: Mapping[str, Any], errors: Array) -> Array:
         """Errors with what each does to them."""
@@ -167,13 +233,13 @@ class Disturbances:
         return changed, reading
 
     def change_measurement(
-        self, states: Mapping[str, Any], measurement: Any, numbers: Mapping[str, Numbers], feedback: Any
+        self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, Step], feedback: Any
     ) -> tuple[dict[str, Any], Any]:
         """States and measurement with what each does to them."""
         changed = dict(states)
         for part in self.parts:
             changed[part.name], measurement = part.change_measurement(
-                changed[part.name], measurement, numbers[part.name], feedback
+                changed[part.name], measurement, steps[part.name], feedback
             )
         return changed, measurement
 
@@ -186,56 +252,63 @@ class Disturbances:
         return {name: v for part in self.parts for name, v in part.records(states[part.name]).items()}
 
 
-class Outliers(NamedTuple):
-    """Measurements whose errors are larger than stated, each one on its own, as by glint; nobody says so."""
+def causes_of(kinds: Sequence[type[Disturbance]]) -> tuple[Cause, ...]:
+    """Return the causes of some kinds of disturbances, in their order."""
+    return tuple(cause for kind in kinds for cause in kind.causes)
+
+
+class Outliers(Disturbance):
+    """Measurements whose errors are larger than stated, each one on its own; nobody says so.
+
+    Its state is the standard deviation of this measurement's errors over that of usual ones, ``(N,)``.
+
+    Args:
+        task: with its parameters.
+
+    Attributes:
+        probability: of a measurement that is one.
+        factor: standard deviation of its errors over that of the others.
+    """
 
     probability: float
     factor: float
-    """Standard deviation of their errors over that of the others."""
-
-    @property
-    def row_uniforms(self) -> int:
-        """Uniform numbers that a measurement takes: one, or none where there are no outliers."""
-        return 1 if self.probability else 0
-
-    def amplify(self, deviation: Array, uniforms: Array, xp: ModuleType) -> Array:
-        """Return standard deviations, or errors, multiplied by the factor where a measurement is an outlier.
-
-        Args:
-            deviation: ``(..., N)``.
-            uniforms: ``(row_uniforms, N)``.
-            xp: array namespace.
-        """
-        if not self.probability:
-            return deviation
-        return xp.where(uniforms[0] < self.probability, self.factor, xp.ones_like(uniforms[0])) * deviation
-
-
-class Glint(Disturbance):
-    """Measurements whose errors are larger than stated, each one on its own, by ``glint_factor`` with
-    ``glint_probability``; nobody says so. Its state is the standard deviation of this measurement's errors over that of
-    usual ones, ``(N,)``; the world's truth counts ``scan``.
-    """
-
-    name = "glint"
 
     def __init__(self, task: "Task") -> None:
         super().__init__(task)
-        self.outliers = Outliers(self.parameters.glint_probability, self.parameters.glint_factor)
-        self.row_uniforms = self.outliers.row_uniforms
+        self.probability, self.factor = self.limits(self.parameters)
+        self.row_uniforms = 1 if self.probability else 0
+
+    @staticmethod
+    @abstractmethod
+    def limits(parameters: Any) -> tuple[float, float]:
+        """Probability and factor."""
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
+        """Start with a usual one."""
+        return zero + 1.0
+
+    def advance(self, state: Array, step: Step) -> Array:
+        """Draw whether this is one."""
+        if not self.probability:
+            return state
+        one = self.xp.ones_like(state)
+        return self.xp.where(step.uniforms[0] < self.probability, self.factor, one)
+
+
+class Glint(Outliers):
+    """Measurements whose errors are larger than stated by ``glint_factor`` with ``glint_probability``."""
+
+    name = "glint"
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
         """Whether any measurement may be one."""
         return bool(parameters.glint_probability > 0.0)
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> Array:
-        """Start with a usual one."""
-        return self.xp.ones_like(truth.scan, dtype=self.xp.float64)
-
-    def advance(self, state: Array, interval: Array | float, numbers: Numbers) -> Array:
-        """Draw whether this is one."""
-        return self.outliers.amplify(self.xp.ones_like(state), numbers.uniforms, self.xp)
+    @staticmethod
+    def limits(parameters: Any) -> tuple[float, float]:
+        """Those of glint."""
+        return parameters.glint_probability, parameters.glint_factor
 
     def change_errors(self, state: Array, errors: Array) -> Array:
         """Enlarge them."""
@@ -270,3 +343,60 @@ class GaussMarkov(NamedTuple):
     def advance(self, error: Array, normals: Array) -> Array:
         """Return the errors of the next measurement, ``(..., N)``."""
         return self.decay * error + self.kick * normals
+
+
+class Colour(NamedTuple):
+    """State of :class:`ColouredErrors`."""
+
+    deviation: Array
+    """Stationary standard deviation, ``(..., N)``."""
+    process: GaussMarkov
+    level: Array
+    """Errors at this measurement, in the same unit, ``(n, N)``."""
+
+
+class ColouredErrors(Disturbance):
+    """Errors that last from measurement to measurement, beside the white ones, at a fixed interval; nobody says so.
+
+    Args:
+        task: with its parameters.
+        interval: from one measurement to the next, s.
+        count: n, errors of a measurement.
+        present: whether there may be any; else they are zero and take no numbers.
+    """
+
+    name = "coloured"
+
+    def __init__(self, task: "Task", interval: float, count: int, present: bool) -> None:
+        super().__init__(task)
+        self.interval, self.count = interval, count
+        self.initial_normals = self.normals = count if present else 0
+
+    @abstractmethod
+    def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
+        """Draw standard deviation and correlation time, s, each ``(N,)`` or ``(n, N)``."""
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> tuple[Array, Array]:
+        """Keep what :meth:`complete` takes."""
+        return normals, zero
+
+    def complete(self, state: tuple[Array, Array], draws: Draws) -> Colour:
+        """Draw how large they are and how long they last; they are stationary from the start."""
+        normals, zero = state
+        deviation, lasting = self.draw(draws, zero)
+        process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)
+        level = deviation * normals if self.normals else self.xp.stack([zero] * self.count)
+        return Colour(deviation, process, level)
+
+    def quiet(self, state: Colour, calm: Array) -> Colour:
+        """None of them."""
+        deviation, kick, level = (
+            self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)
+        )
+        return Colour(deviation, state.process._replace(kick=kick), level)
+
+    def advance(self, state: Colour, step: Step) -> Colour:
+        """Let them wander."""
+        return (
+            state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state
+        )

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from .draws import Draws
+from .faults import Disturbances
 from .observation import Array
 
 if TYPE_CHECKING:
@@ -42,6 +43,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     measurement does not say."""
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
+
+    disturbances: Disturbances = Disturbances(())
+    """What it may do to its sensors."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task

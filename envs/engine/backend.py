@@ -10,8 +10,8 @@ from ..contract.model import Model
 from ..contract.parameters import Limits, check
 from ..contract.task import Task
 from .catalogue import nearest
-from .compiled import AVAILABLE, CompiledModel, warn_of
-from .scenario_choice import make_task
+from .compiled import AVAILABLE, compiled_model, warn_of
+from .scenario_choice import find_scenario
 
 BACKENDS = ("auto", "compiled", "numpy", "torch")
 
@@ -48,15 +48,16 @@ def make_model(
     control = cls.controls[0] if control is None else control
     if not isinstance(control, str) or control not in (*cls.controls, *cls.trained_banks):
         raise nearest("control", control, cls.controls)
-    task = make_task(cls, scenario, xp, device, **keywords)
+    chosen = find_scenario(cls, scenario, keywords)
+    parameters = cls.Parameters(**{**chosen.parameters, **keywords})
     if backend == "compiled" or (backend == "auto" and AVAILABLE):
         try:
-            return CompiledModel(task, control, threads)
+            return compiled_model(cls, parameters, control, chosen.recording, threads)
         except NotTraceable as error:
             if backend == "compiled":
-                raise ValueError(f"{task.id} cannot be compiled: {error}") from error
-            warn_of(task.id, error)
-    return Model(task, control)
+                raise ValueError(f"{cls.id} cannot be compiled: {error}") from error
+            warn_of(cls.id, error)
+    return Model(cls(parameters, xp, device, chosen.recording), control)
 
 
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:

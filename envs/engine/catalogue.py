@@ -191,7 +191,7 @@ def task_class(id: str) -> "type[Task]":
             f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {quote_shortened(id)}"
         )
     module, colon, own = id.rpartition(":")
-    known = catalogue()
+    known = Catalogue()
     for candidate in (own, f"filtergym/{own}", f"filtergym/{own}-v0"):
         if candidate in known:
             return known[candidate]

@@ -141,6 +141,26 @@ class CompiledModel(Model):
         return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
 
+def compiled_model(
+    cls: type[Task], parameters: Any, control: str, recording: Any = None, threads: int = 1
+) -> CompiledModel:
+    """Return the compiled model of a task with these parameters; nothing in it changes, so that the last ones are kept.
+
+    Raises:
+        NotTraceable: if a step is no straight line of arithmetic.
+        ImportError: without llvmlite.
+    """
+    make = _make_once if _hashes(parameters) else _make
+    return make(cls, parameters, control, recording, threads)
+
+
+def _make(cls: type[Task], parameters: Any, control: str, recording: Any, threads: int) -> CompiledModel:
+    return CompiledModel(cls(parameters, recording=recording), control, threads)
+
+
+_make_once = functools.lru_cache(PROGRAM_CACHE_SIZE)(_make)
+
+
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
     graph = Graph(loops=True)
     with namespace.tracing(graph):
@@ -168,9 +188,8 @@ def _name_of(function: Callable[..., Any]) -> str:
 def warn_of(what: str, error: BaseException) -> None:
     """Warn that something runs with NumPy, and name the line that is to blame."""
     found: BaseException = error.__cause__ or error
-    frames = [
-        f for f in traceback.extract_tb(found.__traceback__) if "compiler" not in Path(f.filename).parts
-    ]
+    own = Path(namespace.__file__).parent
+    frames = [f for f in traceback.extract_tb(found.__traceback__) if Path(f.filename).parent != own]
     line = (
         f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line})" if frames else ""
     )

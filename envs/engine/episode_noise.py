@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy
 
+from ...compiler.counter_code import bind_numbers
 from ...compiler.counter_numbers import numbers
 from ...compiler.functions import Call, address_of, empty_lanes, leaves, round_up_lanes
 from ...compiler.native import AVAILABLE
@@ -145,7 +146,7 @@ class EpisodeNoise:
         normals = self._layout.initial_normals
         memory = empty_lanes((normals + self._layout.uniforms,), self.width)
         if self._start is None:
-            self._start = self._bind(memory, normals)
+            self._start = bind_numbers(self.identities, self.measurement, memory, normals)
         self._start.replace(2, memory)
         self._start(0, self.width)
         return memory[normals:], memory[:normals]
@@ -202,13 +203,9 @@ class EpisodeNoise:
     def _next_call(self) -> Call:
         if self._next is None:
             memory = empty_lanes((self._rows,), self.width)
-            self._next, self._address = self._bind(memory, self._layout.normals), address_of(memory)
+            self._next = bind_numbers(self.identities, self.measurement, memory, self._layout.normals)
+            self._address = address_of(memory)
         return self._next
-
-    def _bind(self, rows: numpy.ndarray, normals: int) -> Call:
-        from ...compiler.counter_code import bind_numbers
-
-        return bind_numbers(self.identities, self.measurement, rows, normals)
 
     def _next_of_block(self) -> numpy.ndarray:
         if self._ahead is None or self._slot == len(self._ahead):

@@ -89,6 +89,8 @@ def read_files(cls: type[Task], scenario: Any) -> Any:
     Raises:
         ValueError: if the files hold neither.
     """
+    if scenario is None or (isinstance(scenario, str) and scenario in cls.scenarios):
+        return scenario
     if isinstance(scenario, Mapping):
         if find_mixture(cls, scenario) is not None:
             return scenario
@@ -213,6 +215,8 @@ def find_scenario(
     if isinstance(scenario, Scenario):
         return scenario
     check_names(cls, keywords or ())
+    if scenario is None or (isinstance(scenario, str) and scenario in cls.scenarios):
+        return cls.scenarios[scenario or cls.default_scenario]
     if find_mixture(cls, scenario) is not None:
         raise ValueError(
             "a mixture of scenarios is for gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
@@ -223,16 +227,13 @@ def find_scenario(
         return cls.scenario_of_flights(scenario, keywords or {})
     if isinstance(scenario, Recording):
         return scenario.scenario(cls, keywords or {})
-    name = cls.default_scenario if scenario is None else scenario
-    if not isinstance(name, str):
+    if not isinstance(scenario, str):
         raise ValueError(
             f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got "
-            f"{quote_shortened(name)}: "
+            f"{quote_shortened(scenario)}: "
             f"choose from {', '.join(cls.scenarios)}; a mixture of scenarios is a dictionary of weights"
         )
-    if name not in cls.scenarios:
-        raise nearest("scenario", name, cls.scenarios)
-    return cls.scenarios[name]
+    raise nearest("scenario", scenario, cls.scenarios)
 
 
 def make_task(

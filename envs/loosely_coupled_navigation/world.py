@@ -1,22 +1,19 @@
 """The motion of LooselyCoupledNavigation, its INS, and the receiver; equations in ``filters/loosely_coupled.py``."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
 from ...filters.ordered_sums import ordered_sum
-from ..contract.draws import Draws, draw_between
-from ..contract.faults import GaussMarkov, Outliers
+from ..contract.draws import Draws
+from ..contract.faults import Disturbances, undisturbed
 from ..contract.filter import Initial
 from ..contract.observation import Array
-from ..contract.schedules import Steps, within
 from ..contract.task import Task
 from ..contract.world import World
+from .disturbances import DISTURBANCES, DRAWN_FIRST
 from .parameters import LooselyCoupledNavigationParameters
-
-NEVER = 1e9
-"""Number of the measurement at which happens what does not; finite, so that arithmetic on it stays finite."""
 
 
 class Truth(NamedTuple):
@@ -42,34 +39,12 @@ class Truth(NamedTuple):
     """Standard deviation of what eta gains from one measurement to the next, m/s, ``(N,)``."""
     white_step: Array
     """Standard deviation of the displacement that this gain does not explain, m, ``(N,)``."""
-    receiver_levels: Array
-    """Standard deviation of the receiver noise before, between and after its changes, m, ``(3, N)``."""
-    reported_levels: Array
-    """What the receiver reports in its place, m, ``(3, N)``."""
-    change: Array
-    """First measurement after each change, ``(2, N)``."""
-    outage: Array
-    """First measurement of the outage and first one after it, ``(2, N)``."""
-    jamming: Array
-    """Likewise, ``(2, N)``."""
-    spoofing: Array
-    """Likewise, ``(2, N)``."""
-    jamming_gain: Array
-    """Standard deviation of the receiver noise under jamming over that without, ``(N,)``."""
-    spoofing_rate: Array
-    """Rate at which every axis is pulled off, m/s, ``(N,)``."""
-    receiver_decay: Array
-    """What is left of the receiver's coloured error from one measurement to the next, ``(N,)``."""
-    receiver_kick: Array
-    """Standard deviation of what it gains, m, ``(N,)``."""
-    receiver_error: Array
-    """That error, m, ``(A, N)``; zero where the task has none."""
     deviation: Array
     """True standard deviation of this measurement, m, ``(N,)``."""
-    reported_deviation: Array
-    """What the receiver says of it, m, ``(N,)``."""
     available: Array
     """One where the receiver has a measurement, otherwise zero, ``(N,)``."""
+    disturbances: dict[str, Any]
+    """State of each by its name, see :mod:`.disturbances`."""
 
 
 class Measurement(NamedTuple):
@@ -101,12 +76,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         axes = self.parameters.axes
-        p = self.parameters
-        self.receiver_is_coloured = p.receiver_coloured[1] > 0.0
-        kinds = 3 if self.receiver_is_coloured else 2
-        self.initial_normals, self.normals = kinds * axes, (kinds + 1) * axes
-        self.outliers = Outliers(p.outlier_probability, math.sqrt(p.outlier_factor))
-        self.row_uniforms = self.outliers.row_uniforms
+        self.disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
+        self.initial_normals = 2 * axes + self.disturbances.initial_normals
+        self.normals = 3 * axes + self.disturbances.normals
+        self.row_uniforms = self.disturbances.row_uniforms
         self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
         self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
@@ -117,44 +90,21 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw noise levels, disturbances and rate errors; at the start INS and reference agree."""
         xp, p = self.xp, self.parameters
-        calm = draws.event("undisturbed", p.undisturbed) if p.undisturbed else None
-
-        def unless_calm(drawn: Array, otherwise: float) -> Array:
-            return drawn if calm is None else xp.where(calm, otherwise, drawn)
+        calm = undisturbed(draws, p)
 
         def factor(name: str, limits: tuple[float, float]) -> Array:
-            return unless_calm(draws.log_uniform(name, limits), 1.0)
+            drawn = draws.log_uniform(name, limits)
+            return drawn if calm is None else xp.where(calm, 1.0, drawn)
 
         drift_deviation = p.drift * factor("drift_factor", p.drift_factor)
         coloured_deviation = p.coloured * xp.sqrt(factor("coloured_factor", p.coloured_factor))
         white_intensity = p.white_intensity * factor("white_factor", p.white_factor)
-        factors = [factor("receiver_factor", p.receiver_factor)]
-        changes = unless_calm(draws.integer("noise_changes", p.noise_changes), 0.0)
-        first, second = self._number_at(draws.uniform("change_start", p.change_start, 2))
-        factors += list(draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2))
-        unreported = draws.event("unreported", p.unreported, 2)
-        windows = {
-            name: unless_calm(self._window(name, draws), NEVER) for name in ("outage", "jamming", "spoofing")
-        }
-
-        both = changes == 2
-        earlier = xp.where(changes == 0, NEVER, xp.where(both, xp.minimum(first, second), first))
-        later = xp.where(both, xp.maximum(first, second), NEVER)
-        levels = [xp.sqrt(p.receiver_variance * factor) for factor in factors]
-        reported = levels[:1]
-        for level, silent in zip(levels[1:], unreported, strict=True):
-            reported.append(xp.where(silent, reported[-1], level))
-
         beta, eta = normals[: p.axes], normals[p.axes : 2 * p.axes]
         zeros = 0.0 * beta
+        states = self.disturbances.begin(draws, normals[2 * p.axes :], zeros[0])
         harmonics, turn = self._motion(draws, zeros)
         reference = ordered_sum(harmonics[0])
-        wandering = draw_between(draws.uniform, "receiver_coloured", p.receiver_coloured)
-        coloured = zeros[0] + unless_calm(zeros[0] + wandering, 0.0)
-        lasting = zeros[0] + draw_between(
-            draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time
-        )
-        receiver = GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp)
+        states = self.disturbances.quiet(self.disturbances.complete(states, draws), calm)
         truth = Truth(
             number=zeros[0],
             reference=reference,
@@ -168,20 +118,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             white_step=xp.sqrt(
                 white_intensity * p.sampling_interval + p.sampling.residual * coloured_deviation**2
             ),
-            receiver_levels=xp.stack(levels),
-            reported_levels=xp.stack(reported),
-            change=xp.stack([earlier, later]),
-            **windows,
-            jamming_gain=xp.sqrt(
-                zeros[0] + draw_between(draws.log_uniform, "jamming_factor", p.jamming_factor)
-            ),
-            spoofing_rate=zeros[0] + draw_between(draws.uniform, "spoofing_rate", p.spoofing_rate),
-            receiver_decay=receiver.decay,
-            receiver_kick=receiver.kick,
-            receiver_error=coloured * normals[2 * p.axes :] if self.receiver_is_coloured else zeros,
-            deviation=levels[0],
-            reported_deviation=reported[0],
+            deviation=self.disturbances.change_deviations(states, zeros[0] + 1.0),
             available=zeros[0] + 1.0,
+            disturbances=states,
         )
         return truth, Initial(reference, self.no_covariance + zeros[0])
 
@@ -207,21 +146,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             xp.stack([xp.sin(angle), xp.cos(angle)]),
         )
 
-    def _number_at(self, time: Array) -> Array:
-        """Number of the measurement nearest to a time in s."""
-        return self.xp.round(time / self.parameters.sampling_interval)
-
-    def _window(self, name: str, draws: Draws) -> Array:
-        """First measurement of a disturbance and first one after it, ``(2, N)``."""
-        xp, p = self.xp, self.parameters
-        happens = draws.event(name, getattr(p, f"{name}_probability"))
-        first = self._number_at(draws.uniform(f"{name}_start", getattr(p, f"{name}_start")))
-        beyond = first + self._number_at(draws.uniform(f"{name}_duration", getattr(p, f"{name}_duration")))
-        return xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
-
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver's white and
-        coloured, outliers.
+        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver's white, that of
+        disturbances.
         """
         xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
         number = truth.number + 1.0
@@ -234,38 +161,25 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         increment = (reference - truth.reference) + (slip + truth.white_step * noise[n : 2 * n])
         ins = truth.ins + increment
 
-        deviation, reported = truth.receiver_levels[0], truth.reported_levels[0]
-        available = truth.available
-        if p.noise_changes[1]:
-            levels = truth.receiver_levels, truth.reported_levels
-            deviation, reported = (Steps(level, truth.change).at(number, xp) for level in levels)
-        if p.jamming_probability:
-            deviation = xp.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
-        deviation = self.outliers.amplify(deviation, noise[self.normals :], xp)
-        fix = reference + deviation * noise[2 * n : 3 * n]
-        error = truth.receiver_error
-        if self.receiver_is_coloured:
-            process = GaussMarkov(truth.receiver_decay, truth.receiver_kick)
-            error = process.advance(error, noise[3 * n : 4 * n])
-            fix = fix + error
-        if p.spoofing_probability:
-            pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
-            fix = fix + xp.where(within(number, truth.spoofing), pull, 0.0)
-        if p.outage_probability:
-            available = xp.where(within(number, truth.outage), 0.0, xp.ones_like(number))
-            fix = available * fix
+        further = noise[3 * n : self.normals], noise[self.normals :]
+        steps = self.disturbances.share(number, p.sampling_interval, *further)
+        states = self.disturbances.advance(truth.disturbances, steps)
+        deviation = self.disturbances.change_deviations(states, xp.ones_like(number))
+        reading = reference + deviation * noise[2 * n : 3 * n]
+        states, fix = self.disturbances.change_reading(states, reading)
+        measurement = Measurement(number, ins, increment, fix, xp.ones_like(number), deviation)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
         truth = truth._replace(
             number=number,
             reference=reference,
             harmonics=harmonics,
             ins=ins,
             coloured=s.decay * truth.coloured + kick,
-            receiver_error=error,
             deviation=deviation,
-            reported_deviation=reported,
-            available=available,
+            available=measurement.available,
+            disturbances=states,
         )
-        return truth, Measurement(number, ins, increment, fix, available, reported)
+        return truth, measurement
 
     def state(self, truth: Truth) -> Array:
         """Position, ``(A, N)``."""
@@ -288,34 +202,18 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return {
             "available": truth.available,
             "receiver_deviation": truth.deviation,
-            "reported_deviation": truth.reported_deviation,
+            **self.disturbances.records(truth.disturbances),
         }
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Noise levels of INS and receiver, their changes and disturbances as numbers of measurements (the first in a
         window and the first one after it), and what the receiver is like now.
         """
-        xp = self.xp
-        windows = {
-            name: xp.where(numbers < NEVER, numbers, -1.0)
-            for name, numbers in (
-                ("change", truth.change),
-                ("outage", truth.outage),
-                ("jamming", truth.jamming),
-                ("spoofing", truth.spoofing),
-            )
-        }
         return {
             "drift_deviation": truth.drift_deviation,
             "coloured_step": truth.coloured_step,
             "white_step": truth.white_step,
-            "receiver_levels": truth.receiver_levels,
-            "reported_levels": truth.reported_levels,
-            **windows,
-            "jamming_gain": truth.jamming_gain,
-            "spoofing_rate": truth.spoofing_rate,
-            "receiver_decay": truth.receiver_decay,
-            "receiver_kick": truth.receiver_kick,
+            **self.disturbances.context(truth.disturbances),
             "drift": truth.drift,
             "receiver_deviation": truth.deviation,
             "available": truth.available,

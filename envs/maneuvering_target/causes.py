@@ -1,6 +1,7 @@
 """What makes a radar track of ManeuveringTarget costly: manoeuvres, scans that miss the target, outliers, range."""
 
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment, bins, context_flag
+from ..contract.faults import causes_of
 from ..contract.observation import Array
 from .disturbances import DISTURBANCES
 
@@ -39,5 +40,5 @@ CAUSES = (
     MISSED._replace(phrase="where a scan misses the target"),
     OUTLIER,
     *bins("range", "km", "at ranges", RANGE_EDGES, _range),
-    *(kind.cause for kind in DISTURBANCES if kind.cause is not None),
+    *causes_of(DISTURBANCES),
 )

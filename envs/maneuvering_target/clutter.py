@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ...filters import data_association, polar
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, Numbers
+from ..contract.faults import Disturbance, Step
 from ..contract.observation import Array
 from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
@@ -26,17 +26,6 @@ class Track(NamedTuple):
     """Position and velocity after the scan before, ``(4, N)``."""
     covariance: Array
     """``(4, 4, N)``."""
-
-
-class Plots(NamedTuple):
-    """All plots of a scan in the window of a track, in random order."""
-
-    position: Array
-    """x and y, m, ``(2, K, N)``; zero where there is none, where an estimator gets NaN."""
-    variance: Array
-    """Variances of their errors, evaluated at the plots, m^2, ``(2, K, N)``."""
-    available: Array
-    """1 where there is a plot, 0 where not, ``(K, N)``."""
 
 
 class Echo(NamedTuple):
@@ -74,10 +63,12 @@ class Clutter(Disturbance):
         """Whether there are any."""
         return parameters.cluttered
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> ClutterState:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> ClutterState:
         """Draw the density, which the parameters give per square kilometre."""
         density = 1e-6 * draws.uniform("clutter_density", self.parameters.clutter_density)
-        return ClutterState(density, 0.0 * density, Echo(truth.position, 0.0 * density), 0.0 * density)
+        return ClutterState(
+            density, 0.0 * density, Echo(self.xp.stack([zero, zero]), 0.0 * density), 0.0 * density
+        )
 
     def count(self, uniform: Array, density: Array) -> Array:
         """Poisson number of false plots in the window, one less than slots at most, by the inverse of its cumulative
@@ -93,10 +84,10 @@ class Clutter(Disturbance):
         return count
 
     def change_measurement(
-        self, state: ClutterState, measurement: Any, numbers: Numbers, feedback: Track
+        self, state: ClutterState, measurement: Any, step: Step, feedback: Track
     ) -> tuple[ClutterState, Any]:
         """Put false plots beside that of the target, and associate one with the track of the filter."""
-        xp, p, uniforms = self.xp, self.parameters, numbers.uniforms
+        xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
             feedback,
             measurement.interval,
@@ -133,7 +124,7 @@ class Clutter(Disturbance):
             variance=variance,
             available=available,
             elapsed=elapsed,
-            plots=Plots(positions, variances, there),
+            plots=data_association.Plots(positions, variances, there),
         )
 
     def predict(self, track: Track, interval: Array, elapsed: Array) -> tuple[Array, Array]:

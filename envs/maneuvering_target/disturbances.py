@@ -4,10 +4,10 @@ Errors are along x and y, or, where measurements are polar, of range and azimuth
 deviations. Nobody says any of it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, GaussMarkov, Glint, Numbers
+from ..contract.faults import Disturbance, GaussMarkov, Glint, Step, undisturbed
 from ..contract.observation import Array
 from .clutter import Clutter
 from .parameters import ManeuveringTargetParameters
@@ -36,20 +36,19 @@ class ColouredErrors(Disturbance):
         """Whether there may be any."""
         return parameters.coloured
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> Colour:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Colour:
         """Draw how large they are and how long they last; they are stationary from the start."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
-        if p.undisturbed:
-            drawn = draws.drawn.get("undisturbed")
-            calm = draws.event("undisturbed", p.undisturbed) if drawn is None else drawn
+        calm = undisturbed(draws, p)
+        if calm is not None:
             deviation = self.xp.where(calm, 0.0, deviation)
         return Colour(deviation, draws.uniform("coloured_time", p.coloured_time), deviation * normals)
 
-    def advance(self, state: Colour, interval: Array, numbers: Numbers) -> Colour:
+    def advance(self, state: Colour, step: Step) -> Colour:
         """Let them wander."""
-        process = GaussMarkov.sampled(state.deviation, state.correlation_time, interval, self.xp)
-        return state._replace(level=process.advance(state.level, numbers.normals))
+        process = GaussMarkov.sampled(state.deviation, state.correlation_time, step.interval, self.xp)
+        return state._replace(level=process.advance(state.level, step.normals))
 
     def change_errors(self, state: Colour, errors: Array) -> Array:
         """Add them."""
@@ -70,7 +69,7 @@ class Bias(Disturbance):
         """Whether there are any."""
         return parameters.bias > 0.0
 
-    def begin(self, draws: Draws, normals: Array, truth: Any) -> Array:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
         """Draw them."""
         return draws.uniform("bias", (-self.parameters.bias, self.parameters.bias), 2)
 

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from ..contract.draws import Draws
+from ..contract.faults import undisturbed
 from ..contract.observation import Array
 from ..contract.task import Task
 from .courses import Course, Motion
@@ -94,8 +95,8 @@ class UnreliableScans(RegularScans):
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
-        if p.undisturbed:
-            calm = draws.event("undisturbed", p.undisturbed)
+        calm = undisturbed(draws, p)
+        if calm is not None:
             seen, jitter = self.xp.where(calm, 1.0, seen), self.xp.where(calm, 0.0, jitter)
         return Reliability(seen, jitter, never, never, *motion)
 

@@ -4,13 +4,14 @@ import math
 from typing import Any, NamedTuple
 
 from ...filters import polar
+from ...filters.data_association import Plots
 from ..contract.draws import Draws
 from ..contract.faults import Disturbances
 from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
 from ..contract.world import World
-from .clutter import Plots, Track
+from .clutter import Track
 from .courses import course_of
 from .disturbances import DISTURBANCES
 from .parameters import ManeuveringTargetParameters
@@ -110,8 +111,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
         diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
-        truth = Truth(0.0 * ones, position, velocity, flight, scans, {})
-        truth = truth._replace(disturbances=self.disturbances.begin(draws, normals[4:], truth))
+        states = self.disturbances.begin(draws, normals[4:], 0.0 * ones)
+        states = self.disturbances.complete(states, draws)
+        truth = Truth(0.0 * ones, position, velocity, flight, scans, states)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 
     def advance(self, truth: Truth, noise: Array, feedback: Track | None) -> tuple[Truth, Measurement]:
@@ -120,8 +122,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
         uniforms, before = noise[self.normals :], (truth.position, truth.velocity)
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
-        numbers = self.disturbances.share(noise[2 : self.normals], uniforms[self.scans.row_uniforms :])
-        states = self.disturbances.advance(truth.disturbances, scan.interval, numbers)
+        further = noise[2 : self.normals], uniforms[self.scans.row_uniforms :]
+        steps = self.disturbances.share(number, scan.interval, *further)
+        states = self.disturbances.advance(truth.disturbances, steps)
         errors = self.disturbances.change_errors(states, noise[:2])
         states, measured = self._measure(position, errors, states)
         variance = self.variances(measured)
@@ -130,7 +133,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
             measured = self.xp.where(seen, measured, 0.0)
             variance = self.xp.where(seen, variance, p.range_sigma**2)
         measurement = Measurement(number, measured, variance, available, scan.interval, scan.elapsed)
-        states, measurement = self.disturbances.change_measurement(states, measurement, numbers, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
         return Truth(number, position, velocity, flight, scans, states), measurement
 
     def variances(self, position: Array) -> Array:

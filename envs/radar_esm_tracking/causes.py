@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from ..contract.causes import OUTLIER, Cause, Moment, bins
+from ..contract.faults import causes_of as of_disturbances
 from ..contract.observation import Array
 from .world import DISTURBANCES
 
@@ -50,5 +51,5 @@ def causes_of(classes: Sequence[str]) -> tuple[Cause, ...]:
         Cause("second emitter", "beside a second emitter", _has_second_emitter),
         OUTLIER,
         *bins("range", "km", "at ranges", RANGE_EDGES, lambda moment: moment.state[0] / 1e3),
-        *(kind.cause for kind in DISTURBANCES if kind.cause is not None),
+        *of_disturbances(DISTURBANCES),
     )

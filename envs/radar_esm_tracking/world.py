@@ -8,7 +8,7 @@ import numpy
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..contract.draws import Draws, category, draw_between
-from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint
+from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
@@ -162,8 +162,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if p.class_change_probability < 1.0:
             changes = draws.event("class_changes", p.class_change_probability)
             change = xp.where(changes, change, self.never)
-        if p.undisturbed:
-            calm = draws.event("undisturbed", p.undisturbed)
+        calm = undisturbed(draws, p)
+        if calm is not None:
             silence_start, second_emitter = (xp.where(calm, 0.0, x) for x in (silence_start, second_emitter))
             silence_end, change = xp.where(calm, 1.0, silence_end), xp.where(calm, self.never, change)
             coloured, correlation = (xp.where(calm, 0.0, x) for x in (coloured, correlation))
@@ -189,9 +189,10 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             radar_kick=wandering.kick,
             radar_correlation=correlation,
             radar_error=(coloured if self.radar_is_coloured else 0.0) * normals[own - 2 : own],
-            disturbances={},
+            disturbances=self.disturbances.complete(
+                self.disturbances.begin(draws, normals[own:], zero), draws
+            ),
         )
-        truth = truth._replace(disturbances=self.disturbances.begin(draws, normals[own:], truth))
         truth, first = self._measure(truth, normals[1:3], normals[3:5], draws.unit("first_intercept", 3))
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
@@ -238,12 +239,13 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if self.radar_is_coloured:
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
-        numbers = self.disturbances.share(noise[self.own_normals : self.normals], uniforms[4:])
-        states = self.disturbances.advance(truth.disturbances, p.sampling_interval, numbers)
+        further = noise[self.own_normals : self.normals], uniforms[4:]
+        steps = self.disturbances.share(scan, p.sampling_interval, *further)
+        states = self.disturbances.advance(truth.disturbances, steps)
         truth = truth._replace(disturbances=states)
         truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
         states, measurement = self.disturbances.change_measurement(
-            truth.disturbances, measurement, numbers, feedback
+            truth.disturbances, measurement, steps, feedback
         )
         return truth._replace(disturbances=states), measurement
 

@@ -85,14 +85,10 @@ class TightlyCoupledNavigationPicture(Picture):
         flags: list[list[bool]] = [[] for _ in FAULTS]
         for _ in range(task.horizon):
             modes.append(int(truth.mode[0]))
-            hidden, no_rates = truth.faults.hidden[:, 0], truth.faults.no_rates[:, 0]
-            k = float(truth.step[0])
-            happening = (
-                hidden[0] <= k <= hidden[1],
-                no_rates[0] <= k <= no_rates[1],
-                (truth.noise_factor[:, 0] > 1.0).any(),
-                truth.stuck[0] > 0.0,
+            hidden, no_rates, stuck = (
+                truth.disturbances[name].now[0] > 0.0 for name in ("hidden", "no_rates", "stuck")
             )
+            happening = hidden, no_rates, (truth.noise_factor[:, 0] > 1.0).any(), stuck
             for flag, now in zip(flags, happening, strict=True):
                 flag.append(bool(now))
             # Only the truth and the sensors: the filters would take a hundred times as long.

@@ -1,12 +1,12 @@
 """What makes a loop of UavAutopilot costly: commands, gusts, noisy sensors, dropouts."""
 
-from ..contract.causes import MISSED, Cause, Moment
+from ..contract.causes import Cause, Moment
+from ..contract.faults import causes_of
 from ..contract.observation import Array
+from .disturbances import DISTURBANCES, RAISED
 
 SETTLING = 20.0
 """Measurements in which the loop follows a new command."""
-RAISED = 2.0
-"""Factor on a nominal noise from which it is raised."""
 
 
 def _has_new_command(moment: Moment) -> Array | None:
@@ -21,13 +21,6 @@ def _is_gusty(moment: Moment) -> Array | None:
     return moment.context["level"] >= RAISED if moment.knows("level") else None
 
 
-def _has_noisy_sensor(moment: Moment) -> Array | None:
-    if not moment.knows("sensor_level"):
-        return None
-    noisy: Array = moment.xp.any(moment.context["sensor_level"] >= RAISED, axis=0)
-    return noisy
-
-
 def _is_calm(moment: Moment) -> Array | None:
     if not moment.knows("level", "sensor_level"):
         return None
@@ -39,11 +32,6 @@ def _is_calm(moment: Moment) -> Array | None:
 CAUSES = (
     Cause("command", f"in the {SETTLING:g} measurements after a command", _has_new_command),
     Cause("disturbance", f"where the disturbance is at least {RAISED:g} times the nominal one", _is_gusty),
-    Cause(
-        "sensor noise",
-        f"where a sensor's noise is at least {RAISED:g} times the nominal one",
-        _has_noisy_sensor,
-    ),
     Cause("calm", "where all noise is near its nominal level", _is_calm),
-    MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),
+    *causes_of(DISTURBANCES),
 )

@@ -1,17 +1,17 @@
 """The aircraft of UavAutopilot, what disturbs it, and its sensors; equations (8) and (9)."""
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
 from ...filters import linear_systems
 from ..contract.draws import Draws
-from ..contract.faults import GaussMarkov
+from ..contract.faults import Disturbances, undisturbed
 from ..contract.observation import Array
-from ..contract.schedules import Steps, within
+from ..contract.schedules import Steps
 from ..contract.world import World
+from .disturbances import DISTURBANCES, DRAWN_FIRST, draw_steps
 from .parameters import UavAutopilotParameters
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ class Truth(NamedTuple):
     """Measurements so far, ``(N,)``."""
     state: Array
     """In the units of the task's components, ``(n, N)``."""
-    reading: Array
-    """Last valid reading of each sensor, which it holds during a dropout, ``(m, N)``."""
     command: Array
     """r at this measurement, ``(N,)``."""
     level: Array
@@ -41,20 +39,8 @@ class Truth(NamedTuple):
     """Values ``(J + 1, N)``."""
     levels: Steps
     """Values ``(J + 1, N)``."""
-    sensor_levels: Steps
-    """Values ``(J + 1, m, N)``."""
-    sensor_bias: Array
-    """Constant error of each sensor, in its unit, ``(m, N)``."""
-    sensor_coloured: Array
-    """Coloured error of each sensor at this measurement, in its unit, ``(m, N)``."""
-    coloured_decay: Array
-    """What is left of it at the next measurement, ``(m, N)``."""
-    coloured_kick: Array
-    """Standard deviation of what it gains, ``(m, N)``; zero: there is no such error."""
-    dropout_starts: Array
-    """First measurement without a reading, ``(D, m, N)``."""
-    dropout_stops: Array
-    """First measurement with a reading again, ``(D, m, N)``."""
+    disturbances: dict[str, Any]
+    """State of each by its name, see :mod:`.disturbances`."""
 
 
 class Start(NamedTuple):
@@ -105,24 +91,20 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         """Normal numbers that the level of the disturbance multiplies; they come first."""
         self.drives = scaled.shape[1] + other.shape[1]
         """Normal numbers that drive the plant; those of the sensors follow."""
-        m = len(task.sensors)
-        self.sensors_are_coloured = p.sensor_coloured[1] > 0.0
-        self.initial_normals = len(task.components) + self.sensors_are_coloured * m
-        self.normals = self.drives + (1 + self.sensors_are_coloured) * m
+        self.disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
+        self.own_normals = self.drives + len(task.sensors)
+        self.initial_normals = len(task.components) + self.disturbances.initial_normals
+        self.normals = self.own_normals + self.disturbances.normals
+        self.row_uniforms = self.disturbances.row_uniforms
         self.noise_factor = constant(numpy.hstack([scaled, other]))
         self.F, self.B = constant(plant.F), constant(plant.B)
         self.sensor_sigmas = constant(p.value("sensor_sigmas"))[:, None]
         self.initial_sigmas = constant(p.value("initial_sigmas"))[:, None]
         self.initial_covariance = constant(numpy.diag(numpy.square(p.value("initial_sigmas"))))[:, :, None]
-        self.changing, self.biased = (
-            constant([[float(named is None or s in named)] for s in task.sensors])
-            for named in (p.changing_sensors, p.biased_sensors)
-        )
         self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
         self.optimal = task.design.optimal
         self.manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
-        self.dropouts = -(-p.horizon // p.dropout_period) if p.dropout_period else 0
 
     def reading_deviations(self, measurement: Measurement) -> Array:
         """The nominal ones."""
@@ -130,72 +112,30 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
         """Draw what the episode will be like, and the state at its start."""
-        xp, p, m = self.xp, self.parameters, len(self.task.sensors)
-        state = self.initial_sigmas * normals[: len(self.task.components)]
+        xp, p, size = self.xp, self.parameters, len(self.task.components)
+        state = self.initial_sigmas * normals[:size]
         zero = xp.zeros_like(state[0])
         commands = self._commands(draws, zero)
-        levels = self._parts(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
-        sensor_levels = self._parts(draws, "sensor", p.sensor_levels, p.sensor_times, zero, m)
-        sensor_levels = sensor_levels._replace(values=1.0 + self.changing * (sensor_levels.values - 1.0))
-        no_dropout = xp.stack([zero] * m)
-        starts, stops = [no_dropout], [no_dropout]
-        for i in range(self.dropouts):
-            length = draws.integer(f"dropout_length_{i}", p.dropout_length, m)
-            room = draws.unit(f"dropout_{i}", m) * (p.dropout_period - length)
-            starts.append(i * p.dropout_period + 1.0 + xp.floor(room))
-            stops.append(starts[-1] + length)
-        bias, deviation = no_dropout, no_dropout
-        if p.sensor_bias[1]:
-            side = xp.where(draws.event("bias_side", 0.5, m), 1.0, -1.0)
-            bias = self.sensor_sigmas * self.biased * side * draws.uniform("bias", p.sensor_bias, m)
-        lasting = 1.0 + no_dropout
-        if self.sensors_are_coloured:
-            deviation = self.sensor_sigmas * draws.uniform("coloured", p.sensor_coloured, m)
-            lasting = draws.log_uniform("correlation_time", p.sensor_correlation_time, m)
-        if p.undisturbed:
-            calm = draws.event("undisturbed", p.undisturbed)
+        levels = draw_steps(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
+        states = self.disturbances.begin(draws, normals[size:], zero)
+        states = self.disturbances.complete(states, draws)
+        calm = undisturbed(draws, p)
+        if calm is not None:
             levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
-            sensor_levels = sensor_levels._replace(values=xp.where(calm, 1.0, sensor_levels.values))
-            stops = [xp.where(calm, start, stop) for start, stop in zip(starts, stops, strict=True)]
-            bias, deviation = (xp.where(calm, 0.0, values) for values in (bias, deviation))
-        coloured = GaussMarkov.sampled(deviation, lasting, p.value("sampling_interval"), xp)
         if p.plant == "U":
             state = xp.concat([state[:-1], state[-1:] * levels.values[0]])
         truth = Truth(
             number=zero,
             state=state,
-            reading=no_dropout,
             command=zero,
             level=levels.values[0],
-            sensor_level=sensor_levels.values[0],
+            sensor_level=xp.ones_like(xp.stack([zero] * len(self.task.sensors))),
             commands=commands,
             levels=levels,
-            sensor_levels=sensor_levels,
-            sensor_bias=bias,
-            sensor_coloured=deviation * normals[len(self.task.components) :]
-            if self.sensors_are_coloured
-            else no_dropout,
-            coloured_decay=coloured.decay,
-            coloured_kick=coloured.kick,
-            dropout_starts=xp.stack(starts)[1:],
-            dropout_stops=xp.stack(stops)[1:],
+            disturbances=self.disturbances.quiet(states, calm),
         )
         covariance = xp.broadcast_to(self.initial_covariance, (*self.initial_covariance.shape[:2], len(zero)))
         return truth, Start(xp.zeros_like(state), covariance, zero)
-
-    def _parts(
-        self,
-        draws: Draws,
-        kind: str,
-        levels: Sequence[tuple[float, float]],
-        times: Sequence[tuple[int, int]],
-        zero: Array,
-        count: int | None = None,
-    ) -> Steps:
-        """Draw the level in each part of the episode, and when the parts begin."""
-        values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
-        begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
-        return Steps(self.xp.stack(values), self.xp.stack([zero, *begins])[1:])
 
     def _commands(self, draws: Draws, zero: Array) -> Steps:
         """Draw the command.
@@ -233,37 +173,30 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         """
         xp = self.xp
         number = truth.number + 1.0
-        level, sensor_level = truth.levels.at(number, xp), truth.sensor_levels.at(number, xp)
-        m = len(self.task.sensors)
-        drive, readout = noise[: self.drives], noise[self.drives : self.drives + m]
+        level = truth.levels.at(number, xp)
+        drive, readout = noise[: self.drives], noise[self.drives : self.own_normals]
         drive = xp.concat([drive[: self.scaled_drives] * level, drive[self.scaled_drives :]])
         disturbance = xp.matmul(self.noise_factor, drive)
         state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
         state = xp.clip(state, -FARTHEST, FARTHEST)
+        further = noise[self.own_normals : self.normals], noise[self.normals :]
+        steps = self.disturbances.share(number, self.parameters.value("sampling_interval"), *further)
+        states = self.disturbances.advance(truth.disturbances, steps)
+        sensor_level = self.disturbances.change_deviations(states, xp.ones_like(readout))
         reading = self.task.readings_of(state) + self.sensor_sigmas * sensor_level * readout
-        coloured = truth.sensor_coloured
-        if self.sensors_are_coloured:
-            process = GaussMarkov(truth.coloured_decay, truth.coloured_kick)
-            coloured = process.advance(coloured, noise[self.drives + m :])
-            reading = reading + coloured
-        if self.parameters.sensor_bias[1]:
-            reading = reading + truth.sensor_bias
-        available = xp.ones_like(reading)
-        for i in range(truth.dropout_starts.shape[0]):
-            out = within(number, (truth.dropout_starts[i], truth.dropout_stops[i]))
-            available = xp.where(out, 0.0, available)
-        reading = xp.where(available > 0.0, reading, truth.reading)
+        states, reading = self.disturbances.change_reading(states, reading)
         command = truth.commands.at(number, xp)
+        measurement = Measurement(number, reading, xp.ones_like(reading), command, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
         truth = truth._replace(
             number=number,
             state=state,
-            reading=reading,
             command=command,
             level=level,
             sensor_level=sensor_level,
-            sensor_coloured=coloured,
+            disturbances=states,
         )
-        return truth, Measurement(number, reading, available, command, feedback)
+        return truth, measurement
 
     def component_readings(self, measurement: Measurement) -> Array:
         """Every coordinate that has a sensor."""
@@ -304,7 +237,11 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
 
     def records(self, truth: Truth) -> dict[str, Array]:
         """Output and command, in the unit of the output."""
-        return {"output": truth.state[self.task.output], "command": truth.command}
+        return {
+            **self.disturbances.records(truth.disturbances),
+            "output": truth.state[self.task.output],
+            "command": truth.command,
+        }
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
@@ -313,14 +250,9 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         return {
             "levels": truth.levels.values,
             "level_times": truth.levels.times,
-            "sensor_levels": truth.sensor_levels.values,
-            "sensor_level_times": truth.sensor_levels.times,
             "commands": truth.commands.values,
             "command_times": truth.commands.times,
-            "dropout_starts": truth.dropout_starts,
-            "dropout_stops": truth.dropout_stops,
             "level": truth.level,
             "sensor_level": truth.sensor_level,
-            "sensor_bias": truth.sensor_bias,
-            "sensor_coloured": truth.sensor_coloured,
+            **self.disturbances.context(truth.disturbances),
         }

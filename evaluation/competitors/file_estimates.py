@@ -12,12 +12,10 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.contract.filter import Filter, Input, Stated
-from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ..storage.dataset import NO_ROW
 from ..storage.estimate_tables import EstimateTable, read_estimates
-from .smoothers import check_open_loop
 
 SAME_TIME = 1e-3
 """s, within which a row is of a measurement; at most a quarter of the time between two."""
@@ -66,24 +64,6 @@ class FileEstimates:
                 f"{name} holds no {', '.join(missing)}, without which {task.id} does not say what an error costs"
             )
         return TrackEstimates(table, dict(tracks), _recorded_times(task, table, name))
-
-
-def bind_tracks(name: str, competitor: Any, model: Model, tracks: Mapping[int, str]) -> Any:
-    """Return a competitor, if it is from a file with the rows of these tracks.
-
-    Args:
-        name: of it, in errors.
-        competitor: or what makes it.
-        model: that it runs in.
-        tracks: names by the seeds of their episodes.
-
-    Raises:
-        ValueError: if the estimates do not belong to the tracks, or the loop is closed.
-    """
-    if not isinstance(competitor, FileEstimates):
-        return competitor
-    check_open_loop(model, f"{name!r}")
-    return competitor.of_tracks(model.on_numpy().task, tracks)
 
 
 class TrackEstimates(NamedTuple):

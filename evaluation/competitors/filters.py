@@ -21,7 +21,7 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
-from .kinds import Kind, check_competitor, compilation_key, make_competitor
+from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, make_competitor
 from .programs import ProgramEstimator
 
 AFTER_MISSED = 5.0
@@ -480,7 +480,30 @@ def _can_be_traced(maker: Any, own: Filter) -> bool:
     return True
 
 
-def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int) -> Model:
+def check_knowledge(name: str, own: Any, kind: Kind, task: Task) -> None:
+    """Check that a reference or a bound says of every disturbance of the world that it knows it.
+
+    Args:
+        name: of it, in errors.
+        own: reference or bound, see :class:`.kinds.Reference`.
+        kind: which of them.
+        task: whose world it is.
+
+    Raises:
+        ValueError: if it does not: a disturbance that is new would make it worse than who is told nothing.
+    """
+    known = getattr(own, "disturbances", ())
+    for part in task.world.disturbances.parts if known is not None else ():
+        if part.name not in known:
+            raise ValueError(
+                f"{kind} {name!r} does not know the disturbance {part.name!r} of {task.id}: add it to the reference's "
+                "class attribute disturbances, and use it or ignore it on purpose"
+            )
+
+
+def put_in_loop(
+    model: Model, competitor: Any, kind: Kind, name: str, count: int, last: int | None = None
+) -> Model:
     """Return a model whose filter is a competitor.
 
     Args:
@@ -489,14 +512,18 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
         kind: what it is.
         name: of it, in errors.
         count: number of episodes.
+        last: number of their last measurement; None: not known.
 
     Raises:
-        ValueError: if it cannot be made, or has not the methods of its kind.
+        ValueError: if it cannot be made, has not the methods of its kind, or is a reference that knows not all that may
+            happen.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
         own = make_competitor(competitor, model.task)
+    if kind in TOLD_MORE:
+        check_knowledge(name, own, kind, model.task)
     if isinstance(own, ProgramEstimator):
-        own.tracks = count
+        own.tracks, own.last = count, last
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):
         try:

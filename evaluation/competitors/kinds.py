@@ -11,7 +11,7 @@ Stable-Baselines3.
 
 import functools
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy
@@ -345,6 +345,8 @@ class Reference(Protocol):
     kind: ClassVar[Kind] = "reference"
     knows: ClassVar[str]
     """What it is told, in words; printed wherever it is reported."""
+    disturbances: ClassVar[Collection[str] | None] = ()
+    """Names of the world's disturbances that it is told of or ignores on purpose; None: sensors are nothing to it."""
 
     def __init__(self, task: Task) -> None: ...
 
@@ -365,6 +367,7 @@ class Bound(Protocol):
 
     kind: ClassVar[Kind] = "bound"
     knows: ClassVar[str]
+    disturbances: ClassVar[Collection[str] | None] = ()
 
     def __init__(self, task: Task) -> None: ...
 

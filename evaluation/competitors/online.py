@@ -21,7 +21,7 @@ from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .filters import find_fault, put_in_loop
-from .kinds import Kind, check_competitor, make_competitor
+from .kinds import check_competitor, kind_of, make_competitor
 from .online_state import Estimate, History, OnlineState, Taken, Watch
 from .stepping import SteppingPolicy
 
@@ -39,7 +39,6 @@ class OnlineFilter:
     Args:
         model: task, a feed in its world's place, with the bank of the competitor's control.
         competitor: policy or estimator, or what makes it.
-        kind: what it is.
         name: of it, in errors.
         tracks: how many are followed side by side.
         watch: looks at what a network inside is shown; None where there is none.
@@ -54,12 +53,12 @@ class OnlineFilter:
         self,
         model: Model,
         competitor: Any,
-        kind: Kind,
         name: str,
         tracks: int = 1,
         watch: Watch | None = None,
         lag: int | timedelta = 0,
     ) -> None:
+        kind = kind_of(competitor)
         if kind not in ("policy", "estimator"):
             raise ValueError(
                 f"{name!r} is of kind {kind} and cannot run online: choose a policy or an estimator"

@@ -24,6 +24,7 @@ END_SECONDS = 1.0
 """That a program has to end in peace."""
 PIPE_BYTES = 1 << 20
 """Of a pipe, where the system can be asked for it: a message of a thousand tracks is one piece then."""
+MORE = "it has written more than an answer"
 LAST_WORDS = 2000
 """Bytes of standard error that are kept."""
 
@@ -102,7 +103,7 @@ class ProgramProcess:
         unsent, until = memoryview(question), time.monotonic() + self._seconds
         self._read(self._from)
         if self._buffer:
-            raise Failure(WRONG, "it has written more than an answer")
+            raise Failure(WRONG, MORE)
         while True:
             if unsent:
                 unsent = self._write(unsent)
@@ -122,6 +123,26 @@ class ProgramProcess:
             Failure: if it is not taken in time.
         """
         self.exchange(message, 0)
+
+    def finish(self) -> None:
+        """End its input, and see that nothing follows its last answer; a program may take ``END_SECONDS`` to end.
+
+        Raises:
+            Failure: if something does: then an earlier answer was one too many, and later ones were of other questions.
+        """
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        until, goes_on = time.monotonic() + END_SECONDS, True
+        while goes_on and not self._buffer and (left := until - time.monotonic()) > 0.0:
+            for key, _ in self._answers.select(left):
+                if key.fd == self._from:
+                    found = os.read(self._from, PIPE_BYTES)
+                    self._buffer += found
+                    goes_on = bool(found)
+                else:
+                    self._read(key.fd)
+        if self._buffer:
+            raise Failure(WRONG, MORE)
 
     def _write(self, unsent: memoryview) -> memoryview:
         """Write what fits into the pipe, and wait for room for the rest."""

@@ -179,6 +179,7 @@ class ProgramEstimator:
 
     Attributes:
         tracks: how many of the N lanes are tracks; the others repeat the last one.
+        last: number of the last measurement, whose answer nothing may follow; None where that is not known.
         fault: number of the reason among ``FAULTS`` for which there is no answer; 0 while there is.
         feedback: what it has reported to steer the world, ``(..., N)``; None where it does not.
     """
@@ -188,6 +189,7 @@ class ProgramEstimator:
     def __init__(self, task: Task, program: Program) -> None:
         self.task, self.program = task, program
         self.tracks: int | None = None
+        self.last: int | None = None
         self.fault, self.step_number = 0, 0
         self.feedback: numpy.ndarray | None = None
         self._steering: Field | None = None
@@ -236,7 +238,10 @@ class ProgramEstimator:
             try:
                 if memory == 0:
                     self._greet(measurement)
-                answer = self._ask(rows_of(measurement, self.count), C)
+                found = self._ask(rows_of(measurement, self.count), C)
+                if self.step_number == self.last:
+                    self._process.finish()
+                answer = found
             except Failure as failure:
                 self.fault = failure.fault
                 warnings.warn(

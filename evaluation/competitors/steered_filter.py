@@ -54,7 +54,7 @@ class Decider:
 
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
         self.xp, self.ask, self._template = model.task.xp, act, memory
-        self._shapes = shapes_of(memory)
+        self._shapes = [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
         self.space = model.action_space
         self.size = math.prod(self.space.shape or (1,))
         self.interval = model.task.decision_interval if interval is None else interval
@@ -156,11 +156,6 @@ class SteeredFilter(AroundBank[Steered]):
     def records(self, state: Steered, measurement: Any) -> dict[str, Array]:
         """Those of the bank."""
         return self.bank.records(state.bank, measurement)
-
-
-def shapes_of(memory: Any) -> list[tuple[tuple[int, ...], str]]:
-    """Shapes and kinds of the arrays that a policy remembers."""
-    return [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
 
 
 def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:

@@ -51,7 +51,7 @@ def episode_frames(
         raise ValueError(f"{name!r} is a bound: it estimates nothing that could be drawn")
     keywords = {**getattr(competitor, "task_keywords", {}), **keywords}
     if kind == "policy":
-        control = control_of(competitor, kind, None, task, name)
+        control = control_of(competitor, None, task, name)
         world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
         return _policy_frames(world, name, competitor, seed, every)
     model, chosen = (

@@ -63,12 +63,11 @@ def run_episodes(
     """
     drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
     plan = _with_episodes(plan_of(drawn, competitors), numbers)
-    kept = {name: run_piece(plan.piece(name, 0, len(numbers), True), _unheard) for name in competitors}
+    kept = {
+        name: run_piece(plan.piece(name, 0, len(numbers), True), lambda measurements: None)
+        for name in competitors
+    }
     return plan.dataset(kept, plan.seeds)
-
-
-def _unheard(measurements: int) -> None:
-    """Tell nobody of the progress: these are few."""
 
 
 def _with_episodes(plan: Plan, numbers: list[int]) -> Plan:

@@ -11,6 +11,7 @@ import cloudpickle
 import gymnasium
 import numpy
 
+from ...compiler.native import optimised_code
 from ...envs.contract.model import Model
 from ...envs.contract.parameters import check_integer, quote_shortened
 from ...envs.contract.task import Scenario, Task
@@ -19,7 +20,7 @@ from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
-from ..competitors.file_estimates import bind_tracks
+from ..competitors.file_estimates import FileEstimates
 from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
@@ -37,12 +38,11 @@ if TYPE_CHECKING:
     import xarray
 
 
-def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+def control_of(maker: Any, control: str | None, cls: type[Task], name: str) -> str:
     """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
 
     Args:
         maker: of the competitor, or the competitor itself.
-        kind: what it is.
         control: that is demanded; None demands none.
         cls: the environment.
         name: of the competitor, in errors.
@@ -52,7 +52,7 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     """
     if control is not None and not isinstance(control, str):  # an array equals no word, and no truth
         raise nearest("control", control, cls.controls)
-    if kind != "policy":
+    if kind_of(maker) != "policy":
         return cls.controls[0]
     own = getattr(maker, "control", None)
     space = getattr(maker, "action_space", None)
@@ -207,7 +207,7 @@ def run_experiment(
     ]
     if not workers.alone:
         check_sendable(experiment.task, competitors)
-    sizes = [piece.measurements for piece in pieces]
+    sizes = [len(piece.seeds) * piece.horizon for piece in pieces]
     chunks = workers.results(run_piece, pieces, sizes, progress)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     count = len(chunks) // len(competitors)
@@ -235,11 +235,6 @@ class Piece(NamedTuple):
     model: Model | None
     """That was made already, in this process."""
 
-    @property
-    def measurements(self) -> int:
-        """How many there are."""
-        return len(self.seeds) * self.horizon
-
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 """What few estimators and references say: how likely a measurement was."""
@@ -257,25 +252,22 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
         drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
-    flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    # What is timed afterwards is optimised then: nothing need be compiled in two ways.
+    with optimised_code(experiment.timed):
+        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)
     if experiment.strict and "lost" in arrays:
         _refuse_losses(piece, arrays["lost"])
     if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
-        arrays["action"] = _limit_actions(model.action_space, flown.action)
+        box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
+        arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
             if name in arrays and numpy.isnan(arrays[name]).all():
                 del arrays[name]
     return arrays
-
-
-def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
-    """Return the actions that are applied, within the limits of their box, ``(episodes, time, A)``."""
-    bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
-    return bounded.reshape(*action.shape[:2], -1)
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
@@ -405,7 +397,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
-        controls[name] = control_of(maker, kinds[name], control, cls, name)
+        controls[name] = control_of(maker, control, cls, name)
         models[name] = experiment.make_model(maker, controls[name])
     for name, model in models.items():
         check_observation(model, competitors[name], name)
@@ -428,7 +420,11 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         tracks = {seed: str(i) for i, seed in enumerate(seeds)}
     else:
         tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}
-    competitors = {name: bind_tracks(name, one, models[name], tracks) for name, one in competitors.items()}
+    competitors = dict(competitors)
+    for name, one in competitors.items():
+        if isinstance(one, FileEstimates):
+            check_open_loop(models[name], repr(name))
+            competitors[name] = one.of_tracks(models[name].on_numpy().task, tracks)
     return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
 
 

@@ -7,8 +7,8 @@ import numpy
 
 from ...envs.contract.model import Model
 from ...envs.data.recording import Recording
-from ..statistics.cause_split import VARIABLE, cause_coords
-from ..storage.dataset import group_of_each, keywords_as_text, whole_number, with_windows
+from ..statistics.cause_split import VARIABLE
+from ..storage.dataset import group_of_each, keywords_as_text, whole_number, window_coords
 from .kept import DRAWN_PREFIX
 
 if TYPE_CHECKING:
@@ -160,19 +160,38 @@ def with_named_axes(
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked, _attributes(key, model.task.cost_description))
-    dataset = xarray.Dataset(
+    coords: dict[str, Any] = {
+        "policy": names,
+        "kind": ("policy", [kinds[n] for n in names]),
+        "control": ("policy", [controls[n] for n in names]),
+        "episode": numpy.arange(len(seeds)),
+        "episode_seed": ("episode", [str(seed) for seed in seeds]),
+        "time": times,
+        "component": components,
+        "unit": ("component", [c.unit for c in model.task.components]),
+        "group": ("component", group_of_each(components, model.task.groups)),
+    }
+    if model.task.interval is not None:
+        about = {"units": "s", "long_name": "since the start of the track"}
+        coords["elapsed"] = ("time", float(model.task.interval) * times, about)
+    windows = {
+        name: (first, min(last, model.task.horizon))
+        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
+        if first <= model.task.horizon
+    }
+    coords |= window_coords(windows)
+    if "mode_probability" in variables:
+        coords["mode"] = list(model.task.modes)
+    if VARIABLE in variables:
+        causes = model.task.causes
+        coords["cause"] = [cause.name for cause in causes]
+        coords["cause_phrase"] = ("cause", [cause.phrase for cause in causes])
+        coords["start_measurements"] = model.task.start_measurements
+    if actions:
+        coords["action_name"] = list(dict.fromkeys(sum(actions.values(), ())))
+    return xarray.Dataset(
         variables,
-        coords={
-            "policy": names,
-            "kind": ("policy", [kinds[n] for n in names]),
-            "control": ("policy", [controls[n] for n in names]),
-            "episode": numpy.arange(len(seeds)),
-            "episode_seed": ("episode", [str(seed) for seed in seeds]),
-            "time": times,
-            "component": components,
-            "unit": ("component", [c.unit for c in model.task.components]),
-            "group": ("component", group_of_each(components, model.task.groups)),
-        },
+        coords,
         attrs={
             "environment": model.task.id,
             "scenario": scenario.name,
@@ -182,26 +201,3 @@ def with_named_axes(
             "cost": model.task.cost_description,
         },
     )
-    if model.task.interval is not None:
-        elapsed = (
-            "time",
-            float(model.task.interval) * times,
-            {"units": "s", "long_name": "since the start of the track"},
-        )
-        dataset = dataset.assign_coords(elapsed=elapsed)
-    windows = {
-        name: (first, min(last, model.task.horizon))
-        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
-        if first <= model.task.horizon
-    }
-    dataset = with_windows(dataset, windows)
-    if "mode_probability" in dataset:
-        dataset = dataset.assign_coords(mode=list(model.task.modes))
-    if VARIABLE in dataset:
-        causes = model.task.causes
-        dataset = dataset.assign_coords(
-            cause_coords([c.name for c in causes], [c.phrase for c in causes], model.task.start_measurements)
-        )
-    if actions:
-        dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
-    return dataset

@@ -160,13 +160,10 @@ class Workers:
             if elsewhere and jobs != 1:
                 raise ValueError("a cluster has as many processes as it has: leave out jobs")
         self.jobs, self.cluster = jobs, cluster
+        self.alone = jobs == 1 and cluster is None
+        """Whether this process does everything itself."""
         self._ended = ExitStack()
         self._dask: Any = None
-
-    @property
-    def alone(self) -> bool:
-        """Whether this process does everything itself."""
-        return self.jobs == 1 and self.cluster is None
 
     @property
     def width(self) -> int:

@@ -74,7 +74,8 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
         times = numpy.cumsum(measurements["interval"], axis=1)
     else:
         times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
-    there = times_there(lengths, truth.shape[1])
+    # Those acted on, and the one that the last observation shows.
+    there = numpy.arange(truth.shape[1]) <= lengths[:, None]
     parameters = differing(plain.parameters)
     for name in cls.World.own_parameters:
         parameters.pop(name, None)
@@ -104,11 +105,6 @@ def _check_size(task: Task, episodes: int) -> None:
             f"{episodes:,} episodes of {task.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
             "that a recording may hold: record fewer"
         )
-
-
-def times_there(lengths: numpy.ndarray, rows: int) -> numpy.ndarray:
-    """Measurements that are recorded: those acted on, and the one that the last observation shows, ``(E, rows)``."""
-    return numpy.arange(rows) <= lengths[:, None]
 
 
 def _record(

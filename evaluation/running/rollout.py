@@ -118,7 +118,7 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
         )
     if answers_by_track(competitor):
         competitor = competitor.of_episodes(model.task, seeds)
-    return put_in_loop(model, competitor, kind, name, len(seeds))
+    return put_in_loop(model, competitor, kind, name, len(seeds), model.task.horizon)
 
 
 def _smoothed_estimates(
@@ -196,10 +196,11 @@ def run_episodes(
         steering = _steering_of(model, competitor, name)
     compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
     if compiled and (steering is not None or not steers):
-        first = 0 if more is None else min(more.episodes, count)
-        parts = [] if more is None else [_run_compiled(looped, steering, seeds[:first], more.report, tick)]
-        if first < count:
-            parts.append(_run_compiled(looped, steering, seeds[first:], report, tick))
+        if more is None:
+            return _run_compiled(looped, steering, seeds, report, tick)
+        parts = [_run_compiled(looped, steering, seeds[: more.episodes], more.report, tick)]
+        if more.episodes < count:
+            parts.append(_run_compiled(looped, steering, seeds[more.episodes :], report, tick))
         return _one_after_another(parts)
     steps = (
         _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)

@@ -99,7 +99,7 @@ def front(points: Sequence[Point]) -> list[str]:
     """Names of the ranked competitors that no other beats in cost and time, the quickest first (Pareto front).
 
     Whoever takes about as long, within :data:`EQUAL_TIMES`, and costs less beats, too; so noise of the clock puts
-    nobody on the front.
+    nobody on the front. Of equal costs it is the quickest, of those that take about as long the first by name.
     """
     ranked = [point for point in points if point.kind in RANKED and math.isfinite(point.cost)]
     found = [
@@ -110,11 +110,12 @@ def front(points: Sequence[Point]) -> list[str]:
             for other in ranked
         )
     ]
-    # Of equal costs the quickest.
-    by_cost: dict[float, Point] = {}
-    for point in sorted(found, key=lambda point: point.time.nanoseconds):
-        by_cost.setdefault(point.cost, point)
-    return [point.name for point in by_cost.values()]
+    chosen = []
+    for cost in {point.cost for point in found}:
+        equal = [point for point in found if point.cost == cost]
+        longest = EQUAL_TIMES * min(point.time.nanoseconds for point in equal)
+        chosen.append(min((p for p in equal if p.time.nanoseconds <= longest), key=lambda p: p.name))
+    return [point.name for point in sorted(chosen, key=lambda point: point.time.nanoseconds)]
 
 
 def time_text(time: ProcessorTime | None) -> str:

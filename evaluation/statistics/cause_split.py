@@ -50,17 +50,6 @@ class CauseCosts(NamedTuple):
         return found
 
 
-def cause_coords(names: Sequence[str], phrases: Sequence[str], start: int) -> dict[str, object]:
-    """Return the coordinates of an evaluation that say what its causes are.
-
-    Args:
-        names: of those that the environment declares, in their order.
-        phrases: that say when each holds.
-        start: how many measurements are the start of a track.
-    """
-    return {"cause": list(names), "cause_phrase": ("cause", list(phrases)), "start_measurements": start}
-
-
 def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
     """Return what says when each cause of an evaluation holds, by name; nothing where it holds no causes."""
     if "cause" not in dataset.coords:

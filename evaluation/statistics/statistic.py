@@ -80,13 +80,6 @@ class Reduction(NamedTuple):
         return found
 
 
-def in_blocks(run: "xarray.Dataset") -> "Iterator[tuple[int, xarray.Dataset]]":
-    """Cut a run into blocks of episodes; yields the number of each one's first episode in the run, and the block."""
-    block = block_of(run.sizes["time"])
-    for first in range(0, run.sizes["episode"], block):
-        yield first, run.isel(episode=slice(first, first + block))
-
-
 def reduce_run(
     run: "xarray.Dataset",
     declare: "Callable[[xarray.Dataset], Iterable[Statistic]]",
@@ -101,7 +94,11 @@ def reduce_run(
         bootstrap: over the episodes of the whole evaluation.
         first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
-    parts = (_reduce_block(declare(part), bootstrap, first + i) for i, part in in_blocks(run))
+    block = block_of(run.sizes["time"])
+    parts = (
+        _reduce_block(declare(run.isel(episode=slice(i, i + block))), bootstrap, first + i)
+        for i in range(0, run.sizes["episode"], block)
+    )
     return functools.reduce(Reduction.merge, parts)
 
 

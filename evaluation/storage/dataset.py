@@ -83,18 +83,13 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
     return Losses(int(lost.sum()), i, int(losses[i, 0]), int(losses[i, 1]))
 
 
-def fits_classic(dataset: "xarray.Dataset") -> bool:
-    """Whether NetCDF's classic format, which needs nothing but SciPy, has room for every variable."""
-    return all(variable.nbytes <= MOST_BYTES for variable in dataset.variables.values())
-
-
 def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
     """Write an evaluation in NetCDF's classic format with 64-bit offsets, which R, MATLAB and most others open.
 
     Raises:
         ValueError: if a variable is too large for it, or the file cannot be written.
     """
-    if not fits_classic(dataset):
+    if any(variable.nbytes > MOST_BYTES for variable in dataset.variables.values()):
         raise ValueError(
             f"a variable is larger than {MOST_BYTES:,} bytes, what NetCDF's classic format takes"
         )
@@ -119,10 +114,14 @@ def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
 
 def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
     """Return a dataset with these windows, in place of those that it has."""
+    dataset = dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore")
+    return dataset.assign_coords(window_coords(windows))
+
+
+def window_coords(windows: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    """Return the coordinates that say what the windows are."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
-    return dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore").assign_coords(
-        window=list(windows), window_first=("window", first), window_last=("window", last)
-    )
+    return {"window": list(windows), "window_first": ("window", first), "window_last": ("window", last)}
 
 
 def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:

@@ -23,7 +23,6 @@ from ...envs.engine.backend import make_model
 from ...envs.engine.scenario_choice import find_scenario
 from ...filters.gaussian import log_density
 from ..competitors.filters import find_fault
-from ..competitors.kinds import kind_of
 from ..competitors.online import OnlineFilter
 from ..competitors.online_state import OnlineState
 from ..running.evaluate import Experiment, control_of
@@ -191,14 +190,14 @@ class CrashTest:
         Raises:
             ValueError: for what needs the truth or later measurements, or cannot be made.
         """
-        experiment, kind = self.experiment, kind_of(maker)
+        experiment = self.experiment
         keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
         chosen = dataclasses.replace(
             find_scenario(experiment.task, experiment.scenario, keywords), flights=(), recording=Feed()
         )
-        control = control_of(maker, kind, experiment.control, experiment.task, name)
+        control = control_of(maker, experiment.control, experiment.task, name)
         model: Model = make_model(experiment.task, control, chosen, backend=experiment.backend, **keywords)
-        return StreamFilter(model, maker, kind, name, tracks)
+        return StreamFilter(model, maker, name, tracks)
 
     def _stream(self, name: str) -> Stream:
         stream = self.streams[name]

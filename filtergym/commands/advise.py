@@ -28,7 +28,9 @@ from ..reports.tables.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
 from .terminal import (
+    Parameters,
     RenameOption,
+    Speeds,
     TruthOffset,
     TruthOption,
     command_line,
@@ -126,14 +128,10 @@ def advise_on_log(
             help="Estimator of your own, module:Class, whose attribute parameters gives limits; repeat for several."
         ),
     ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
-    ] = None,
+    settings: Parameters = None,
     noise: Annotated[bool, typer.Option(help="Fit the scale of the measurement noise, too.")] = True,
     seed: Annotated[int, typer.Option(help="Of the starts of the fits.")] = 0,
-    speeds: Annotated[
-        str, typer.Option(help="Speeds that are possible, m/s, from the lowest to the highest.")
-    ] = "0.01,1000",
+    speeds: Speeds = "0.01,1000",
     agents: Annotated[
         bool, typer.Option("--agents", help="Compare the shipped learned agents, too; it takes longer.")
     ] = False,
@@ -142,7 +140,7 @@ def advise_on_log(
 
     Example: filtergym advise log.csv --out mine.filter.json
     """
-    keywords = parse_settings(settings or [])
+    keywords = parse_settings(settings)
     if out is not None:
         if not out.name.endswith(SUFFIX):
             raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")

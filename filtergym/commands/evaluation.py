@@ -37,10 +37,9 @@ from ..evaluation.storage.files import whole_files, writable_file, writable_fold
 from ..evaluation.storage.store import UNFINISHED, Store
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
-from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
+from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
 from ..reports.tables.reasons import explained_by_default, reason_sentences
 from ..reports.tables.recording_tables import recording_tables
-from ..reports.tables.records import write_records
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables.terminal_tables import flights_table, results_tables
 from ..reports.tables.work import work_of
@@ -266,10 +265,24 @@ class Outcome(NamedTuple):
         """Return what is printed in so many columns, widest first."""
         tables = [flights_table(self.dataset, flights, self.records, width)] if flights else []
         if self.has_truth:
-            tables += results_tables(self.records, problem.knows, width)
+            compared = results_tables(self.records, problem.knows, width)
+            paper = self.dataset.attrs["paper"]
+            if paper not in {record.policy for record in self.records}:
+                compared[-1].caption = f"{_without_costs(paper)}\n{compared[-1].caption}"
+            tables += compared
         if self.dataset.attrs["recorded"]:
             tables += recording_tables(self.records, differences, self.has_truth, width)
         return tables
+
+
+def _without_costs(paper: str) -> str:
+    """Say why no competitor has a cost, and what to do, where the paper's algorithm of this name did not take part."""
+    if not paper:
+        return "No cost is shown: the environment names no paper's algorithm to compare it with."
+    return (
+        f"No cost is shown: it is compared with that of the paper's algorithm, which did not take part; add --policy "
+        f"{paper}."
+    )
 
 
 def run(
@@ -371,11 +384,8 @@ def write(
     if outputs.folder is not None and outcome.curves is not None:
         if outcome.has_truth:
             settings = settings_of(command_line())
-            results = [
-                result_of(
-                    problem, outcome.dataset, outcome.records, outcome.curves, learned, explained, worst
-                )
-            ]
+            found = result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned, explained)
+            results = [found._replace(worst=list(worst))]
         whole = outcome.dataset.drop_dims(
             "drawn_episode", errors="ignore"
         )  # the track is for the report alone
@@ -425,14 +435,6 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
                 f"{record.policy}: {100.0 * record.value:.3g} % of the measurements have no row in the file; the last "
                 "estimate before each, or the initial one, is held"
             )
-
-
-def say_departures(
-    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
-) -> None:
-    """Say what :func:`departure_lines` says."""
-    for line in departure_lines(problem, data, learned, keywords, trust):
-        print_sentence(line)
 
 
 def departure_lines(

@@ -7,13 +7,14 @@ import typer
 
 from ..agents.export import export_run
 from ..baselines.problem import problem_of
-from ..envs.engine.catalogue import check_names, nearest
+from ..envs.engine.catalogue import nearest
 from ..envs.engine.scenario_choice import read_recording
 from ..evaluation.storage.files import writable_file, writable_folder
 from .terminal import (
     Parameters,
     RenameOption,
     ScenarioName,
+    Speeds,
     Trust,
     command_line,
     complete_environment,
@@ -77,10 +78,7 @@ def export(
             "measurements it is tried on. What was fitted to a second sensor needs one that has it."
         ),
     ] = None,
-    speeds: Annotated[
-        str,
-        typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
-    ] = "1,1000",
+    speeds: Speeds = "1,1000",
     rename: RenameOption = None,
     settings: Parameters = None,
     trust: Trust = False,
@@ -113,8 +111,7 @@ def export(
     if name is None:
         raise ValueError(f"name the filter: filtergym export {environment} NAME --to {to}")
     problem = problem_of(environment)
-    keywords = parse_settings(settings or [])
-    check_names(problem.task, keywords)
+    keywords = parse_settings(settings, problem.task)
     data: Any = scenario
     if recording is not None:
         if scenario is not None:
@@ -137,7 +134,8 @@ def export(
 
 def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
     """Write a filter as C99, and say what it costs."""
-    from ..exports.c_source import export_c, file_stem
+    from ..exports.c_filter import file_stem
+    from ..exports.c_source import export_c
     from ..exports.figures import operation_words
 
     stem = file_stem(request.name)

@@ -24,6 +24,7 @@ from .terminal import (
     Environment,
     Jobs,
     RenameOption,
+    Speeds,
     TrainedControl,
     TrainingScenario,
     Trust,
@@ -58,10 +59,7 @@ def tune_policy(
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
     rename: RenameOption = None,
-    speeds: Annotated[
-        str,
-        typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
-    ] = "0.01,1000",
+    speeds: Speeds = "0.01,1000",
 ) -> None:
     """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
 

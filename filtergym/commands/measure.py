@@ -32,11 +32,11 @@ from .evaluation import (
     FileOptions,
     Outputs,
     check_explained,
+    departure_lines,
     find_data,
     find_names,
     keeps_predictions,
     run,
-    say_departures,
     write,
 )
 from .protocol import check_options, evaluate_protocol
@@ -66,6 +66,7 @@ from .terminal import (
     import_environments,
     one_of,
     parse_settings,
+    print_sentence,
     print_table,
     progress_bar,
 )
@@ -205,7 +206,7 @@ def evaluate_policies(
                 protocol, policy or [], workers, json, trust, isolating, backend=backend, threads=threads
             )
         return
-    keywords = parse_settings(settings or [])
+    keywords = parse_settings(settings)
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
     options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename)
     outputs.check()
@@ -241,7 +242,8 @@ def evaluate_policies(
             else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
         )
     write(problem, outcome, outputs, learned, explained, worst)
-    say_departures(problem, data, learned, keywords, trust)
+    for sentence in departure_lines(problem, data, learned, keywords, trust):
+        print_sentence(sentence)
 
 
 def record_scenario(
@@ -266,8 +268,8 @@ def record_scenario(
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
-    problem, keywords = problem_of(environment), parse_settings(settings or [])
-    check_names(problem.task, keywords)
+    problem = problem_of(environment)
+    keywords = parse_settings(settings, problem.task)
     if not blind and out.suffix != ".nc":
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
     (writable_folder if blind else writable_file)(out)
@@ -328,7 +330,7 @@ def write_offline(
 
     Example: filtergym offline filtergym/ManeuveringTarget-v0 --policy imm --policy random --episodes 500
     """
-    problem, keywords = problem_of(environment), parse_settings(settings or [])
+    problem, keywords = problem_of(environment), parse_settings(settings)
     experiment = problem.experiment(scenario, episodes, seed, split, control, keywords=keywords)
     plan = plan_datasets(problem, experiment, policy, trust)
     with progress_bar() as bar:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -13,33 +13,8 @@ STEP = 0.05
 """Share of the work that is worth a line."""
 
 
-class ProgressDisplay(Protocol):
-    """What shows how far a command has come; a context manager, as rich's ``Progress``."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: Any) -> None: ...
-
-    def add_task(self, description: str, *, total: float | None) -> Any:
-        """Begin to show a task; returns what :meth:`update` takes."""
-
-    def update(
-        self,
-        task: Any,
-        /,
-        *,
-        advance: float | None = None,
-        completed: float | None = None,
-        description: str | None = None,
-    ) -> None:
-        """Say how much more, or how much in all, is done, and of what."""
-
-    def say(self, text: str) -> None:
-        """Say that something has been read, fitted or finished; a bar shows it by itself."""
-
-
 class _Bar(Progress):
-    """A bar that goes when all is done."""
+    """A bar that goes when all is done; it shows by itself what :class:`ProgressLines` says."""
 
     def say(self, text: str) -> None:
         """Leave the bar alone."""
@@ -117,7 +92,7 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def progress_bar() -> ProgressDisplay:
+def progress_bar() -> "_Bar | ProgressLines":
     """Return what shows progress on standard error, so that tables can be piped: a bar, or lines where nobody looks."""
     errors = Console(stderr=True, highlight=False, markup=False, emoji=False)
     if not errors.is_terminal:

@@ -20,7 +20,7 @@ from ..protocol import (
     read_protocol,
     run_protocol,
 )
-from ..reports.tables.records import write_records
+from ..reports.tables.export import write_records
 from ..reports.tables.terminal_tables import consistency, plain_table, with_interval
 from .terminal import console, print_table, progress_bar
 

@@ -6,14 +6,13 @@ from typing import Annotated
 import typer
 
 from ..baselines.problem import problem_of
-from ..envs.engine.catalogue import check_names
 from ..evaluation.running.threads import one_thread
 from ..evaluation.storage.files import writable_file, write_text
 from ..evaluation.stress.alterations import ALTERATIONS
 from ..evaluation.stress.crash_test import CrashTest, Finding
 from ..names import FILE, find_competitor
 from ..reports.pages.crash_report import crash_page, crash_table
-from ..reports.tables.records import write_records
+from ..reports.tables.export import write_records
 from .terminal import (
     Backend,
     Environment,
@@ -68,8 +67,8 @@ def stress(
 
     Example: filtergym stress filtergym/ManeuveringTarget-v0 kalman-imm --steps 0
     """
-    problem, keywords = problem_of(environment), parse_settings(settings or [])
-    check_names(problem.task, keywords)
+    problem = problem_of(environment)
+    keywords = parse_settings(settings, problem.task)
     for name in policy:
         if name.startswith(FILE):
             raise ValueError(f"{name!r} has answered already, and a crash test asks: name a filter")

@@ -3,20 +3,24 @@
 import ast
 import io
 import os
+import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..reports.tables.lines import fill
 from .progress import progress_bar as progress_bar
+
+if TYPE_CHECKING:
+    from ..envs.contract.task import Task
 
 # --- what a shell completes; imports wait until it asks
 
@@ -141,6 +145,9 @@ RenameOption = Annotated[
     ),
 ]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
+Speeds = Annotated[
+    str, typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest.")
+]
 Backend = Annotated[
     str,
     typer.Option(
@@ -218,6 +225,12 @@ def output_width() -> int | None:
 
 # No markup: names and paths are printed as they are.
 console = Output(width=output_width(), markup=False, emoji=False)
+
+
+def fill(sentence: str, width: int) -> str:
+    """Break a sentence into lines, no number from its unit and no interval apart."""
+    kept = re.sub(r"\[[^\]]*\]| %| ns\b", lambda found: found[0].replace(" ", "\xa0"), sentence)
+    return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def print_sentence(sentence: str, width: int = PAGE_WIDTH, bold: int = 0) -> None:
@@ -309,10 +322,15 @@ def command_line() -> str:
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 
-def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
+def parse_settings(settings: list[str] | None, task: type["Task"] | None = None) -> dict[str, Any]:
+    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word.
+
+    Args:
+        settings: as they were typed; None: none.
+        task: whose parameters they must be; None: anything.
+    """
     keywords: dict[str, Any] = {}
-    for setting in settings:
+    for setting in settings or []:
         name, equals, text = setting.partition("=")
         if not equals or not name.strip().isidentifier() or not text.strip():
             raise ValueError(f"--set needs name=value, such as --set horizon=50, got {setting!r}")
@@ -322,4 +340,8 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
             if not text.strip().replace("-", "_").isidentifier():
                 raise ValueError(f"--set {name}: cannot read the value {text!r}") from error
             keywords[name.strip()] = text.strip()
+    if task is not None:
+        from ..envs.engine.catalogue import check_names
+
+        check_names(task, keywords)
     return keywords

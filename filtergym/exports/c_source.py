@@ -1,7 +1,7 @@
-"""A whole filter as C99: one header and one source, a program that reads a table, and a test with its vectors.
+"""A whole filter as C99: header and source, a program that reads a table, and a test with its vectors.
 
-No allocation, and nothing but ``math.h``; parameters and weights are constants. Whatever a stranger's file calls its
-parts gets into the text as identifiers and comments only, see :mod:`..compiler.c_source`.
+The filter itself is written by :mod:`.c_filter`; what differs in the programs around it goes into the templates of
+:mod:`.c_programs`.
 """
 
 import re
@@ -10,13 +10,10 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy
 
 from ..baselines.fitted_filters import LogSetup
-from ..compiler.c_loops import Arrays, Rows
-from ..compiler.c_source import helper_functions, write_program
 from ..compiler.c_text import (
     DOUBLE,
     FLOAT,
@@ -28,24 +25,12 @@ from ..compiler.c_text import (
     literal,
 )
 from ..evaluation.storage.files import whole_files
-from .c_network import memory_size, network_operations, network_text, scratch_size
+from .c_filter import FilterText
 from .c_programs import LOG, MAIN, POSITIONS, PROJECT, TEST
-from .c_structs import struct_text, structure
 from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
-from .traced_filter import (
-    ANSWER,
-    ESTIMATE,
-    FEEDBACK,
-    INITIAL,
-    LIKELIHOODS,
-    MEASUREMENT,
-    SHOWN,
-    STATE,
-    TracedFilter,
-    count_answers,
-)
+from .traced_filter import FEEDBACK, LIKELIHOODS, TracedFilter
 
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
 """Under which the text compiles without a warning."""
@@ -54,8 +39,6 @@ MOST_OPTIMISED = 10_000
 seconds."""
 WORST = {"double": 1e-3, "float": 0.1}
 """Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
-TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
-"""Names that a filter's files must not have: those of the others."""
 EPISODES, MEASUREMENTS = 8, 200
 """That are compared before anything is written, at most."""
 STEER = """
@@ -65,257 +48,20 @@ VECTORS = 2, 50
 """Episodes and measurements among the test's vectors, at most."""
 
 
-def file_stem(name: str) -> str:
-    """Return what the files and functions of a filter are called."""
-    return identifier(name, TAKEN)
+class Writer(FilterText):
+    """The files of a filter: itself, and the programs around it.
 
-
-class Writer:
-    """The files of a filter.
-
-    Args:
-        name: of the competitor.
-        traced: its programs.
-        scalar: kind of numbers.
-        components: what is estimated, name and unit.
+    Arguments are those of :class:`.FilterText`.
 
     Attributes:
-        about: paragraphs for the comment of the header.
         limit: largest difference with which the test passes, standard deviations.
     """
 
     def __init__(
         self, name: str, traced: TracedFilter, scalar: Scalar, components: Sequence[tuple[str, str]]
     ) -> None:
-        self.traced, self.scalar, self.components = traced, scalar, components
-        self.about: list[str] = []
+        super().__init__(name, traced, scalar, components)
         self.limit = WORST[scalar.name]
-        self.name = own = file_stem(name)
-        parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
-        parts["estimate"] = traced.estimate
-        self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
-        self.memory = memory_size(traced.network) if traced.network is not None else 0
-        self.has_state = bool(traced.state or self.memory)
-        self.start, self.start_source = self._start()
-        self.update, self.update_source = self._update()
-
-    def _parameters(self, *parts: str) -> list[Parameter]:
-        """Parameters that point to structs; ``const`` is what is only read."""
-        return [
-            Parameter(f"{'const ' * (part in ('initial', 'measurement'))}{self.structs[part].name} *", part)
-            for part in parts
-        ]
-
-    def _rows(self, part: str, name: str = "", qualifier: str = "const ") -> Rows:
-        """Numbers of a struct one after the other: it has no members of another kind."""
-        pointer = f"(({qualifier}{self.scalar.name} *){name or part})"
-        return Rows(pointer, self.structs[part].numbers)
-
-    def _start(self) -> tuple[str, Any]:
-        to, given = self.structs["state"].places, self.structs["initial"].places
-        parameters = self._parameters("state", "initial")
-        source = write_program(
-            self.traced.start,
-            f"{self.name}_start",
-            parameters,
-            lambda _, row: f"initial->{given[row]}",
-            lambda _, row: f"state->{to[row]}",
-            self.scalar,
-            arrays=Arrays({INITIAL: self._rows("initial")}, {STATE: self._rows("state", qualifier="")}),
-        )
-        body = list(source.body)
-        if self.memory:
-            zero = literal(0.0, self.scalar)
-            body += [f"for (i = 0; i < {self.memory}; ++i) state->network[i] = {zero};"]
-            body.insert(0, "int i;")
-        return f"{source.functions}\n{function_text('void', f'{self.name}_start', parameters, body)}", source
-
-    def _update(self) -> tuple[str, Any]:
-        traced, real, own = self.traced, self.scalar.name, self.name
-        state, places = self.structs["state"], self.structs["state"].places
-        given, told = self.structs["measurement"].places, self.structs["estimate"].places
-        inner = [Parameter(f"const {state.name} *", "state"), *self._parameters("measurement")]
-        inner += [Parameter(f"{state.name} *", "next"), *self._parameters("estimate")]
-        between = []
-        if traced.network is not None:
-            inner += [Parameter(f"{real} *", "shown"), Parameter(f"const {real} *", "answer")]
-            memory = "next->network" if self.memory else "0"
-            between = [
-                f"if (shown[0] != {literal(0.0, self.scalar)}) {own}_network(shown + 1, {memory}, answer);"
-            ]
-
-        def read(argument: int, row: int) -> str:
-            if argument == ANSWER:
-                return f"answer[{row}]"
-            return f"state->{places[row]}" if argument == STATE else f"measurement->{given[row]}"
-
-        def write(argument: int, row: int) -> str:
-            if argument == SHOWN:
-                return f"shown[{row}]"
-            return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
-
-        read_rows = {STATE: self._rows("state"), MEASUREMENT: self._rows("measurement")}
-        written = {STATE: self._rows("state", "next", ""), ESTIMATE: self._rows("estimate", qualifier="")}
-        if traced.network is not None:
-            read_rows[ANSWER] = Rows("answer", range(count_answers(traced.network)))
-            written[SHOWN] = Rows("shown", range(traced.shown))
-        arrays = Arrays(read_rows, written)
-        source = write_program(
-            traced.update,
-            f"{own}_update",
-            inner,
-            read,
-            write,
-            self.scalar,
-            between=between,
-            results=traced.shown,
-            arrays=arrays,
-        )
-        body = list(source.body)
-        if self.has_state:
-            # What is written is not what is read.
-            start = " = *state" if self.memory else ""
-            body = [
-                f"{state.name} after{start};",
-                f"{state.name} *const next = &after;",
-                *body,
-                *self._guard(),
-                "*state = after;",
-                self._taken(),
-            ]
-        else:
-            if "next" in " ".join(body):
-                body = [f"{state.name} *const next = state;", *body]
-            body.append(self._taken())
-        if traced.network is not None:
-            zero = literal(0.0, self.scalar)
-            answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
-            body = [f"{real} shown[{traced.shown}];", answers, *body]
-        interval = next((place for place in given.values() if place == "interval"), None)
-        if interval is not None:
-            inside = body
-            body = [
-                f"if (!(measurement->interval >= {literal(0.0, self.scalar)})) return {own.upper()}_REFUSED;",
-                "{",
-                *inside,
-                "}",
-            ]
-        parameters = self._parameters("state", "measurement", "estimate")
-        return f"{source.functions}\n{function_text('int', f'{own}_update', parameters, body)}", source
-
-    def _guard(self) -> list[str]:
-        """Statements that leave the state alone where the estimate is no finite number."""
-        zero = literal(0.0, self.scalar)
-        C = len(self.components)
-        mean, covariance = ("", "") if C == 1 else ("[i]", "[i][j]")
-        terms = [
-            f"sum += {zero} * estimate->mean{mean};",
-            f"for (j = 0; j < {C}; ++j) sum += {zero} * estimate->covariance{covariance};",
-        ]
-        return [
-            "{ /* Zero times what is not finite is not zero. */",
-            f"    {self.scalar.name} sum = {zero};",
-            "    int i, j;",
-            f"    for (i = 0; i < {C}; ++i) {{",
-            *(f"        {term}" for term in terms),
-            "    }",
-            f"    if (!(sum == {zero})) return {self.name.upper()}_REJECTED;",
-            "}",
-        ]
-
-    def _taken(self) -> str:
-        """Statement that returns whether there was a measurement."""
-        own = self.name.upper()
-        if "available" not in self.structs["measurement"].places.values():
-            return f"return {own}_TAKEN;"
-        zero = literal(0.0, self.scalar)
-        return f"return measurement->available > {zero} ? {own}_TAKEN : {own}_MISSED;"
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Operations, and bytes of state, weights and stack."""
-        size = numpy.dtype(self.scalar.dtype).itemsize
-        network = self.traced.network
-        weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
-        after = (len(self.traced.state) + self.memory) * size
-        asked = 0 if network is None else scratch_size(network) + count_answers(network)
-        scratch = (self.update_source.scratch + self.traced.shown + asked) * size + after
-        return self.update_source.operations, after, weights, scratch
-
-    @property
-    def network_operations(self) -> int:
-        """Operations of a network, where it is asked."""
-        return 0 if self.traced.network is None else network_operations(self.traced.network)
-
-    @property
-    def replaced(self) -> tuple[float, ...]:
-        """Constants that the kind of number does not have."""
-        return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
-
-    # --- files
-
-    def header(self, notes: Sequence[str] = ()) -> str:
-        """Text of the header."""
-        own, scalar, structs = self.name, self.scalar, self.structs
-        guard = f"{own.upper()}_H"
-        listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
-        remembered = f"{self.scalar.name} network[{self.memory}]; /* what the network remembers */"
-        memory = [remembered] if self.memory else []
-        functions = {
-            "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
-            "update": (
-                "Takes in a measurement: predicts to its time, and updates. What was not received is said by the "
-                "measurement itself, as in the environment. Returns what became of it; the state stays as it was where "
-                "a measurement is rejected or refused, and the estimate is then of no use.",
-                ("state", "measurement", "estimate"),
-            ),
-        }
-        text = [
-            comment(*self.about, *notes),
-            f"#ifndef {guard}\n#define {guard}\n",
-            '#ifdef __cplusplus\nextern "C" {\n#endif\n',
-            struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
-            struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
-            struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
-            struct_text(
-                structs["state"],
-                scalar,
-                "What is kept from one measurement to the next, one struct for each track; members are named by what "
-                "leads to them in the filter. Copy it to save it.",
-                memory,
-            ),
-        ]
-        statuses = ("TAKEN", "MISSED", "REJECTED", "REFUSED")
-        text.append(
-            comment(
-                "What became of a measurement: taken in; none was received; rejected, since the estimate would be no "
-                "number; refused, since its interval is negative or none."
-            )
-            + "\nenum { "
-            + ", ".join(f"{own.upper()}_{name} = {i}" for i, name in enumerate(statuses))
-            + " };\n"
-        )
-        for name, (words, parts) in functions.items():
-            arguments = ", ".join(f"{p.type}{p.name}" for p in self._parameters(*parts))
-            answer = "int" if name == "update" else "void"
-            text.append(f"{comment(words)}\n{answer} {own}_{name}({arguments});\n")
-        text.append(f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n")
-        return "\n".join(text)
-
-    def source(self) -> str:
-        """Text of the source."""
-        parts = [
-            comment(
-                "See the header. A loop goes over the members of array operations, k is the member; where they lie is "
-                "said by tables, whose names end in at and a number. The array w holds what one loop leaves to another."
-                " A comment names the functions whose operations the loops below it have."
-            ),
-            f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
-            helper_functions([self.traced.start, self.traced.update], self.scalar),
-        ]
-        if self.traced.network is not None:
-            parts.append(network_text(self.traced.network, self.name, self.scalar)[0])
-        return _without_blank_runs("\n".join([*parts, self.start, self.update]))
 
     def rows(self) -> str:
         """Text of a header that fills structs from rows of numbers, for main.c and the test."""
@@ -459,14 +205,12 @@ class Writer:
 
     def table(self, replayed: Replay) -> str:
         """Text of a table of measurements, as main.c reads it."""
-        first = len(self.columns("initial"))
         lines = [",".join([*self.columns("initial"), *self.columns("measurement")])]
-        for episode in range(replayed.initial.shape[1]):
-            for k, measured in enumerate(replayed.measurements[:, :, episode]):
-                initial = replayed.initial[:, episode] if k == 0 else [""] * first
-                lines.append(
-                    ",".join(str(x) if isinstance(x, str) else repr(float(x)) for x in [*initial, *measured])
-                )
+        blank = "," * len(self.columns("initial"))
+        for episode, initial in enumerate(replayed.initial.T.tolist()):
+            rows = [",".join(map(repr, row)) for row in replayed.measurements[:, :, episode].tolist()]
+            lines.append(",".join([*map(repr, initial), rows[0]]))
+            lines += [blank + row for row in rows[1:]]
         return "\n".join([*lines, ""])
 
 
@@ -475,10 +219,6 @@ def _string(text: str) -> str:
     assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
     pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
     return "\n    ".join(f'"{piece}"' for piece in pieces)
-
-
-def _without_blank_runs(text: str) -> str:
-    return re.sub(r"\n{3,}", "\n\n", text)
 
 
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:

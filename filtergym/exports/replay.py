@@ -96,7 +96,7 @@ def replay(
     """
     problem, name, maker, scenario, keywords = request[:5]
     kind = kind_of(maker)
-    control = control_of(maker, kind, None, problem.task, name)
+    control = control_of(maker, None, problem.task, name)
     given = {**getattr(maker, "task_keywords", {}), **keywords}
     plain = make_model(problem.task, control, scenario, **given)
     model = make_model(problem.task, control, scenario, backend="auto", **given)
@@ -230,7 +230,8 @@ class _Code:
         results = [result._replace(argument=SHOWN + 1, row=i) for i, result in enumerate(code.results)]
         self._arrays.append(empty_lanes((max(len(results), 1),), width))
         self._constants, self._width = code.constants, width
-        self._run = native(code._replace(results=results), [False] * len(self._arrays), portable())
+        program = code._replace(results=results)
+        self._run = native(program, [False] * len(self._arrays), portable()).expect(width)
 
     def __call__(self, given: dict[int, Any]) -> list[numpy.ndarray]:
         for argument, row in self._inputs:

@@ -1,7 +1,7 @@
 """Exact errors of one alpha-beta filter whose gains follow a schedule fixed beforehand.
 
 With gains that do not depend on the data the error is linear in the noise, so its mean square follows
-without Monte Carlo from :func:`~filtergym.filters.alpha_beta.propagate_error`: for constant gains, for the
+without Monte Carlo from :func:`.alpha_beta_errors.propagate_error`: for constant gains, for the
 ramp of the paper's adaptive filter when the scan of the detection is given, and for the best schedule.
 """
 
@@ -12,6 +12,7 @@ import numpy
 
 from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...filters import alpha_beta, polar
+from .alpha_beta_errors import ErrorMoments, propagate_error
 
 
 class Flight(NamedTuple):
@@ -62,7 +63,7 @@ def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
     """
     T, nothing = flight.interval, 0.0 * alpha[0]
     start = flight.variance[0]
-    moments = alpha_beta.ErrorMoments(
+    moments = ErrorMoments(
         nothing,
         nothing,
         alpha_beta.Covariance(start + nothing, nothing, 2.0 * start / T**2 + nothing),
@@ -70,10 +71,9 @@ def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
     beta = alpha_beta.benedict_bordner_beta(alpha)
     position, velocity = [], []
     for k in range(len(alpha)):
-        moments = alpha_beta.propagate_error(
+        moments = propagate_error(
             moments,
-            flight.displacement[k],
-            flight.increment[k],
+            (flight.displacement[k], flight.increment[k]),
             flight.variance[k + 1],
             alpha[k],
             beta[k],

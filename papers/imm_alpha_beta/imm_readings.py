@@ -13,6 +13,7 @@ import numpy
 
 from ...filters import alpha_beta, imm, kalman
 from ...filters.gaussian import log_density
+from .alpha_beta_errors import variance_reduction
 
 
 class Recording(NamedTuple):
@@ -100,7 +101,7 @@ def interacting_multiple_model(recording: Recording, reading: Reading) -> numpy.
         if reading.likelihood == "R/(1-alpha)":
             S = _diagonal(noise / (1.0 - alpha))
         elif reading.likelihood == "steady":
-            S = _diagonal(noise * (1.0 + alpha_beta.variance_reduction(alpha, beta).prediction))
+            S = _diagonal(noise * (1.0 + variance_reduction(alpha, beta).prediction))
         else:
             S = P[:d, :d] + _diagonal(noise)
         log_likelihood, _ = log_density(innovation, S)

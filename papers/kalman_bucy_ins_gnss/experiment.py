@@ -12,11 +12,11 @@ from ...envs.engine.backend import make_model
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...evaluation.running.parallel import Workers
 from ...evaluation.running.seeds import episode_seeds
-from ...filters import kalman_bucy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.linear_systems import steady_kalman_bucy, van_loan
 from ..quantities import evaluate_policy, means, record_run
 from ..reproduction import Progress, compute_units, later
+from . import kalman_bucy
 
 EPISODES = 4000
 SEED = 0

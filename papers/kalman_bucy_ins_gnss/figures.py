@@ -5,8 +5,8 @@ from typing import Any
 import numpy
 
 from ...evaluation.figures.looks import styles
-from ...filters import kalman_bucy
 from ..panels import draw, finish, panels
+from . import kalman_bucy
 from .experiment import DRIFT, GAINS, INTENSITY, LONG, NAMES, PARAMETERS, A, Results, U, closed_form
 
 

@@ -19,6 +19,7 @@ from .experiment import (
     WINDOWS,
     Results,
     exact_mean_squares,
+    information_per_decision,
     parameters,
     rms,
 )
@@ -315,7 +316,7 @@ def tables(r: Results) -> list[Grid]:
             ["true class", *(f"against {name}" for name in CLASSES)],
             [
                 [name, *(f"{x:.2f}" for x in row)]
-                for name, row in zip(CLASSES, class_fusion.information_per_decision(esm), strict=True)
+                for name, row in zip(CLASSES, information_per_decision(esm), strict=True)
             ],
         ),
         Grid("One type for each target, at 60 s", ["class", "type", *rules], one_type),

@@ -26,6 +26,55 @@ WORTHLESS_RATE = 1e4
 """m/s: a radial velocity measured with this error says no more than two ranges half a second apart."""
 
 
+def channel_error_covariance(
+    models: class_fusion.Models,
+    channels: class_fusion.Channels,
+    target: int,
+    channel: int,
+    start: numpy.ndarray,
+) -> numpy.ndarray:
+    """Exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
+
+    Truth and error e = estimate - truth obey one linear recursion of 2 n states,
+
+        x(k) = Phi_t x + xi,   e(k) = (I - K H) (Phi_c e + (Phi_c - Phi_t) x - xi) + K v
+
+    with t the target's class and c the filter's, so the covariance follows without Monte Carlo. The mean of
+    the error is zero when that of x lies where Phi_c and Phi_t agree (any mean position and velocity).
+
+    Args:
+        models: of the classes.
+        channels: design of the filters, for scans 0 to K.
+        target: index of the true class.
+        channel: index of the filter.
+        start: joint covariance of (x, e) at scan 0, ``(2 n, 2 n)``.
+    """
+    n = models.Phi.shape[0]
+    Phi_t, Phi_c = models.Phi[..., target], models.Phi[..., channel]
+    scans = channels.gain.shape[-1]
+    joint = start
+    result = numpy.zeros((n, n, scans))
+    result[..., 0] = start[n:, n:]
+    for k in range(1, scans):
+        K = channels.gain[..., channel, k]
+        rest = numpy.eye(n) - K @ models.H
+        A = numpy.block([[Phi_t, numpy.zeros((n, n))], [rest @ (Phi_c - Phi_t), rest @ Phi_c]])
+        B = numpy.concatenate([numpy.eye(n), -rest])
+        C = numpy.concatenate([numpy.zeros_like(K), K])
+        joint = A @ joint @ A.T + B @ models.Q[..., target] @ B.T + C @ models.R @ C.T
+        result[..., k] = joint[n:, n:]
+    return result
+
+
+def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
+    """Mean log-likelihood ratio of one decision, nats, ``(M, M)``: row = true class, column = its rival.
+
+    The Kullback-Leibler divergence of rows of ``decision_probabilities``, which must be positive.
+    """
+    logarithm = numpy.log(probabilities)
+    return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
+
+
 def leaking(probability: float) -> tuple[tuple[float, ...], ...]:
     """Class transition matrix that leaves each class with a probability, equally for the others."""
     return tuple(
@@ -63,7 +112,7 @@ def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int)
     joint[2, 2] = joint[5, 5] = p.acceleration_sigma[target] ** 2
     joint[2, 5] = joint[5, 2] = -joint[2, 2]
     joint[3, 3], joint[4, 4] = p.range_sigma**2, p.range_rate_sigma**2
-    covariance = class_fusion.channel_error_covariance(models, channels, target, channel, joint)
+    covariance = channel_error_covariance(models, channels, target, channel, joint)
     return numpy.stack([covariance[i, i, 1:] for i in range(3)])
 
 

@@ -1,6 +1,6 @@
 """One self-contained page from a file of results: it opens offline, and executes nothing of what the file says."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
@@ -97,7 +97,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "rows": rows,
         "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
         "why": why_section(result),
-        "figures": _figures(result),
+        "figures": list(_figures(result)),
         "data": pack(
             {
                 "lines": _lines(result, group),
@@ -245,110 +245,102 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
     ]
 
 
-def _figures(result: Result) -> list[dict[str, str]]:
-    """Figures of a scenario: what each is called, what it shows in words, and what reads it instead of looking."""
+class Figure(NamedTuple):
+    """A figure of a scenario."""
+
+    kind: str
+    """By which the page's script draws it."""
+    title: str
+    text: str
+    """What it shows."""
+    alternative: str
+    """What reads it instead of looking."""
+
+
+def _figures(result: Result) -> Iterator[Figure]:
+    """Yield the figures of a scenario, of whatever there is data for."""
     found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
     order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
 
-    def in_words(metric: str, component: str, names: Sequence[str]) -> str:
+    def in_words(metric: str, component: str) -> str:
         parts = []
-        for name in names:
+        for name in order[:6]:
             record = found.get((name, metric, component))
             if record is not None and record.value is not None:
                 parts.append(f"{name} {record.value:.3g}{'' if record.unit == '1' else ' ' + record.unit}")
         return ", ".join(parts)
 
-    figures = []
     if _differences(result):
-        figures.append(
-            {
-                "kind": "ranking",
-                "title": f"Cost against {result.paper or 'the paper'}",
-                "text": "Geometric mean of the ratios of the episodes' costs, less one, with its paired 95 % interval; "
-                "left of zero is better.",
-                "alternative": "The table above holds these numbers.",
-            }
+        yield Figure(
+            "ranking",
+            f"Cost against {result.paper or 'the paper'}",
+            "Geometric mean of the ratios of the episodes' costs, less one, with its paired 95 % interval; "
+            "left of zero is better.",
+            "The table above holds these numbers.",
         )
     if points := points_of_records(result.records):
-        figures.append(
-            {
-                "kind": "front",
-                "title": "Cost and time",
-                "text": "Cost against the processor time of a measurement, of simulated world and competitor "
-                "together. No other competitor has a lower error cost in as much time as those on the front, the "
-                "line; open: asked in Python.",
-                "alternative": f"On the front, the quickest first: {', '.join(front(points))}.",
-            }
+        yield Figure(
+            "front",
+            "Cost and time",
+            "Cost against the processor time of a measurement, of simulated world and competitor together. No other "
+            "competitor has a lower error cost in as much time as those on the front, the line; open: asked in Python.",
+            f"On the front, the quickest first: {', '.join(front(points))}.",
         )
-    if result.curves is not None and "rmse" in result.curves:
+    curves = set() if result.curves is None else {str(name) for name in result.curves}
+    if result.curves is not None and "rmse" in curves:
         component = str(result.curves["quantity"].values[0])
-        figures += [
-            {
-                "kind": "rmse",
-                "title": "Error over time",
-                "text": "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second "
-                "one all again.",
-                "alternative": f"RMSE of {component} over the whole run: {in_words('rmse', component, order[:6])}.",
-            },
-            {
-                "kind": "exceeded",
-                "title": "Distribution of errors",
-                "text": "Share of measurements whose error is larger.",
-                "alternative": f"Largest RMSE at any time: {in_words('peak_rmse', component, order[:6])}.",
-            },
-        ]
-    if result.curves is not None and {"cost_minus_paper", "cost_minus_best"} & set(result.curves):
-        figures.append(
-            {
-                "kind": "difference",
-                "title": "Mine minus theirs over time",
-                "text": "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero "
-                "is better.",
-                "alternative": "The difference over the whole run stands in the table above.",
-            }
+        yield Figure(
+            "rmse",
+            "Error over time",
+            "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second one all "
+            "again.",
+            f"RMSE of {component} over the whole run: {in_words('rmse', component)}.",
         )
-    if result.curves is not None and {"anees", "anis"} & set(result.curves):
-        figures.append(
-            {
-                "kind": "consistency",
-                "title": "Consistency",
-                "text": "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is "
-                "consistent; the band holds 95 % of a consistent estimator's (chi-square).",
-                "alternative": f"Mean NEES over its dimension: {in_words('anees', 'state', order[:6])}.",
-            }
+        yield Figure(
+            "exceeded",
+            "Distribution of errors",
+            "Share of measurements whose error is larger.",
+            f"Largest RMSE at any time: {in_words('peak_rmse', component)}.",
         )
-    if result.curves is not None and BEHAVIOUR_CURVES & set(result.curves):
-        figures.append(
-            {
-                "kind": "steering",
-                "title": "Gains, weights and actions over time",
-                "text": "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten "
-                "episodes of an action or a gain.",
-                "alternative": "What each competitor steers, and how, says the page of the environment.",
-            }
+    if {"cost_minus_paper", "cost_minus_best"} & curves:
+        yield Figure(
+            "difference",
+            "Mine minus theirs over time",
+            "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero is better.",
+            "The difference over the whole run stands in the table above.",
+        )
+    if {"anees", "anis"} & curves:
+        yield Figure(
+            "consistency",
+            "Consistency",
+            "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is consistent; "
+            "the band holds 95 % of a consistent estimator's (chi-square).",
+            f"Mean NEES over its dimension: {in_words('anees', 'state')}.",
+        )
+    if BEHAVIOUR_CURVES & curves:
+        yield Figure(
+            "steering",
+            "Gains, weights and actions over time",
+            "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten episodes of an action "
+            "or a gain.",
+            "What each competitor steers, and how, says the page of the environment.",
         )
     if result.track is not None:
-        figures.append(
-            {
-                "kind": "track",
-                "title": "A track to look at",
-                "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, "
-                "what was measured, estimates, and their covariances at two standard deviations. Move the slider.",
-                "alternative": "An animation of one episode; its numbers are in the table above, over all episodes.",
-            }
+        yield Figure(
+            "track",
+            "A track to look at",
+            f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, what was "
+            "measured, estimates, and their covariances at two standard deviations. Move the slider.",
+            "An animation of one episode; its numbers are in the table above, over all episodes.",
         )
     if any(one.track is not None for one in result.worst):
-        figures.append(
-            {
-                "kind": "worst",
-                "title": "The worst episodes",
-                "text": "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, "
-                "estimates, and their covariances at two standard deviations. The slider begins where "
-                "the error is largest.",
-                "alternative": "An animation of single episodes; the tables of the causes tell their seeds and costs.",
-            }
+        yield Figure(
+            "worst",
+            "The worst episodes",
+            "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, estimates, "
+            "and their covariances at two standard deviations. The slider begins where the error is largest.",
+            "An animation of single episodes; the tables of the causes tell their seeds and costs.",
         )
-    return figures
 
 
 BEHAVIOUR_CURVES = {"mode_probability", "true_class_probability", "action", "gain"}

@@ -29,7 +29,6 @@ from .ranking import best_of_origins
 from .results import (
     RESULTS,
     Result,
-    WorstTrack,
     components_to_draw,
     select_competitors,
     settings_of,
@@ -160,7 +159,6 @@ def result_of(
     curves: xarray.Dataset,
     learned: Sequence[str],
     explained: Sequence[str] = (),
-    worst: Sequence[WorstTrack] = (),
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
@@ -171,7 +169,6 @@ def result_of(
         curves: of it; those of what is shown are kept.
         learned: names that stand for something learned, those of competitors among them.
         explained: names of those whose cost is to be explained; default: the paper's algorithm.
-        worst: their worst episodes.
     """
     cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
@@ -196,7 +193,6 @@ def result_of(
         track_of(dataset.sel(policy=shown), components, plane),
         phrases_of(dataset),
         explained,
-        list(worst),
     )
 
 

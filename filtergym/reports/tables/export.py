@@ -1,6 +1,7 @@
-"""Results for other programs: records as CSV, and the terminal's tables for LaTeX."""
+"""Results for other programs: records as JSON and CSV, and the terminal's tables for LaTeX."""
 
 import csv
+import json
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from rich.table import Column, Row, Table
 from rich.text import Text
 
 from ...evaluation.running.metrics import Record
-from ...evaluation.storage.files import whole_file
+from ...evaluation.storage.files import whole_file, write_text
 
 PREAMBLE = "% In the preamble: \\usepackage{booktabs,graphicx}"
 FITTING = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
@@ -58,6 +59,12 @@ MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
 
 LATEX_WIDTH = 160
 """Columns of a terminal whose tables are written for LaTeX: all of them beside each other, with all intervals."""
+
+
+def write_records(path: Path, records: Sequence[Any]) -> None:
+    """Write named tuples as JSON, one record to a line."""
+    lines = ",\n".join(json.dumps(record._asdict()) for record in records)
+    write_text(path, f"[\n{lines}\n]\n")
 
 
 def records_as_csv(path: Path, records: Sequence[Any]) -> None:

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy
 from numpy.typing import ArrayLike
 
-from .linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
+from ...filters.linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
 
 
 def _times(times: ArrayLike) -> Matrix:
@@ -80,6 +80,10 @@ def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) ->
     return (R0 * (1 + a * u) + w * u) / (1 + (s * R0 - a) * u)
 
 
+LONGEST_TIME = 0.5
+"""s, after which the solution by the Hamiltonian matrix is restarted."""
+
+
 def riccati_hamiltonian(
     A: ArrayLike,
     BGBt: ArrayLike,
@@ -87,7 +91,6 @@ def riccati_hamiltonian(
     Q: ArrayLike,
     R0: ArrayLike,
     times: ArrayLike,
-    restart: float = 0.5,
 ) -> Matrix:
     """Covariance (5) by the exponential of the Hamiltonian matrix, exact for constant coefficients.
 
@@ -101,7 +104,6 @@ def riccati_hamiltonian(
         Q: intensity of the measurement noise, ``(m, m)``.
         R0: covariance at time zero, ``(n, n)``.
         times: instants in ascending order, s, ``(k,)``.
-        restart: longest time without a restart, s.
 
     Returns:
         Covariances, ``(k, n, n)``.
@@ -116,11 +118,9 @@ def riccati_hamiltonian(
     information = _information(C, Q, n)
     hamiltonian = numpy.block([[-A.T, information], [intensity_matrix("BGBt", BGBt, n), A]])
     R = intensity_matrix("R0", R0, n)
-    if not restart > 0:
-        raise ValueError(f"restart must be a positive number of seconds, got {restart!r}")
     covariances = []
     for duration in numpy.diff(_times(times), prepend=0.0):
-        pieces = int(numpy.ceil(duration / restart))
+        pieces = int(numpy.ceil(duration / LONGEST_TIME))
         if pieces:
             exponential = expm(hamiltonian * (duration / pieces))
         for _ in range(pieces):

@@ -1,0 +1,203 @@
+"""What may go wrong with the sensors of UavAutopilot: a class for each. Nobody says any of it but that one answers."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..contract.causes import MISSED, Cause, Moment
+from ..contract.draws import Draws
+from ..contract.faults import Colour, ColouredErrors, Disturbance, Step
+from ..contract.observation import Array
+from ..contract.schedules import Steps, within
+
+if TYPE_CHECKING:
+    from .task import UavAutopilot
+
+RAISED = 2.0
+"""Factor on a nominal noise from which it is raised."""
+
+
+def _has_noisy_sensor(moment: Moment) -> Array | None:
+    if not moment.knows("sensor_level"):
+        return None
+    noisy: Array = moment.xp.any(moment.context["sensor_level"] >= RAISED, axis=0)
+    return noisy
+
+
+def draw_steps(
+    draws: Draws,
+    kind: str,
+    levels: Sequence[tuple[float, float]],
+    times: Sequence[tuple[int, int]],
+    zero: Array,
+    count: int | None = None,
+) -> Steps:
+    """Draw the level in each part of the episode, and when the parts begin."""
+    values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
+    begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
+    return Steps(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
+
+
+class _OfSensors(Disturbance):
+    """What concerns each of m sensors, or those that are named."""
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        super().__init__(task)
+        self.task, self.count = task, len(task.sensors)
+        self.sigmas = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
+
+    def chosen(self, named: tuple[str, ...] | None) -> Array:
+        """One for the sensors that are named, or for all, else zero, ``(m, 1)``."""
+        return self.task.constant([[float(named is None or s in named)] for s in self.task.sensors])
+
+
+class SensorLevels(NamedTuple):
+    """State of :class:`NoisySensors`."""
+
+    levels: Steps
+    """Factors on the sensors' noise, values ``(J + 1, m, N)``."""
+    level: Array
+    """At this measurement, ``(m, N)``."""
+
+
+class NoisySensors(_OfSensors):
+    """The white noise of a sensor is another one, and changes in the episode."""
+
+    name = "noisy_sensors"
+    causes = (
+        Cause(
+            "sensor noise",
+            f"where a sensor's noise is at least {RAISED:g} times the nominal one",
+            _has_noisy_sensor,
+        ),
+    )
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> SensorLevels:
+        """Draw levels, and when they change."""
+        p, chosen = self.parameters, self.chosen(self.parameters.changing_sensors)
+        levels = draw_steps(draws, "sensor", p.sensor_levels, p.sensor_times, zero, self.count)
+        levels = levels._replace(values=1.0 + chosen * (levels.values - 1.0))
+        return SensorLevels(levels, levels.values[0])
+
+    def quiet(self, state: SensorLevels, calm: Array) -> SensorLevels:
+        """Nominal noise."""
+        values = self.xp.where(calm, 1.0, state.levels.values)
+        return SensorLevels(state.levels._replace(values=values), values[0])
+
+    def advance(self, state: SensorLevels, step: Step) -> SensorLevels:
+        """Take the levels of this measurement."""
+        return state._replace(level=state.levels.at(step.number, self.xp))
+
+    def change_deviations(self, state: SensorLevels, deviations: Array) -> Array:
+        """Multiply them."""
+        return deviations * state.level
+
+    def context(self, state: SensorLevels) -> dict[str, Array]:
+        """All levels, and the numbers of the measurements from which on they hold."""
+        return {"sensor_levels": state.levels.values, "sensor_level_times": state.levels.times}
+
+
+class Holds(NamedTuple):
+    """State of :class:`Dropouts`."""
+
+    starts: Array
+    """First measurement without a reading, ``(D, m, N)``."""
+    stops: Array
+    """First measurement with a reading again, ``(D, m, N)``."""
+    reading: Array
+    """Last valid reading of each sensor, which it holds during a dropout, ``(m, N)``."""
+
+
+class Dropouts(_OfSensors):
+    """A sensor does not answer for a while, once in a period, and holds its last reading."""
+
+    name = "dropouts"
+    causes = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
+        """Draw when."""
+        xp, p = self.xp, self.parameters
+        none = xp.stack([zero] * self.count)
+        starts, stops = [none], [none]
+        for i in range(-(-p.horizon // p.dropout_period) if p.dropout_period else 0):
+            length = draws.integer(f"dropout_length_{i}", p.dropout_length, self.count)
+            room = draws.unit(f"dropout_{i}", self.count) * (p.dropout_period - length)
+            starts.append(i * p.dropout_period + 1.0 + xp.floor(room))
+            stops.append(starts[-1] + length)
+        return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
+
+    def quiet(self, state: Holds, calm: Array) -> Holds:
+        """None of them lasts."""
+        return state._replace(stops=self.xp.where(calm, state.starts, state.stops))
+
+    def change_measurement(
+        self, state: Holds, measurement: Any, step: Step, feedback: Any
+    ) -> tuple[Holds, Any]:
+        """Hold the last reading of each sensor that is out."""
+        xp, available = self.xp, measurement.available
+        for i in range(state.starts.shape[0]):
+            out = within(step.number, (state.starts[i], state.stops[i]))
+            available = xp.where(out, 0.0, available)
+        reading = xp.where(available > 0.0, measurement.reading, state.reading)
+        measurement = measurement._replace(reading=reading, available=available)
+        return state._replace(reading=reading), measurement
+
+    def context(self, state: Holds) -> dict[str, Array]:
+        """When they are."""
+        return {"dropout_starts": state.starts, "dropout_stops": state.stops}
+
+
+class SensorBias(_OfSensors):
+    """A sensor has a constant error; its state, in its unit, ``(m, N)``."""
+
+    name = "bias"
+
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> Array:
+        """Draw size and side."""
+        xp, limits = self.xp, self.parameters.sensor_bias
+        if not limits[1]:
+            return xp.stack([zero] * self.count)
+        side = xp.where(draws.event("bias_side", 0.5, self.count), 1.0, -1.0)
+        size = draws.uniform("bias", limits, self.count)
+        return self.sigmas * self.chosen(self.parameters.biased_sensors) * side * size
+
+    def quiet(self, state: Array, calm: Array) -> Array:
+        """None."""
+        return self.xp.where(calm, 0.0, state)
+
+    def change_reading(self, state: Array, reading: Array) -> tuple[Array, Array]:
+        """Add it."""
+        return state, reading + state if self.parameters.sensor_bias[1] else reading
+
+    def context(self, state: Array) -> dict[str, Array]:
+        """All of it."""
+        return {"sensor_bias": state}
+
+
+class SensorColour(ColouredErrors):
+    """Errors of the sensors that last."""
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        p = task.parameters
+        super().__init__(task, p.value("sampling_interval"), len(task.sensors), p.sensor_coloured[1] > 0.0)
+        self.sigmas = task.constant(p.value("sensor_sigmas"))[:, None]
+
+    def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
+        """Draw deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""
+        p, none = self.parameters, self.xp.stack([zero] * self.count)
+        if not self.normals:
+            return none, none + 1.0
+        deviation = self.sigmas * draws.uniform("coloured", p.sensor_coloured, self.count)
+        return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
+
+    def change_reading(self, state: Colour, reading: Array) -> tuple[Colour, Array]:
+        """Add them."""
+        return state, reading + state.level if self.normals else reading
+
+    def context(self, state: Colour) -> dict[str, Array]:
+        """Those of this measurement."""
+        return {"sensor_coloured": state.level}
+
+
+DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
+"""In the order in which they act; a further one comes last, so that episodes stay."""
+DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
