@@ -149,14 +149,17 @@ def test_random_actions_go_with_the_policy_before_them(minari):
     assert scores == [1.0, 1.0]
 
 
-def test_more_episodes_than_are_flown_at_once(minari, monkeypatch):
+def test_more_episodes_than_are_flown_at_once(minari, monkeypatch, tmp_path):
     from filtergym import offline
 
     whole = offline.write_datasets(ENV, ["random"], episodes=7, horizon=4, namespace="mine/whole")
+    [space, *_] = sorted((tmp_path / "datasets").rglob("namespace_metadata.json"))
+    space.write_text('{"description": "the user\'s own"}')
     monkeypatch.setattr(offline, "CHUNK", 3)
     parts = offline.write_datasets(ENV, ["random"], episodes=7, horizon=4, namespace="mine/parts")
     one, other = (minari.load_dataset(entry.name) for [entry] in (whole, parts))
     assert one.total_episodes == other.total_episodes == 7
+    assert "own" in space.read_text()  # also where others are written beside it
     for left, right in zip(one, other, strict=True):
         np.testing.assert_array_equal(left.observations, right.observations)
         np.testing.assert_array_equal(left.actions, right.actions)
