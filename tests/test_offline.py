@@ -136,8 +136,13 @@ def test_data_sets_are_loaded_back_by_minari(env_id, short, minari):
 
 
 def test_random_actions_go_with_the_policy_before_them(minari):
-    from filtergym.offline import write_datasets
+    from filtergym.offline import default_policies, write_datasets
 
+    paper = baselines_of(ENV).score_paper
+    assert [paper in default_policies(problem_of(ENV), control) for control in (None, "gain")] == [
+        True,
+        False,
+    ]
     _, tuned, random = write_datasets(ENV, episodes=2, horizon=5)
     assert tuned.environment == random.environment
     assert tuned.environment["gains"] == competitor(ENV, tuned.policy).task_keywords["gains"]
