@@ -66,7 +66,7 @@ class _Trainer(BaseCallback):
 
 
 def training_environment(run: TrainingRun) -> TaskVecEnv:
-    """Make the environments of a run, seeded by the training split."""
+    """Make the environments of a run."""
     env: Any = gymnasium.make_vec(
         run.environment,
         num_envs=run.envs,
@@ -81,9 +81,7 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
     corrected = policy_to_correct(inner, run.residual_to) if run.residual_to else None
     gate = Gate(inner, corrected) if run.gated else None
     # A rollout is shorter than an episode: side by side in step, it would show one part of the flight only.
-    adapted = to_sb3(env, staggered=True, residual_to=corrected, gate=gate)
-    adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
-    return adapted
+    return to_sb3(env, staggered=True, residual_to=corrected, gate=gate)
 
 
 def _step_eagerly(model: BaseAlgorithm) -> None:

@@ -130,25 +130,22 @@ class Specialised:
         self.lane_first[0] |= given_turned
         self.code: Code | None = None
 
-    def compile(self, library: Library | None = None) -> None:
-        """Translate the program, or find it in the cache."""
+    def compile(self, library: Library | None = None) -> Code:
+        """Return the code of the program."""
         if self.code is None:
             self.code = native(self.program, self.lane_first, library)
+        return self.code
 
     def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
         """Return what runs the function on arrays ``(rows, N)``, or ``(..., N)``, from now on always the same."""
-        self.compile()
-        assert self.code is not None
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
             table += [address_of(array), _lane_stride(array) if lane_first else _stride(array)]
-        return Call(self.code, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
+        return Call(self.compile(), numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
         """Run on inputs of some width; returns new outputs, None where an input stands for one."""
-        self.compile()
-        assert self.code is not None
         table = [address_of(self.program.constants)]
         for array in arrays:
             table += [address_of(array), _stride(array)]
@@ -167,7 +164,7 @@ class Specialised:
             table[-2:] = [address_of(last), rows[-1]]
             outputs[-1] = last.T.reshape(*self.outputs[-1].shape, width)
         call = Call(
-            self.code, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
+            self.compile(), numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
         )
         call.expect(width)
         run_over(call, width, threads)

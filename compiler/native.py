@@ -144,14 +144,11 @@ _EAGER: contextvars.ContextVar[bool] = contextvars.ContextVar("eager", default=F
 
 
 @contextmanager
-def optimised_code(at_once: bool = True) -> Iterator[None]:
+def optimised_code() -> Iterator[None]:
     """Let programs that run inside in a :class:`~.sequence.CallSequence` be optimised at once: times depend neither
     on a cache nor on how long they have run then.
-
-    Args:
-        at_once: whether they are.
     """
-    token = _EAGER.set(at_once)
+    token = _EAGER.set(True)
     try:
         yield
     finally:

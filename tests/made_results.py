@@ -32,5 +32,4 @@ def results_of(id, names, scenario, episodes, **options):
         scenario, episodes, about["seed"], about["split"], keywords=keywords_of(dataset)
     )
     worst = find_worst(problem, experiment, costs, records, [paper])
-    found = result_of(problem, dataset, records, curves, pretrained_agents(id), [paper])
-    return found._replace(worst=worst)
+    return result_of(problem, dataset, records, curves, pretrained_agents(id), worst)

@@ -43,6 +43,18 @@ def make_model(id: str, control: str | None = None, scenario: Any = None, **keyw
     return backend.make_model(task_class(id), control, scenario, **keywords)
 
 
+def begin(model: Model, rng: np.random.Generator, count: int) -> Any:
+    """Begin episodes side by side, from numbers of a generator."""
+    noise = model.task.noise
+    return model.begin(rng.random((noise.uniforms, count)), rng.normal(size=(noise.initial_normals, count)))
+
+
+def next_row(model: Model, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Numbers of the next measurement."""
+    noise = model.task.noise
+    return np.concatenate([rng.normal(size=(noise.normals, count)), rng.random((noise.row_uniforms, count))])
+
+
 def short_episodes(id: str) -> dict[str, Any]:
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
     interval = min(task_class(id).Parameters().decision_interval, 2)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy
 from contract import assert_equals_its_vector
-from models import load_module, make_model
+from models import begin, load_module, make_model, next_row
 
 ROOT = Path(__file__).parent.parent
 ID = "mine/BudgetedSensing-v0"
@@ -22,17 +22,10 @@ def example():
 def run(example, steps, episodes, actions=None, **parameters):
     """Truth, measurement, prediction and the bank's state at each of some measurements."""
     model = make_model(ID, "beam", backend="numpy", **parameters)
-    rng, noise = np.random.default_rng(0), model.task.noise
-    episode = model.begin(
-        rng.random((noise.uniforms, episodes)), rng.standard_normal((noise.initial_normals, episodes))
-    )
-    kept = []
+    rng = np.random.default_rng(0)
+    episode, kept = begin(model, rng, episodes), []
     for k in range(steps):
-        row = [
-            rng.standard_normal((noise.normals, episodes)),
-            rng.random((noise.row_uniforms, episodes)),
-        ]
-        predicted = model.measure(episode, np.concatenate(row))
+        predicted = model.measure(episode, next_row(model, rng, episodes))
         action = np.full(episodes, k % 4) if actions is None else actions[k]
         episode = model.act(predicted, action)
         kept.append((predicted.truth, predicted.measurement, predicted.filter, episode.filter))
@@ -73,19 +66,6 @@ def test_what_is_not_looked_at_changes_nothing_and_what_is_beyond_the_beam_neith
     beyond = predicted.mean[0] + np.array([[0.0], [0.0], [200.1], [0.0]])
     missed = bank.act(predicted, measurement._replace(position=beyond), action)
     np.testing.assert_array_equal(missed.mean, predicted.mean)
-
-
-def test_the_moments_of_the_course(example):
-    """Variance and correlation of the acceleration are what `later` takes for them."""
-    _, kept = run(example, 100, 300, agility=(2.0, 2.0))
-    a = np.stack([truth.acceleration for truth, *_ in kept[60:]])
-    P = np.zeros((3, 3, 1))
-    for _ in range(200):
-        P = example.later(P, np.array([2.0]))
-        P[:2], P[:, :2] = 0.0, 0.0
-    assert a.var() == pytest.approx(P[2, 2, 0], rel=0.05)
-    kept_share = (a[1:] * a[:-1]).mean() / a.var()
-    assert kept_share == pytest.approx(1.0 - 1.0 / 7.5, abs=0.015)
 
 
 def test_the_expected_cost_is_the_integral(example):

@@ -243,11 +243,11 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
         )
     worst = describe_worst(again, numbers, "imm", "kalman-imm-turn")
     assert [one.seed for one in worst] == dataset["episode_seed"].values[numbers].tolist()
-    found = find_worst(problem, experiment, {"imm": costs}, records, ["imm"])
+    [found] = find_worst(problem, experiment, {"imm": costs}, records, ["imm"]).values()
     assert [one.seed for one in found] == [one.seed for one in worst]
     assert found[0].ratio == pytest.approx(worst[0].cost / worst[0].opponent_cost)
     assert found[0].track.attrs["seed"] == worst[0].seed
-    [(name, figure)] = worst_figures(found, phrases_of(dataset), 1)
+    [(name, figure)] = worst_figures({"imm": found}, phrases_of(dataset), 1)
     assert name == "worst_episodes"
     track = found[0].track.sel(policy="imm")
     truth, seen, *estimates = (line.get_xydata().T for line in figure.axes[0].get_lines())

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -234,34 +233,6 @@ def test_rows_begin_on_cache_lines():
         assert memory.shape == (*shape, width)
         assert memory.ctypes.data % 64 == 0
         assert all(stride % 64 == 0 for stride in memory.strides[:-1])
-
-
-@pytest.fixture
-def _threads_change_often():
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    yield
-    sys.setswitchinterval(interval)
-
-
-@pytest.mark.usefixtures("_threads_change_often")
-def test_threads_that_meet_a_function_at_once_all_get_it(monkeypatch):
-    for attempt in range(2):
-        monkeypatch.setattr(native, "_CODES", {})
-        x, start, graph = numbers(3, 24, seed=attempt), threading.Barrier(4), Graph()
-        # Two functions, whose expressions meet in one graph.
-        both = [Function(lambda x, k=k: ordinary(x) * (k + 1.5) + k, graph) for k in range(2)]
-
-        def work(k, x=x, start=start, both=both):
-            start.wait()
-            return both[k % 2](x)
-
-        with ThreadPoolExecutor(4) as pool:
-            results = list(pool.map(work, range(4)))
-        plain = np.exp(-x) * np.sin(x[::-1]) + np.sum(x * x, axis=0) / 3.0
-        for k, result in enumerate(results):
-            np.testing.assert_allclose(result, plain * (k % 2 + 1.5) + k % 2, rtol=1e-13, atol=1e-13)
-            np.testing.assert_array_equal(result, results[k % 2])
 
 
 def test_one_thread_at_a_time_traces_into_a_graph():

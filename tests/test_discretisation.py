@@ -6,7 +6,6 @@ import scipy
 from filtergym.filters import discretisation
 from own_models import make_models, simulate
 
-import filtergym
 from filtergym import Input
 
 CASES = {
@@ -132,25 +131,6 @@ def test_the_filter_is_that_of_the_discretised_model(make, backend):
             x, P = x + K[:, 0] * (m.values[0, lane] - x[0]), (np.eye(2) - K @ np.array([[1.0, 0.0]])) @ P
         np.testing.assert_allclose(kept[-1][2][:, lane], x, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
-
-
-def test_a_linear_drift_is_the_model_that_one_writes_by_hand(make):
-    """A point with white acceleration and a known one: f(x, dt, u) and Q(dt) of the textbook."""
-    common = {"covariance": np.eye(2), "inputs": ["acceleration"], "drift": None, "diffusion": None}
-    by_hand = make(
-        **common,
-        f=lambda x, dt, u: [x[0] + dt * x[1] + dt**2 / 2 * u[0], x[1] + dt * u[0]],
-        Q=lambda dt: [[dt**3 / 30, dt**2 / 20], [dt**2 / 20, dt / 10]],
-    )
-    own = make(**{**common, "drift": lambda x, u: [x[1], u[0]], "diffusion": [[0, 0], [0, 0.1]]})
-    one, two = (filtergym.online(each.id, "kalman") for each in (by_hand, own))
-    for time, z, u in [(0.1, 1.0, 2.0), (0.5, 1.2, -1.0), (9.0, 5.0, 0.5), (9.0, 5.1, 0.5)]:
-        for filter in (one, two):
-            if time == 0.1:
-                filter.start(mean=[1, 0], covariance=np.eye(2))
-        expected, found = (filter.update(time, z1=z, acceleration=u) for filter in (one, two))
-        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(

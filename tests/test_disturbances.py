@@ -59,8 +59,8 @@ class Scale(Disturbance):
     def change_reading(self, state, reading):
         return (state[0], state[1] + 1.0), -reading
 
-    def change_measurement(self, state, measurement, step, feedback):
-        return state, measurement + step.uniforms[0] + feedback
+    def change_measurement(self, state, measurement, step):
+        return state, measurement + step.uniforms[0] + step.feedback
 
     def records(self, state):
         return {"changed": state[1]}
@@ -73,7 +73,9 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
     drawn, start = np.array([[0.25, 0.5]]), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     states = both.begin(Draws(drawn, np), start, np.array([100.0, 200.0]))
     np.testing.assert_array_equal(states["shift"], [101.25, 202.5])
-    steps = both.share(np.array([1.0, 1.0]), 2.0, np.array([[7.0, 7.0], [8.0, 9.0]]), np.array([[0.1, 0.2]]))
+    steps = both.share(
+        np.array([1.0, 1.0]), 2.0, np.array([[7.0, 7.0], [8.0, 9.0]]), np.array([[0.1, 0.2]]), 10.0
+    )
     states = both.advance(states, steps)
     np.testing.assert_array_equal(both.context(states)["shift"], [117.25, 220.5])
     errors = both.change_errors(states, np.array([1.0, 1.0]))
@@ -81,7 +83,7 @@ def test_each_takes_its_own_numbers_and_acts_in_its_turn():
     states, reading = both.change_reading(states, np.array([1.0, 2.0]))
     np.testing.assert_array_equal(reading, [-1.0, -2.0])
     np.testing.assert_array_equal(both.records(states)["changed"], [1.0, 1.0])
-    _, measurement = both.change_measurement(states, np.array([1.0, 2.0]), steps, 10.0)
+    _, measurement = both.change_measurement(states, np.array([1.0, 2.0]), steps)
     np.testing.assert_array_equal(measurement, [11.1, 12.2])
     task.parameters.shifted = False
     assert [part.name for part in Disturbances.of(task, (Shift, Scale)).parts] == ["scale"]

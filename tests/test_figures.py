@@ -1,6 +1,5 @@
 """Figures of an evaluation: who is told apart, how kinds look, what the files hold, and what stands on the axes."""
 
-import dataclasses
 import itertools
 import re
 
@@ -34,7 +33,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from pictures import draw_learning_curves
 from records import read_benchmark, recorded_environments
 
-from filtergym import evaluate, record
+from filtergym import evaluate
 
 ENV, UAV = "filtergym/ManeuveringTarget-v0", "filtergym/UavAutopilot-v0"
 NAMES = [
@@ -54,11 +53,6 @@ NAMES = [
 @pytest.fixture(scope="module")
 def curves() -> xarray.Dataset:
     return curves_of(evaluate(ENV, NAMES, "paper", 12, horizon=80))
-
-
-@pytest.fixture(scope="module")
-def figures(curves) -> dict[str, Figure]:
-    return dict(evaluation_figures(curves))
 
 
 def lines(axis):
@@ -141,8 +135,8 @@ def test_who_is_told_apart_may_be_asked_for(curves):
         choose_highlights(curves, NAMES[:7])
 
 
-def test_figures_are_as_wide_as_columns_and_legible(curves, figures):
-    assert {figure.get_figwidth() for figure in figures.values()} == {WIDTHS[2]}
+def test_figures_are_as_wide_as_columns_and_legible(curves):
+    assert draw_error_over_time(curves).get_figwidth() == WIDTHS[2]
     narrow = dict(evaluation_figures(curves, 1))
     assert list(narrow) == [
         "rmse_over_time", "error_distribution", "cost_difference", "consistency", "mode_probabilities",
@@ -201,13 +195,13 @@ def test_labels_stand_at_the_ends_of_lines_and_never_on_each_other(curves):
     assert len(labels) == MOST_HIGHLIGHTED + 1
 
 
-def test_many_modes_are_named_in_a_legend(curves, figures):
+def test_many_modes_are_named_in_a_legend(curves):
     modes = [f"m{i}" for i in range(9)]
     several = curves.sel(policy=["imm"]).isel(mode=[0, 1] * 4 + [0]).assign_coords(mode=modes)
     figure = draw_mode_probabilities(several)
     assert not set(modes) & set(texts(figure))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == modes
-    figure = figures["mode_probabilities"]
+    figure = draw_mode_probabilities(curves)
     assert {"mode 1", "mode 2"} <= set(texts(figure))
     assert not figure.legends
 
@@ -286,12 +280,6 @@ def test_learning_curves_are_median_and_range_over_runs():
     assert "%" in axis.get_ylabel()
 
 
-def test_recordings_without_truth_have_figures_too():
-    recording = dataclasses.replace(record(ENV, "paper", 3, horizon=40), truth=None)
-    found = curves_of(evaluate(ENV, ["imm", "adaptive"], recording))
-    assert list(dict(evaluation_figures(found))) == ["consistency", "mode_probabilities"]
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("env", "names", "length"),
@@ -331,7 +319,7 @@ def test_names_leave_the_line_of_the_papers_cost_free():
 
 def test_names_of_the_fronts_lie_on_no_other():
     """As the records have them, in the picture of README."""
-    figure = draw_fronts(panels_of([read_benchmark(name)[0] for name in recorded_environments()[:2]]))
+    figure = draw_fronts(panels_of([read_benchmark(name)[0] for name in recorded_environments()[:1]]))
     for axis in figure.axes:
         names = [text for text in axis.texts if "beyond" not in text.get_text()]
         boxes = {name.get_text(): name.get_window_extent(figure.canvas.get_renderer()) for name in names}

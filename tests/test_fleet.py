@@ -249,19 +249,6 @@ def test_details_of_a_mixture_are_those_of_its_scenarios():
             np.testing.assert_array_equal(values, told[name][lane])
 
 
-def test_pictures_follow_the_scenario():
-    env = gymnasium.make(ID, render_mode="rgb_array", **SHORT)
-    titles = []
-    for options in (None, {"scenario": "paper"}):
-        env.reset(seed=0, options=options)
-        env.step(np.zeros(1))
-        assert env.render().ndim == 3
-        titles.append(env.unwrapped.picture.title)
-    assert "scenario random" in titles[0]
-    assert "scenario paper" in titles[1]
-    env.close()
-
-
 @pytest.mark.parametrize(
     ("scenario", "weights"),
     [

@@ -318,6 +318,7 @@ def test_who_has_no_gate_is_refused(name, message):
     ("make", "control", "message"),
     [
         (Gate, "mode", "has no constant action that is the paper's: give the gate a fallback"),
+        (Gate, "weights", "has no constant action that is the paper's"),
         (lambda model: Gate(model, fallback=Constant), "gains", "fallback is made for control 'gain', but"),
         (lambda model: Gated(model, Constant), "gains", "policy is made for control 'gain', but the task"),
         (lambda model: Gate(model, window=0), "gain", "window must be at least one decision, got 0"),

@@ -1,5 +1,7 @@
 """The engine's noise: every measurement takes its own row of its own episode, whoever else flies or starts."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import episode_noise
 from filtergym.envs.engine.compiled import share_world
-from filtergym.envs.engine.episode_noise import identities_of_seeds, start_numbers
+from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import OWN_PAY, reference
 from models import KINDS, make_model
@@ -175,3 +177,23 @@ def assert_runs_beside_as_lanes_of_its_own(subject, kind):
             np.testing.assert_array_equal(found[0], ours[0])
             np.testing.assert_array_equal(found[1], others[0])
         np.testing.assert_array_equal(lanes.observe(), own.observe())
+
+
+def test_copies_and_snapshots_go_on_as_the_original(either_way):
+    noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
+    for lane in range(3):
+        noise.seed(lane, np.random.default_rng(lane))
+    noise.begin(noise.draw_identities(range(3)))
+    noise.advance()
+    first, other, snapshot = noise.row, pickle.loads(pickle.dumps(noise)), noise.snapshot()
+    noise.advance()
+    other.advance()
+    np.testing.assert_array_equal(noise.row, other.row)
+    following, drawn = noise.row, noise.draw_identities([1])
+    np.testing.assert_array_equal(other.draw_identities([1]), drawn)
+    for _ in range(2):
+        noise.restore(snapshot)
+        noise.advance()
+        np.testing.assert_array_equal(noise.row, following)
+        np.testing.assert_array_equal(noise.draw_identities([1]), drawn)
+    assert (first != following).any()

@@ -295,7 +295,8 @@ def test_disturbances_stand_where_they_are_drawn():
             np.testing.assert_array_equal(said.available, np.where(inside & (name == "outage"), 0.0, 1.0))
             jammed = np.where(inside & (name == "jamming"), 10.0, 1.0)
             np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
-            np.testing.assert_allclose(said.reported_deviation, math.sqrt(2), rtol=1e-14)
+            stated = model.task.world.reading_deviations(said)[0]
+            np.testing.assert_allclose([said.reported_deviation, stated], math.sqrt(2), rtol=1e-14)
             pull = np.where(inside & (name == "spoof-ramp"), 0.02 * (k - first + 1), 0.0)
             fix = np.where(inside & (name == "outage"), 0.0, seen.truth.reference[0] + pull)
             # Sums of three numbers of up to 100 m.

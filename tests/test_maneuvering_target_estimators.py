@@ -22,7 +22,7 @@ from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
-from models import make_model, watch_estimator
+from models import begin, make_model, next_row, watch_estimator
 from naive import transition
 from scipy.stats import multivariate_normal
 
@@ -303,15 +303,11 @@ def test_the_reference_is_told_lasting_errors_as_they_are_measured(scenario, err
 def test_a_deviation_is_carried_as_the_turns_carry_it(scenario, keywords):
     model = make_model(ID, "evidence", scenario, maneuver_count=(3, 3), **keywords)
     world, rng = model.task.world, np.random.default_rng(0)
-    numbers = model.task.noise
-    episode = model.begin(
-        rng.random((numbers.uniforms, LANES)), rng.normal(size=(numbers.initial_normals, LANES))
-    )
+    episode = begin(model, rng, LANES)
     velocity, turned = rng.normal(size=(2, LANES)), 0
     for k in range(1, 61):
         before = episode.truth
-        noise = [rng.normal(size=(numbers.normals, LANES)), rng.random((numbers.row_uniforms, LANES))]
-        episode = model.act(model.measure(episode, np.concatenate(noise)), np.zeros((2, LANES)))
+        episode = model.act(model.measure(episode, next_row(model, rng, LANES)), np.zeros((2, LANES)))
         truth = episode.truth
         early = None if truth.scans is None else (before.scans.early, truth.scans.early)
         carried = world.course.carry(truth.flight, truth.scan, early, velocity)

@@ -15,7 +15,7 @@ from filtergym.envs.contract.observation import (
     Quantity,
     linear_scale,
 )
-from models import make_model
+from models import begin, make_model, next_row
 
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
@@ -118,9 +118,9 @@ def test_unknown_names_and_names_said_twice():
 def test_innovation_in_metres_is_the_measured_minus_the_predicted_position():
     model = make_model("filtergym/ManeuveringTarget-v0", "gain", "missed-detections")
     rng = np.random.default_rng(5)
-    episode = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+    episode = begin(model, rng, 8)
     for _ in range(20):
-        episode = model.measure(episode, np.concatenate([rng.normal(size=(2, 8)), rng.random((2, 8))]))
+        episode = model.measure(episode, next_row(model, rng, 8))
         read = model.reader("innovation_in_metres")(model.observe(episode).T)
         seen = episode.measurement.available > 0.0
         expected = np.where(seen, episode.measurement.position - episode.filter.predicted, 0.0).T

@@ -77,35 +77,6 @@ def test_a_stored_linear_set_is_judged_as_a_naive_filter_judges_it(problems, tmp
     assert row.low_db < row.mse_db < row.high_db
 
 
-def test_stored_drives_are_read(problems, tmp_path):
-    torch = pytest.importorskip("torch")
-    file = tmp_path / "data" / "nclt_fusion" / "test.pt"
-    file.parent.mkdir(parents=True)
-    rows = 4
-    gps = torch.tensor([[1.0, 2.0], [math.nan, math.nan], [3.0, 4.0], [5.0, 6.0]], dtype=torch.float64)
-    wheel = torch.arange(16, dtype=torch.float64).reshape(4, 4)
-    drive = {
-        "filtered_gps": gps,
-        "gps": torch.nan_to_num(gps, nan=1.0),
-        "wheel": wheel,
-        "ground_truth": torch.zeros(rows, 2, dtype=torch.float64),
-        "initial_state": torch.tensor([7.0, 8.0, 0.0, 0.0, 0.5, 0.0], dtype=torch.float64),
-        "data_date": "today",
-    }
-    torch.save([drive], file)
-    recording, held = problems.stored_drives(tmp_path, "test")
-    assert held["today"] == pytest.approx(math.sqrt((1 + 4 + 1 + 1 + 9 + 16 + 25 + 36) / 8.0))
-    values, available = (recording.measurements[name][0] for name in ("values", "available"))
-    np.testing.assert_array_equal(available[:, 0], [1.0, 0.0, 1.0, 1.0])
-    np.testing.assert_array_equal(
-        values[:, 2], [4.5, 8.5, 12.5, 12.5]
-    )  # of the next row; the last one's is its own
-    np.testing.assert_allclose(values[:, 3], [6.0, 10.0, 14.0, 14.0])
-    np.testing.assert_array_equal(values[:, 4], [7.0, 11.0, 15.0, 15.0])
-    np.testing.assert_array_equal(recording.initial["mean"][0], [7.0, 8.0, 0.0, 0.5, 0.0, 0.0])
-    recording.scenario(problems.Drives, {})
-
-
 def test_a_filter_with_noises_of_its_own_uses_both(problems):
     """As factors on the model's covariances say; alike would also hold if both were left out."""
     own = {

@@ -1,10 +1,13 @@
 """RadarEsmTracking: what is shown, the printed recursion, no truth in sight, the frequencies of its world."""
 
 import math
+from types import SimpleNamespace
 
 import numpy
 import pytest
+from filtergym.envs.contract.causes import Moment
 from filtergym.envs.contract.model import Model
+from filtergym.envs.radar_esm_tracking.causes import causes_of
 from filtergym.envs.radar_esm_tracking.picture import RadarEsmTrackingPicture
 from filtergym.envs.radar_esm_tracking.task import TASK
 from filtergym.filters import class_fusion, imm
@@ -286,6 +289,31 @@ def test_silent_targets_radiate_in_bursts():
 def test_bad_parameters_are_refused_with_the_reason(keywords, reason):
     with pytest.raises(ValueError, match=reason):
         TASK.Parameters(**keywords)
+
+
+def test_causes_are_read_from_the_context():
+    context = {
+        "target_class": [0, 2, 2],
+        "change_scan": [40, 10, -1],
+        "radiating": [1, 0, 1],
+        "second_emitter": [0, 0, 0.1],
+    }
+    moment = Moment(
+        numpy,
+        {name: numpy.array(values, dtype=float) for name, values in context.items()},
+        numpy.full((3, 3), 6e4),
+        SimpleNamespace(scan=numpy.array([39.0, 29.0, 29.0])),
+        None,
+        None,
+    )
+    causes = {cause.name: cause.holds for cause in causes_of(("S0", "S1", "S2"))}
+    for name, expected in (
+        ("class S2", [False, True, True]),
+        ("class change", [False, True, False]),
+        ("silence", [False, True, False]),
+        ("second emitter", [False, False, True]),
+    ):
+        assert causes[name](moment).tolist() == expected, name
 
 
 def test_accelerations_of_a_picture_reach_two_deviations_of_the_class_that_is_flown():

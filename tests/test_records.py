@@ -79,6 +79,7 @@ def names_what_is_there(page):
             assert number_text(path)
 
 
+@pytest.mark.claims
 @pytest.mark.parametrize("name", recorded_environments())
 def test_the_strongest_classical_competitor_is_in_the_quick_benchmark(name):
     """Else its verdict would name another as the best."""

@@ -154,6 +154,27 @@ def test_a_program_without_array_operations_is_rolled_up_too(seed):
     assert_same_bits(run_loops(code, lambda _, row: given[row]), interpret(code, lambda _, row: given[row]))
 
 
+def test_first_results_are_known_before_another_input_is_read():
+    """As what a network is shown before it answers; inputs that stand beside others are copied when they are there."""
+    graph = Graph()
+    with namespace.tracing(graph):
+        x, answer = (Traced([graph.input(place, row) for row in range(8)], np.float64) for place in (0, 2))
+        shown = namespace.concat([x[:4], 2.0 * x[:4]]) + x
+        mixed = namespace.concat([answer[:4], x[4:]]) * namespace.concat([x[:4], answer[4:]]) + shown
+        last = namespace.concat([mixed, answer, x[:3]])
+    wanted = [Result(3, row, node) for row, node in enumerate(shown.nodes.tolist())]
+    code = program(graph, [*wanted, *(Result(1, row, node) for row, node in enumerate(last.nodes.tolist()))])
+    given, told = inputs(), []
+
+    def read(argument, row):
+        assert argument == 0 or told
+        return given[argument + row]
+
+    expected = interpret(code, lambda argument, row: given[argument + row])
+    assert_same_bits(run_loops(code, read, 8, told.append), expected)
+    assert_same_bits(told[0], expected[:8])
+
+
 def test_loops_in_c_have_the_bits_of_the_straight_line(tmp_path):
     code, given = array_program(), np.ascontiguousarray(inputs().T)
     rows = len(code.results)

@@ -178,6 +178,8 @@ def test_rounding_holds_and_times_are_not_compared(honest):
             odd = [msgspec.structs.replace(f, **{name: number}) for f in known]
             assert not deviation(known, odd).holds
             assert not deviation(odd, known).holds
+    nothing = [msgspec.structs.replace(f, value=None, low=None, high=None) for f in known]
+    assert not deviation(nothing, nothing).holds
 
 
 # --- arrays swapped

@@ -19,14 +19,14 @@ DECISIONS = 5
 LANES = 5
 
 CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
+TIGHTLY = [cell for cell in CONTROLS if "Tightly" in cell[0] and cell[1] != "gain"]
+"""Of which a step takes longest."""
 CONTINUOUS = {
     id: control
     for id, control in reversed(CONTROLS)
-    if isinstance(make_model(id, control).action_space, gymnasium.spaces.Box)
+    if (id, control) not in TIGHTLY and isinstance(make_model(id, control).action_space, gymnasium.spaces.Box)
 }
-"""The first control of each environment whose action is a box."""
-TIGHTLY = [cell for cell in CONTROLS if "Tightly" in cell[0] and cell[1] != "gain"]
-"""Of which a step takes longest."""
+"""A control of each environment whose action is a box."""
 MODES = [mode.value for mode in gymnasium.vector.AutoresetMode]
 
 
@@ -114,7 +114,7 @@ def test_torch_equals_numpy(id, control, device):
         assert_close(part(runs, name), name)
 
 
-@pytest.mark.parametrize(("id", "mode"), zip(KINDS, MODES, strict=True))
+@pytest.mark.parametrize(("id", "mode"), list(zip(KINDS, MODES, strict=True)))
 def test_autoreset_equals_numpy(id, mode):
     last = 2
     restarted = numpy.array([True, False, True, False, True])

@@ -326,6 +326,9 @@ def test_random_episodes_hold_what_they_promise() -> None:
     noise = Noise(model, N, 0, 1)
     truth = model.begin(noise.uniforms, noise.initial).truth
     times, levels = truth.commands.times, truth.levels.values
+    assert len(truth.commands.values) == len(times) + 1
+    gust = p.value("initial_sigmas")[-1] * noise.initial[len(truth.state) - 1]
+    numpy.testing.assert_allclose(truth.state[-1], levels[0] * gust, rtol=1e-12)
     assert (numpy.diff(times, axis=0) > 0).all()
     assert (times.max(axis=0) <= p.horizon).all()
     assert numpy.abs(levels).min() >= 0.2

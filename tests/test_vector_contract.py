@@ -167,18 +167,6 @@ def pays_as_the_single_environment(subject):
     assert_same_steps(ours, theirs, subject.actions(ours, 3, range(8)))
 
 
-def draws_the_noise_of_long_episodes_in_blocks(subject):
-    # More than 256 measurements: blocks from a child generator, and resets that fall inside a block.
-    long = {"horizon": 260, "decision_interval": 10}
-    ours, theirs = subject.native(3, **long), subject.synchronous(3, **long)
-    ours.reset(seed=5), theirs.reset(seed=5)
-    actions = subject.actions(ours, 3, range(30))
-    assert_same_steps(ours, theirs, actions[:18])
-    for env in (ours, theirs):
-        env.reset(options={"reset_mask": np.array([False, True, False])})
-    assert_same_steps(ours, theirs, actions[18:])
-
-
 def seeds_each_sub_environment(subject):
     env = subject.native(3)
     together, _ = env.reset(seed=11)
@@ -272,7 +260,6 @@ BY_KIND = (
     pays_as_the_single_environment,
     goes_back_to_a_snapshot_as_often_as_one_likes,
     copies_go_on_as_the_original,
-    draws_the_noise_of_long_episodes_in_blocks,
     seeds_each_sub_environment,
     has_the_same_noise_under_every_control,
     waits_for_the_reset_of_what_has_finished,

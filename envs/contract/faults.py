@@ -24,6 +24,8 @@ class Step(NamedTuple):
     """Standard normal numbers that it takes, ``(normals, N)``."""
     uniforms: Array
     """Uniform numbers that it takes, ``(row_uniforms, N)``."""
+    feedback: Any = None
+    """Of a closed loop, see :meth:`.World.advance`."""
 
 
 def undisturbed(draws: Draws, parameters: Any) -> Array | None:
@@ -115,14 +117,13 @@ class Disturbance(ABC):
         """State and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
         return state, reading
 
-    def change_measurement(self, state: Any, measurement: Any, step: Step, feedback: Any) -> tuple[Any, Any]:
+    def change_measurement(self, state: Any, measurement: Any, step: Step) -> tuple[Any, Any]:
         """State and measurement with what it does to them.
 
         Args:
             state: of :meth:`advance`.
             measurement: the world's NamedTuple, with what was missed.
             step: that :meth:`advance` was given.
-            feedback: of a closed loop, see :meth:`.World.advance`.
         """
         return state, measurement
 
@@ -199,13 +200,13 @@ class Disturbances:
         return {part.name: part.quiet(states[part.name], calm) for part in self.parts}
 
     def share(
-        self, number: Array, interval: Array | float, normals: Array, uniforms: Array
+        self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
     ) -> dict[str, Step]:
-        """Hand out the random numbers of a measurement, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
+        """Hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
-            steps[part.name] = Step(number, interval, *own)
+            steps[part.name] = Step(number, interval, *own, feedback)
             n, u = n + part.normals, u + part.row_uniforms
         return steps
 
@@ -233,14 +234,13 @@ class Disturbances:
         return changed, reading
 
     def change_measurement(
-        self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, Step], feedback: Any
+        self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, Step]
     ) -> tuple[dict[str, Any], Any]:
         """States and measurement with what each does to them."""
         changed = dict(states)
         for part in self.parts:
-            changed[part.name], measurement = part.change_measurement(
-                changed[part.name], measurement, steps[part.name], feedback
-            )
+            own = changed[part.name], measurement, steps[part.name]
+            changed[part.name], measurement = part.change_measurement(*own)
         return changed, measurement
 
     def context(self, states: Mapping[str, Any]) -> dict[str, Array]:

@@ -103,9 +103,7 @@ class NoiseChanges(Disturbance):
         """Bring them to the level, m."""
         return state.level * deviations
 
-    def change_measurement(
-        self, state: Levels, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Levels, Any]:
+    def change_measurement(self, state: Levels, measurement: Any, step: Step) -> tuple[Levels, Any]:
         """Report it."""
         return state, measurement._replace(reported_deviation=state.report)
 
@@ -200,9 +198,7 @@ class Outage(_Once):
         Cause("after outage", f"in the {AFTERMATH:g} measurements after an outage", _follows_outage),
     )
 
-    def change_measurement(
-        self, state: Spell, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Spell, Any]:
+    def change_measurement(self, state: Spell, measurement: Any, step: Step) -> tuple[Spell, Any]:
         """Take the fix away."""
         if not self.probability:
             return state, measurement
@@ -285,3 +281,4 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
 )
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoiseChanges,)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""

@@ -162,13 +162,13 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         ins = truth.ins + increment
 
         further = noise[3 * n : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(number, p.sampling_interval, *further)
+        steps = self.disturbances.share(number, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         deviation = self.disturbances.change_deviations(states, xp.ones_like(number))
         reading = reference + deviation * noise[2 * n : 3 * n]
         states, fix = self.disturbances.change_reading(states, reading)
         measurement = Measurement(number, ins, increment, fix, xp.ones_like(number), deviation)
-        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps)
         truth = truth._replace(
             number=number,
             reference=reference,

@@ -84,12 +84,12 @@ class Clutter(Disturbance):
         return count
 
     def change_measurement(
-        self, state: ClutterState, measurement: Any, step: Step, feedback: Track
+        self, state: ClutterState, measurement: Any, step: Step
     ) -> tuple[ClutterState, Any]:
         """Put false plots beside that of the target, and associate one with the track of the filter."""
         xp, p, uniforms = self.xp, self.parameters, step.uniforms
         track, interval, echo = (
-            feedback,
+            step.feedback,
             measurement.interval,
             Echo(measurement.position, measurement.available),
         )

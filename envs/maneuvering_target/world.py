@@ -123,7 +123,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
         further = noise[2 : self.normals], uniforms[self.scans.row_uniforms :]
-        steps = self.disturbances.share(number, scan.interval, *further)
+        steps = self.disturbances.share(number, scan.interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         errors = self.disturbances.change_errors(states, noise[:2])
         states, measured = self._measure(position, errors, states)
@@ -133,7 +133,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
             measured = self.xp.where(seen, measured, 0.0)
             variance = self.xp.where(seen, variance, p.range_sigma**2)
         measurement = Measurement(number, measured, variance, available, scan.interval, scan.elapsed)
-        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps)
         return Truth(number, position, velocity, flight, scans, states), measurement
 
     def variances(self, position: Array) -> Array:

@@ -240,13 +240,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             wandering = GaussMarkov(truth.radar_decay, truth.radar_kick)
             truth = truth._replace(radar_error=wandering.advance(truth.radar_error, noise[7:9]))
         further = noise[self.own_normals : self.normals], uniforms[4:]
-        steps = self.disturbances.share(scan, p.sampling_interval, *further)
+        steps = self.disturbances.share(scan, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         truth = truth._replace(disturbances=states)
         truth, measurement = self._measure(truth, noise[3:5], noise[5:7], uniforms[:3])
-        states, measurement = self.disturbances.change_measurement(
-            truth.disturbances, measurement, steps, feedback
-        )
+        states, measurement = self.disturbances.change_measurement(truth.disturbances, measurement, steps)
         return truth._replace(disturbances=states), measurement
 
     # --- the sensors

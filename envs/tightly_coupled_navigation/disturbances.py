@@ -187,9 +187,7 @@ class HiddenSatellites(_Once):
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return self.xp.stack([first, second])
 
-    def change_measurement(
-        self, state: Fault, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Fault, Any]:
+    def change_measurement(self, state: Fault, measurement: Any, step: Step) -> tuple[Fault, Any]:
         """Take their pseudoranges and rates away."""
         seen = self.xp.where(self.is_at(state), 0.0, self.xp.ones_like(state.now))
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
@@ -205,9 +203,7 @@ class LostRates(_Once):
     name, title = "no_rates", "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
-    def change_measurement(
-        self, state: Fault, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Fault, Any]:
+    def change_measurement(self, state: Fault, measurement: Any, step: Step) -> tuple[Fault, Any]:
         """Take them away."""
         kept = self.xp.stack([1.0 - state.now] * self.satellites)
         return state, self.change_available(measurement, self.satellites, kept)
@@ -312,9 +308,7 @@ class Reflections(_OfSatellites):
         """Add them."""
         return errors + state.multipath
 
-    def change_measurement(
-        self, state: Reception, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Reception, Any]:
+    def change_measurement(self, state: Reception, measurement: Any, step: Step) -> tuple[Reception, Any]:
         """Tell C/N0."""
         return state, measurement._replace(cn0=state.cn0)
 
@@ -390,10 +384,9 @@ class Aperture(_OfSatellites):
         """They do not."""
         return self.xp.where(calm, 0.0, state)
 
-    def change_measurement(
-        self, state: Array, measurement: Any, step: Step, feedback: Array | None
-    ) -> tuple[Array, Any]:
+    def change_measurement(self, state: Array, measurement: Any, step: Step) -> tuple[Array, Any]:
         """Take away what is too far from the state ``(17, N)`` that they expect."""
+        feedback = step.feedback
         if feedback is None:
             return state, measurement
         sight = gnss_ins.geometry(feedback, measurement.satellite_position, measurement.satellite_velocity)
@@ -419,3 +412,4 @@ DISTURBANCES: tuple[type[Disturbance], ...] = (
 )
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoisyRate, StuckAccelerometers, LostRates, HiddenSatellites, Ramp, Reflections, Aperture)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""

@@ -154,7 +154,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         exact, _ = gnss_ins.observe(state, position, velocity, ins_angles, p.gravity)
 
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(k, p.sampling_interval, *further)
+        steps = self.disturbances.share(k, p.sampling_interval, *further, feedback)
         states = self.disturbances.advance(truth.disturbances, steps)
         white, ranges = noise[gnss_ins.SIZE : self.own_normals], task.sensors[0].readings
         ones = xp.ones_like(white)
@@ -164,7 +164,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         readings = xp.concat([measured[ranges] + error, measured[ranges.stop :]])
         states, readings = self.disturbances.change_reading(states, readings)
         measurement = Measurement(step, readings, ones, ins_angles, white[ranges], position, velocity)
-        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps)
         truth = truth._replace(
             step=step,
             state=state,

@@ -129,9 +129,7 @@ class Dropouts(_OfSensors):
         """None of them lasts."""
         return state._replace(stops=self.xp.where(calm, state.starts, state.stops))
 
-    def change_measurement(
-        self, state: Holds, measurement: Any, step: Step, feedback: Any
-    ) -> tuple[Holds, Any]:
+    def change_measurement(self, state: Holds, measurement: Any, step: Step) -> tuple[Holds, Any]:
         """Hold the last reading of each sensor that is out."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
@@ -201,3 +199,4 @@ class SensorColour(ColouredErrors):
 DISTURBANCES: tuple[type[Disturbance], ...] = (NoisySensors, SensorColour, SensorBias, Dropouts)
 """In the order in which they act; a further one comes last, so that episodes stay."""
 DRAWN_FIRST = (NoisySensors, Dropouts, SensorBias)
+"""Those that are drawn with an episode before the others, in this order: episodes have taken their numbers so."""

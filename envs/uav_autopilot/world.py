@@ -180,14 +180,16 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
         state = xp.clip(state, -FARTHEST, FARTHEST)
         further = noise[self.own_normals : self.normals], noise[self.normals :]
-        steps = self.disturbances.share(number, self.parameters.value("sampling_interval"), *further)
+        steps = self.disturbances.share(
+            number, self.parameters.value("sampling_interval"), *further, feedback
+        )
         states = self.disturbances.advance(truth.disturbances, steps)
         sensor_level = self.disturbances.change_deviations(states, xp.ones_like(readout))
         reading = self.task.readings_of(state) + self.sensor_sigmas * sensor_level * readout
         states, reading = self.disturbances.change_reading(states, reading)
         command = truth.commands.at(number, xp)
         measurement = Measurement(number, reading, xp.ones_like(reading), command, feedback)
-        states, measurement = self.disturbances.change_measurement(states, measurement, steps, feedback)
+        states, measurement = self.disturbances.change_measurement(states, measurement, steps)
         truth = truth._replace(
             number=number,
             state=state,

@@ -4,6 +4,7 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -253,7 +254,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         most = experiment.drawn_episodes - piece.first
         drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
     # What is timed afterwards is optimised then: nothing need be compiled in two ways.
-    with optimised_code(experiment.timed):
+    with optimised_code() if experiment.timed else nullcontext():
         flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":

@@ -167,10 +167,10 @@ def advise_on_log(
     learned = [name for name in known if name in shipped]
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
-        line = bar.add_task("advising", total=1.0)
+        fits = bar.add_task("advising", total=1.0)
 
         def progress(what: str, share: float) -> None:
-            bar.update(line, completed=share)
+            bar.update(fits, completed=share)
             bar.say(what)
 
         prices = update_prices(problem, found)

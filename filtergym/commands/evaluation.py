@@ -356,8 +356,7 @@ def write(
     outcome: Outcome,
     outputs: Outputs,
     learned: list[str],
-    explained: Sequence[str],
-    worst: Sequence[WorstTrack] = (),
+    worst: Mapping[str, Sequence[WorstTrack]],
 ) -> None:
     """Write what was asked for, print the tables and the largest reasons, and say where the files are.
 
@@ -366,8 +365,7 @@ def write(
         outcome: of :func:`run`.
         outputs: what is written.
         learned: names that are learned.
-        explained: names of those whose cost is explained.
-        worst: their worst episodes.
+        worst: by the names of those whose cost is explained their worst episodes.
     """
     flights = outcome.flights
     differences = outcome.differences(problem) if outcome.dataset.attrs["recorded"] else {}
@@ -384,8 +382,7 @@ def write(
     if outputs.folder is not None and outcome.curves is not None:
         if outcome.has_truth:
             settings = settings_of(command_line())
-            found = result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned, explained)
-            results = [found._replace(worst=list(worst))]
+            results = [result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned, worst)]
         whole = outcome.dataset.drop_dims(
             "drawn_episode", errors="ignore"
         )  # the track is for the report alone
@@ -411,7 +408,7 @@ def write(
         print_table(table)
     phrases = phrases_of(outcome.dataset)
     console.print()
-    for name in explained:
+    for name in worst:
         for sentence in reason_sentences(outcome.records, phrases, name):
             print_sentence(sentence)
     for note in [*notes_of(outcome.dataset), *missing_rows(outcome.records)]:

@@ -25,7 +25,7 @@ from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
-from ..reports.tables.results import RESULTS, Result, settings_of
+from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of
 from ..reports.tables.terminal_tables import datasets_table, results_tables
 from ..reports.tables.worst import find_worst
 from .evaluation import (
@@ -236,12 +236,10 @@ def evaluate_policies(
         with Workers(jobs, cluster) as workers:
             outcome = run(problem, experiment, names, outputs, workers, trust)
         explained = outcome.explained(policy or [], why or [])
-        worst = (
-            []
-            if out is None
-            else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
-        )
-    write(problem, outcome, outputs, learned, explained, worst)
+        worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
+        if out is not None:
+            worst = find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
+    write(problem, outcome, outputs, learned, worst)
     for sentence in departure_lines(problem, data, learned, keywords, trust):
         print_sentence(sentence)
 
@@ -414,9 +412,10 @@ def benchmark(
     console.print()
     make_report(results, settings_of(options.command), out / REPORT)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    console.print(
-        "what the environments are, and who competes in them: filtergym list, docs/environments.md\n"
+    print_sentence(
+        "what the environments are, and who competes in them: filtergym list, docs/environments.md"
     )
+    console.print()
     print_headline(results)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 FEWEST_SECONDS, MOST_SECONDS = 10.0, 60.0
 """Between two lines: no sooner than the first, and not later than the second where there is something new."""
@@ -43,14 +43,14 @@ class ProgressLines:
     def __exit__(self, *_: Any) -> None:
         pass
 
-    def add_task(self, description: str, *, total: float | None) -> int:
+    def add_task(self, description: str, *, total: float | None) -> TaskID:
         """Begin to show a task, in place of the one before."""
         self._begin(description, total or 0.0)
-        return 0
+        return TaskID(0)
 
     def update(
         self,
-        task: int,
+        task: TaskID,
         /,
         *,
         advance: float | None = None,

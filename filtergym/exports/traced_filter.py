@@ -26,7 +26,7 @@ from ..envs.contract.model import Model
 from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
-from ..evaluation.competitors.steered_filter import Decider, Decisions, steer
+from ..evaluation.competitors.steered_filter import Decider, steer
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
@@ -102,12 +102,9 @@ class FilterSteps:
     def due_nodes(self, state: Any, graph: Graph) -> list[int]:
         """Expression of whether the network is asked at a measurement."""
         assert self.decider is not None
-        return due_nodes(self.decider, getattr(state, "agent", state).policy, graph)
-
-
-def due_nodes(decider: Decider, decisions: Decisions, graph: Graph) -> list[int]:
-    """Expression of whether a policy is asked at a measurement."""
-    return nodes_of(decider.is_due(decisions)) if decider.interval > 1 else [graph.constant(True)]
+        if self.decider.interval == 1:
+            return [graph.constant(True)]
+        return nodes_of(self.decider.is_due(getattr(state, "agent", state).policy))
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:

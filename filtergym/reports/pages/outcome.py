@@ -8,7 +8,7 @@ from typing import NamedTuple
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
 from ...evaluation.running.times import EQUAL_TIMES, times_of_records
-from ..tables.ranking import Place, ranking
+from ..tables.ranking import Place, ranking, rival_of
 from ..tables.results import Result
 from ..tables.terminal_tables import HEADLINE
 
@@ -58,7 +58,7 @@ def sentence_of(result: Result) -> str:
     best = places[0]
     clauses = [_best_clause(result, best)]
     learned_is_best = best.role == "learned"
-    rival = next((place for place in places if (place.role == "learned") != learned_is_best), None)
+    rival = rival_of(places)
     origin = "classical" if learned_is_best else "learned"
     if rival is None:
         if result.learned or learned_is_best:

@@ -5,7 +5,7 @@ compare, in all scenarios.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ from .ranking import best_of_origins
 from .results import (
     RESULTS,
     Result,
+    WorstTrack,
     components_to_draw,
     select_competitors,
     settings_of,
@@ -158,7 +159,7 @@ def result_of(
     records: list[Record],
     curves: xarray.Dataset,
     learned: Sequence[str],
-    explained: Sequence[str] = (),
+    worst: Mapping[str, Sequence[WorstTrack]] | None = None,
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
@@ -168,13 +169,14 @@ def result_of(
         records: of it, tidy.
         curves: of it; those of what is shown are kept.
         learned: names that stand for something learned, those of competitors among them.
-        explained: names of those whose cost is to be explained; default: the paper's algorithm.
+        worst: by the names of those whose cost is to be explained their worst episodes; default: the paper's algorithm,
+            and none.
     """
     cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
-    explained = list(explained) or [name for name in [paper] if name in names]
-    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned), *explained]))
+    worst = worst or {name: [] for name in [paper] if name in names}
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned), *worst]))
     components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
@@ -192,7 +194,8 @@ def result_of(
         thin_curves(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
         phrases_of(dataset),
-        explained,
+        list(worst),
+        [one for episodes in worst.values() for one in episodes],
     )
 
 

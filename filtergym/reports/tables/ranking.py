@@ -50,6 +50,16 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
     return sorted(places, key=lambda place: max(place.cost, equal))
 
 
+def rival_of(places: Sequence[Place]) -> Place | None:
+    """Return the strongest competitor of another origin than the first, learned or classical; None where there is none.
+
+    Args:
+        places: of :func:`ranking`, one at least.
+    """
+    was_learned = places[0].role == "learned"
+    return next((place for place in places if (place.role == "learned") != was_learned), None)
+
+
 def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
     """Who is best of learned and classical competitors in a scenario, in two or three words.
 
@@ -59,9 +69,8 @@ def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None)
     places = ranking(records, learned)
     if not places:
         return "nothing is ranked"
-    best, *others = places
-    where = "learned" if best.role == "learned" else "classical"
-    rival = next((place for place in others if (place.role == "learned") != (where == "learned")), None)
+    where = "learned" if places[0].role == "learned" else "classical"
+    rival = rival_of(places)
     if rival is None:
         return f"{where} only"
     behind = rival.behind
@@ -83,7 +92,7 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
     places = ranking(records, learned)
     if not places:
         return f"On `{first.scenario}` nothing is ranked."
-    best, *others = places
+    best, rival = places[0], rival_of(places)
     difference = found.get((best.name, HEADLINE))
     sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) has the lowest error cost"
     if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
@@ -99,10 +108,8 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
             sentence += f", {with_interval(lost, 100.0, digits=2)} % of its tracks are lost"
     if best.chosen < 1.0:
         sentence += f". Other episodes of the kind would name another one in {_share(1.0 - best.chosen)}"
-    was_learned = best.role == "learned"
-    rival = next((place for place in others if (place.role == "learned") != was_learned), None)
     if rival is not None and rival.behind is not None:
-        origin = "classical competitor" if was_learned else "learned agent"
+        origin = "classical competitor" if best.role == "learned" else "learned agent"
         sentence += (
             f". The strongest {origin}, `{rival.name}`{'' if rival.role == 'learned' else f' ({rival.role})'}, costs "
             f"{with_interval(rival.behind, 100.0)} % more than it"

@@ -26,8 +26,8 @@ def find_worst(
     records: Sequence[Record],
     explained: Sequence[str],
     trust: bool = False,
-) -> list[WorstTrack]:
-    """Run the worst episodes of some competitors once more, each beside the opponent, and return their tracks.
+) -> dict[str, list[WorstTrack]]:
+    """Run the worst episodes of some competitors once more, each beside the opponent; their tracks by name.
 
     Args:
         problem: whose competitors they are.
@@ -37,10 +37,8 @@ def find_worst(
         explained: names of the competitors.
         trust: load models that can execute code.
     """
-    found = []
-    for name in explained:
-        if name not in costs:
-            continue
+    found: dict[str, list[WorstTrack]] = {name: [] for name in explained}
+    for name in found.keys() & costs.keys():
         opponent = opponent_in(records, name)
         numbers = select_worst(costs[name])
         makers = competitors_of(problem, [name, opponent] if opponent else [name], trust)
@@ -48,7 +46,7 @@ def find_worst(
         components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
         for i, worst in enumerate(describe_worst(dataset, numbers, name, opponent)):
             ratio = worst.cost / worst.opponent_cost if worst.opponent_cost > 0.0 else math.nan
-            found.append(
+            found[name].append(
                 WorstTrack(
                     name,
                     opponent,
@@ -75,21 +73,20 @@ def opponent_in(records: Sequence[Record], name: str) -> str:
 
 
 def worst_figures(
-    worst: Sequence[WorstTrack], phrases: Mapping[str, str], columns: int
+    worst: Mapping[str, Sequence[WorstTrack]], phrases: Mapping[str, str], columns: int
 ) -> Iterator[tuple[str, Any]]:
     """Draw the worst episodes of each competitor: the name of a file, and the figure.
 
     Args:
-        worst: of any competitors.
+        worst: of :func:`find_worst`.
         phrases: when each cause holds, by name.
         columns: of a paper, 1 or 2, as wide as which figures are.
     """
-    names = list(dict.fromkeys(one.policy for one in worst))
-    for name in names:
-        own = [(one, one.track) for one in worst if one.policy == name and one.track is not None]
+    for name, episodes in worst.items():
+        own = [(one, one.track) for one in episodes if one.track is not None]
         titles = [_titles(one, phrases) for one, _ in own]
         if own:
-            place = "worst_episodes" if len(names) == 1 else f"worst_episodes_{_file_name(name)}"
+            place = "worst_episodes" if len(worst) == 1 else f"worst_episodes_{_file_name(name)}"
             yield place, draw_worst([track for _, track in own], titles, name, columns=columns)
 
 

@@ -1,12 +1,26 @@
-"""What the workflow of the usual host runs is there."""
+"""What files of the repository say beside the code: the workflow of the usual host, and who is to be cited."""
 
 import re
 from pathlib import Path
 
 import pytest
+from filtergym.envs.engine.catalogue import catalogue
 
 yaml = pytest.importorskip("yaml")
 ROOT = Path(__file__).parents[1]
+
+
+def test_every_paper_is_named():
+    """In CITATION.cff, as the environment itself does."""
+    cited = {}
+    for paper in yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["references"]:
+        authors = [
+            one.get("name") or f"{one['given-names']} {one['family-names']}" for one in paper["authors"]
+        ]
+        cited[paper["notes"]] = f"{', '.join(authors)}, {paper['title']}"
+    assert cited.keys() == catalogue().keys()
+    for id, text in cited.items():
+        assert catalogue()[id].paper_source.startswith(text)
 
 
 def test_every_command_of_the_workflow_exists():
