@@ -12,7 +12,7 @@ Measurements may come from a mixture: most have the stated deviations, a fitted 
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy
@@ -280,13 +280,13 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
     return H
 
 
-class _Place(NamedTuple):
-    """Where a point of a profile lies."""
+class _Way(NamedTuple):
+    """Values of one parameter from the best one towards a limit, at which its profile was computed."""
 
-    parameter: int
-    sign: float
-    distance: float
-    """From the best value of that parameter."""
+    distances: list[float]
+    """From the best value."""
+    drops: list[float]
+    """Nats below the maximum at each."""
 
 
 def fit_profiles(
@@ -320,28 +320,23 @@ def _search_profiles(
     deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
     profiles = {}
     for i, name in enumerate(tunable.limits):
-        places: list[_Place] = []
-        drops: list[float] = []
+        ways = []
         for sign in (-1.0, 1.0):
-            first = _Place(i, sign, float(deviation[i]))
-            walked, lower, point = _walk_profile(likelihood, limits, found, best, first, stop)
-            if stop and lower and lower[-1] < -HIGHER:
+            way, point = _walk_profile(likelihood, limits, found, best, (i, sign * float(deviation[i])), stop)
+            if stop and way.drops and way.drops[-1] < -HIGHER:
                 return {}, point
-            places, drops = [*places, *walked], [*drops, *lower]
-        profiles[name] = _profile(best[i], i, places, numpy.array(drops))
+            ways.append(way)
+        profiles[name] = _profile(best[i], *ways)
     return profiles, None
 
 
-def _profile(best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray) -> Profile:
-    """Put the places at which a parameter was held in order, with the best one, and find its interval."""
-    (low, open_low), (high, open_high) = (
-        _profile_end(places, drops, parameter, sign) for sign in (-1.0, 1.0)
-    )
-    mine = [k for k, place in enumerate(places) if place.parameter == parameter]
-    values = numpy.array([*(best + places[k].sign * places[k].distance for k in mine), best])
-    order = numpy.argsort(values)
+def _profile(best: float, below: _Way, above: _Way) -> Profile:
+    """Put the values at which a parameter was held in order, with the best one, and find its interval."""
+    (low, open_low), (high, open_high) = _profile_end(below), _profile_end(above)
+    values = numpy.array([*(best - d for d in below.distances), *(best + d for d in above.distances), best])
+    drops, order = numpy.array([*below.drops, *above.drops, 0.0]), numpy.argsort(values)
     interval = Interval(float(best - low), float(best + high), open_low, open_high)
-    return Profile(values[order], numpy.append(drops[mine], 0.0)[order], interval)
+    return Profile(values[order], drops[order], interval)
 
 
 def _walk_profile(
@@ -349,22 +344,21 @@ def _walk_profile(
     limits: numpy.ndarray,
     found: Fit,
     best: numpy.ndarray,
-    first: _Place,
+    first: tuple[int, float],
     stop: bool,
-) -> tuple[list[_Place], list[float], numpy.ndarray]:
-    """Places on the way to a limit, up to where the likelihood has fallen far enough, how far it has at each, and the
-    last point; with ``stop`` no further than a point that is likelier than the fit. The way goes past ``first``, a
-    standard deviation away.
+) -> tuple[_Way, numpy.ndarray]:
+    """The way to a limit, up to where the likelihood has fallen far enough, and its last point; with ``stop`` no
+    further than a point that is likelier than the fit. It goes past ``first``, the number of the parameter and a
+    standard deviation of it up or down.
     """
     from scipy.optimize import minimize
 
-    parameter, sign, deviation = first
+    parameter, deviation = first
+    sign = math.copysign(1.0, deviation)
     room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
     others = numpy.delete(numpy.arange(len(best)), parameter)
-    places: list[_Place] = []
-    drops: list[float] = []
-    point = best.copy()
-    for distance in [*(d for d in numpy.array(STEPS) * deviation if d < room), room]:
+    way, point = _Way([], []), best.copy()
+    for distance in [*(d for d in numpy.array(STEPS) * abs(deviation) if d < room), room]:
         point[parameter] = best[parameter] + sign * distance
 
         def objective(values: numpy.ndarray) -> tuple[float, numpy.ndarray]:
@@ -385,11 +379,11 @@ def _walk_profile(
             options={"maxiter": 20, "ftol": 1e-7},
         )
         point[others] = end.x
-        places.append(_Place(parameter, sign, float(distance)))
-        drops.append(found.log_likelihood + float(end.fun))
-        if drops[-1] > DROP or (stop and drops[-1] < -HIGHER):
+        way.distances.append(float(distance))
+        way.drops.append(found.log_likelihood + float(end.fun))
+        if way.drops[-1] > DROP or (stop and way.drops[-1] < -HIGHER):
             break
-    return places, drops, point
+    return way, point
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
@@ -403,14 +397,11 @@ def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: nump
     return information
 
 
-def _profile_end(
-    places: Sequence[_Place], drops: numpy.ndarray, parameter: int, sign: float
-) -> tuple[float, bool]:
+def _profile_end(way: _Way) -> tuple[float, bool]:
     """Distance at which the likelihood has fallen far enough, and whether it has not done so at the limit."""
-    mine = [k for k, place in enumerate(places) if (place.parameter, place.sign) == (parameter, sign)]
-    distances = [0.0, *(places[k].distance for k in mine)]
+    distances = [0.0, *way.distances]
     # A drop grows with the square of the distance: it is interpolated in its root.
-    roots = [0.0, *numpy.sqrt(numpy.clip(drops[mine], 0.0, None)).tolist()]
+    roots = [0.0, *numpy.sqrt(numpy.clip(way.drops, 0.0, None)).tolist()]
     for k in range(1, len(roots)):
         if roots[k] > math.sqrt(DROP):
             share = (math.sqrt(DROP) - roots[k - 1]) / (roots[k] - roots[k - 1])

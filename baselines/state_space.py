@@ -3,8 +3,8 @@ filter that is told the true model.
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -16,6 +16,7 @@ from ..envs.linear.state_space import Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, unscented
+from ..filters.array_namespace import namespace, select_nested
 from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
@@ -78,8 +79,91 @@ def _numbers(measurement: Measurement, xp: Any) -> Array:
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
 
+class Past(NamedTuple):
+    """A measurement that something may still come for."""
+
+    measurement: Measurement
+    truth: Any
+    """What a reference was told with it; None for everyone else."""
+    happened: Array
+    """Whether there was one, and not only the start, ``(N,)``."""
+
+
+class Buffered(NamedTuple):
+    """A filter with the last measurements, which are taken in again when one of them is supplied late."""
+
+    now: Any
+    """State of the filter after all that has come."""
+    settled: Any
+    """State before the oldest measurement that is kept."""
+    past: tuple[Past, ...]
+    """The measurements since, the oldest first, as many as one may come late."""
+
+    @property
+    def mean(self) -> Array:
+        """Of the filter."""
+        mean: Array = self.now.mean
+        return mean
+
+    @property
+    def covariance(self) -> Array:
+        """Of its error."""
+        covariance: Array = self.now.covariance
+        return covariance
+
+    @property
+    def likelihood(self) -> Likelihood:
+        """Of the last measurement, as it was predicted with all that had come."""
+        likelihood: Likelihood = self.now.likelihood
+        return likelihood
+
+
+def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
+    """The start of a filter, with an empty buffer where something may come late."""
+    if not task.parameters.late:
+        return begun
+    own, none = task.definition, 0.0 * begun.mean[0]
+    zeros = lambda rows: task.xp.stack([none] * rows)  # noqa: E731
+    m = own.filters[0].h.size
+    empty = Measurement(
+        zeros(m),
+        zeros(m),
+        none + task.parameters.sampling_interval if own.filters[0].timed else None,
+        zeros(len(own.inputs)) if own.inputs else None,
+    )
+    past = Past(empty, truth, none > 0.0)
+    return Buffered(begun, begun, (past,) * task.parameters.lateness)
+
+
+def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], truth: Any = None) -> Any:
+    """Take a measurement in; where something comes late with it, that first, where it belongs, and again what followed.
+
+    Args:
+        state: of the filter, or a :class:`Buffered` one.
+        measurement: that has come.
+        step: from the filter's state and a :class:`Past` to the state after it.
+        truth: what else a step is told of it.
+    """
+    if not isinstance(state, Buffered):
+        return step(state, Past(measurement, truth, None))
+    xp = namespace(measurement.available)
+    (oldest, *others), late = state.past, measurement.late_available
+    assert late is not None
+    first = oldest.measurement
+    both = xp.where(late > 0.0, measurement.late, _numbers(first, xp)), xp.maximum(first.available, late)
+    oldest = oldest._replace(measurement=first._replace(values=both[0], available=both[1]))
+    alone = measurement._replace(late=None, late_available=None)
+    past = (*others, Past(alone, truth, late[0] >= 0.0))
+    settled = select_nested(oldest.happened, step(state.settled, oldest), state.settled)
+    now = settled
+    for one in past[:-1]:
+        now = select_nested(one.happened, step(now, one), now)
+    return Buffered(step(now, past[-1]), settled, past)
+
+
 class Extended(Filter[StateSpace, Measurement, Track]):
-    """The Kalman filter as written, extended where the model is not linear, as an estimator.
+    """The Kalman filter as written, extended where the model is not linear, as an estimator. What comes late is
+    taken in where it belongs.
 
     Args:
         task: the problem.
@@ -101,13 +185,18 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
-        return Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        begun = Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        return _buffer(self.task, begun)
 
-    def update(self, state: Track, given: Input) -> Track:
+    def update(self, state: Any, given: Input) -> Any:
         """Predict and update."""
-        measurement = given.measurement
+        return _in_order(state, given.measurement, self.take)
+
+    def take(self, state: Track, one: Past) -> Track:
+        """Predict to a measurement and take it in."""
+        measurement = one.measurement
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
         result = _update(self.equations, mean, carried + Q, self.R, measurement, self.xp)
@@ -131,13 +220,13 @@ class Unscented(Extended):
         usual = task.definition.usual_noise(task.parameters.sampling_interval)
         self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> Any:
         """Start where everyone starts, nowhere certain."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
-    def update(self, state: Track, given: Input) -> Track:
-        """Predict and update by sigma points."""
-        measurement = given.measurement
+    def take(self, state: Track, one: Past) -> Track:
+        """Predict to a measurement and take it in by sigma points."""
+        measurement = one.measurement
         mean, spread = unscented.transform(
             state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
         )
@@ -163,7 +252,7 @@ class Unscented(Extended):
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 
-class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
+class InteractingKalman(Filter[StateSpace, Measurement, Any]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
     def __init__(
@@ -173,19 +262,24 @@ class InteractingKalman(Filter[StateSpace, Measurement, Mixture]):
         factors = process_noise, measurement_noise
         self.bank = HypothesisBank(task, "evidence", *factors, *_split(task, noises))
 
-    def start(self, initial: Initial) -> Mixture:
+    def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
-        return self.bank.start(initial)
+        return _buffer(self.task, self.bank.start(initial))
 
-    def update(self, state: Mixture, given: Input) -> Mixture:
+    def update(self, state: Any, given: Input) -> Any:
         """Predict and update, without evidence."""
-        measurement = given.measurement._replace(values=_numbers(given.measurement, self.xp))
+        return _in_order(state, given.measurement, self.take)
+
+    def take(self, state: Mixture, one: Past) -> Mixture:
+        """Predict to a measurement and take it in."""
+        measurement = one.measurement._replace(values=_numbers(one.measurement, self.xp))
         predicted = self.bank.predict(state, measurement)
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 
-    def records(self, state: Mixture, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
         """How likely the measurement was."""
-        return {"log_likelihood": self.bank.records(state, measurement)["log_likelihood"]}
+        own = state.now if isinstance(state, Buffered) else state
+        return {"log_likelihood": self.bank.records(own, measurement)["log_likelihood"]}
 
 
 class KnownModel:
@@ -200,18 +294,29 @@ class KnownModel:
     def __init__(self, task: StateSpace) -> None:
         self.task, self.xp = task, task.xp
 
-    def start(self, initial: Initial, truth: Truth) -> Track:
+    def start(self, initial: Initial, truth: Truth) -> Any:
         """Start where everyone starts."""
-        return Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        begun = Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        return _buffer(self.task, begun, self._told(truth))
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: Track
-    ) -> tuple[Array, Array, Track, Likelihood]:
+        self, measurement: Measurement, truth: Truth, memory: Any
+    ) -> tuple[Array, Array, Any, Likelihood]:
         """Predict and update with the model in force."""
-        xp, chosen = self.xp, None
+        after = _in_order(memory, measurement, self.take, self._told(truth))
+        return after.mean, after.covariance, after, after.likelihood
+
+    @staticmethod
+    def _told(truth: Truth) -> Truth:
+        """What is needed of it."""
+        return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
+
+    def take(self, state: Track, one: Past) -> Track:
+        """Predict to a measurement and take it in."""
+        (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
         for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
-            mean, carried = equations.carry(memory.mean, memory.covariance, measurement)
+            mean, carried = equations.carry(state.mean, state.covariance, measurement)
             P = carried + truth.process_noise * equations.process_noise(mean, measurement)
             R = truth.measurement_noise * equations.R[:, :, None]
             result = _update(equations, mean, P, R, measurement, xp)
@@ -222,8 +327,7 @@ class KnownModel:
                 else kalman.Update(*(xp.where(held, a, b) for a, b in zip(result, chosen, strict=True)))
             )
         assert chosen is not None
-        likelihood = _likelihood(chosen, measurement.available, xp)
-        return chosen.mean, chosen.covariance, Track(chosen.mean, chosen.covariance, likelihood), likelihood
+        return Track(chosen.mean, chosen.covariance, _likelihood(chosen, measurement.available, xp))
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -6,7 +6,6 @@ import pytest
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from filtergym.evaluation.running.seeds import episode_seeds
 from models import make_model
 
 import filtergym
@@ -197,14 +196,6 @@ def test_a_recording_that_is_no_path():
     for path in (None, 3, [None], {}):
         with pytest.raises(ValueError, match="files are named by a path or a pattern"):
             filtergym.read_recording(path)
-
-
-def test_splits_and_seeds_share_no_episode():
-    drawn = [
-        s for split in ("train", "validation", "test") for n in (0, 1) for s in episode_seeds(split, n, 500)
-    ]
-    assert len(set(drawn)) == 3000
-    assert episode_seeds("test", 0, 5, first=3) == episode_seeds("test", 0, 8)[3:]
 
 
 @pytest.mark.parametrize(

@@ -136,8 +136,13 @@ def test_data_sets_are_loaded_back_by_minari(env_id, short, minari):
 
 
 def test_random_actions_go_with_the_policy_before_them(minari):
-    from filtergym.offline import write_datasets
+    from filtergym.offline import default_policies, write_datasets
 
+    paper = baselines_of(ENV).score_paper
+    assert [paper in default_policies(problem_of(ENV), control) for control in (None, "gain")] == [
+        True,
+        False,
+    ]
     _, tuned, random = write_datasets(ENV, episodes=2, horizon=5)
     assert tuned.environment == random.environment
     assert tuned.environment["gains"] == competitor(ENV, tuned.policy).task_keywords["gains"]
@@ -149,14 +154,17 @@ def test_random_actions_go_with_the_policy_before_them(minari):
     assert scores == [1.0, 1.0]
 
 
-def test_more_episodes_than_are_flown_at_once(minari, monkeypatch):
+def test_more_episodes_than_are_flown_at_once(minari, monkeypatch, tmp_path):
     from filtergym import offline
 
     whole = offline.write_datasets(ENV, ["random"], episodes=7, horizon=4, namespace="mine/whole")
+    [space, *_] = sorted((tmp_path / "datasets").rglob("namespace_metadata.json"))
+    space.write_text('{"description": "the user\'s own"}')
     monkeypatch.setattr(offline, "CHUNK", 3)
     parts = offline.write_datasets(ENV, ["random"], episodes=7, horizon=4, namespace="mine/parts")
     one, other = (minari.load_dataset(entry.name) for [entry] in (whole, parts))
     assert one.total_episodes == other.total_episodes == 7
+    assert "own" in space.read_text()  # also where others are written beside it
     for left, right in zip(one, other, strict=True):
         np.testing.assert_array_equal(left.observations, right.observations)
         np.testing.assert_array_equal(left.actions, right.actions)

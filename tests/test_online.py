@@ -571,6 +571,8 @@ def test_wrong_arguments_get_one_sentence():
             filter.start(STATE, COVARIANCE, tracks=value if value is not np.inf else "x")
         with pytest.raises(ValueError, match=r"time must be|each of the two|values are given"):
             filter.start_from({"time": value, "x": 1e4, "y": 2e4}, value)
+    with pytest.raises(ValueError, match="each of the two measurements needs its time"):
+        filter.start_from({"time": 0.0, "x": 1e4, "y": 2e4}, {"x": 1e4, "y": 2e4})
     for what in ("regular", "control", "backend", "tracks"):
         with pytest.raises(ValueError, match=f"{what}"):
             filtergym.online(RADAR, "imm", **{what: np.eye(2)})

@@ -119,14 +119,9 @@ def test_episodes_of_different_lengths_end_where_they_do(tmp_path):
     assert make_model(TARGET, scenario=read, horizon=5).task.flights == (5, 5, 4)
     assert make_model(TARGET, scenario=read, decision_interval=3).task.flights == (12, 6, 3)
     env = gym.make(TARGET, scenario=read, context=True)
-    for seed in range(4):
-        _, info = env.reset(seed=seed)
-        steps, over = 0, False
-        while not over:
-            shown, _, _, over, _ = env.step(env.action_space.sample())
-            steps += 1
-        assert steps == lengths[int(info["context"]["recording"])]
-        assert np.isfinite(shown).all()
+    _, info = env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[3] for _ in range(lengths[int(info["context"]["recording"])])]
+    assert ends == [False] * (len(ends) - 1) + [True]
 
 
 def test_flights_and_user_keywords_go_with_a_recording():

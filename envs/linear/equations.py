@@ -145,6 +145,11 @@ class Measurement(NamedTuple):
     """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
     inputs: Array | None = None
     """What is told of the inputs that acted in that time, ``(p, N)``; None where the model has none."""
+    late: Array | None = None
+    """What comes now and is of ``lateness`` measurements ago, ``(m, N)``, zero where nothing does; None where nothing
+    comes late."""
+    late_available: Array | None = None
+    """1 where such a value has come, 0 where not, ``(m, N)``; likewise None."""
 
 
 class Passage(NamedTuple):

@@ -18,7 +18,15 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""
-OF_EPISODES = ("horizon", "decision_interval", "jitter", "process_noise", "measurement_noise", "availability")
+OF_EPISODES = (
+    "horizon",
+    "decision_interval",
+    "jitter",
+    "process_noise",
+    "measurement_noise",
+    "availability",
+    "late",
+)
 """Parameters of a simulation, which a log has not."""
 
 

@@ -54,6 +54,10 @@ class StateSpaceParameters(TaskParameters):
     """Measurements in a gap, on average."""
     bias: float = parameter(0.0, at_least=0.0)
     """Offset of one sensor, up or down, in standard deviations of its noise."""
+    late: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Probability that what a sensor says comes late, of each sensor."""
+    lateness: int = parameter(3, at_least=1, at_most=20)
+    """Measurements after its own with which it then comes."""
     noise_decades: float = parameter(2.0, above=0.0)
     """Decades by which an action of one scales Q or R (control ``noise``)."""
     gain_factor: float = parameter(4.0, above=1.0)
@@ -77,6 +81,9 @@ class Truth(NamedTuple):
     """Inputs that acted since the measurement before, ``(p, N)``; None where the model has none."""
     sensors: SensorStates | None = None
     """Where the sensors stand; None where nothing is to be remembered."""
+    waiting: Array | None = None
+    """What is under way, values and where there are any, the oldest first, ``(lateness, 2, m, N)``; None where nothing
+    comes late."""
 
 
 class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
@@ -108,7 +115,9 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.loses = self.parameters.availability < 1.0
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
         self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
-        self.row_uniforms = self.drawn + self.receptions.row_uniforms
+        self.delayed = self.drawn + self.receptions.row_uniforms
+        self.delays = self.parameters.late > 0.0
+        self.row_uniforms = self.delayed + len(own.channels) * self.delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
         self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
@@ -132,8 +141,11 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         covariance = self.task.constant(own.covariance)[:, :, None] + zero
         state = mean + apply(self.initial_root[:, :, None], normals[: self.states])
         inputs = self.courses.begin(normals[self.states :])
-        sensors = self.receptions.begin(draws, zero)
-        truth = Truth(state, first, process, measurement, inputs, sensors)
+        sensors, waiting = self.receptions.begin(draws, zero), None
+        if self.delays:
+            nothing = self.xp.stack([self.xp.stack([zero] * (self.noises - self.states))] * 2)
+            waiting = self.xp.stack([nothing] * self.parameters.lateness)
+        truth = Truth(state, first, process, measurement, inputs, sensors, waiting)
         return truth, Initial(mean, covariance)
 
     def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
@@ -163,7 +175,26 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
         )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
-        return truth, Measurement(*self._receive(truth, values, (here, due)), interval, told)
+        received = Measurement(*self._receive(truth, values, (here, due)), interval, told)
+        return self._delay(truth, received, uniforms[self.delayed :]) if self.delays else (truth, received)
+
+    def _delay(self, truth: Truth, received: Measurement, uniforms: Array) -> tuple[Truth, Measurement]:
+        """Hold back what comes late, and hand over what was held back.
+
+        Args:
+            truth: at this measurement, with what is under way from those before.
+            received: all that the sensors say of it.
+            uniforms: of each sensor, ``(sensors, N)``.
+        """
+        xp, rows = self.xp, []
+        for place, channel in enumerate(self.task.definition.channels):
+            rows += [xp.where(uniforms[place] < self.parameters.late, 1.0, 0.0)] * channel.size
+        held, waiting = xp.stack(rows), truth.waiting
+        assert waiting is not None
+        kept = xp.stack([held * received.values, held * received.available])
+        truth = truth._replace(waiting=xp.concat([waiting[1:], kept[None]]))
+        in_time = (1.0 - held) * received.values, (1.0 - held) * received.available
+        return truth, Measurement(*in_time, received.interval, received.inputs, *waiting[0])
 
     def _receive(self, truth: Truth, values: Array, here: Sequence[Array | None]) -> tuple[Array, Array]:
         """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
@@ -356,6 +387,7 @@ def state_space_attributes(
         "noisy": ("ten times the measurement noise", {"measurement_noise": (10.0, 10.0)}),
         "gaps": ("gaps of ten measurements on average, a third of the time", {"gaps": 0.05}),
         "biased": ("one sensor is off by three standard deviations", {"bias": 3.0}),
+        "late": ("a third of what the sensors say comes three measurements late", {"late": 1.0 / 3.0}),
     }
     if definition.world[0].timed:
         held_out["jitter"] = ("intervals from a tenth to 1.9 times the usual", {"jitter": 0.9})

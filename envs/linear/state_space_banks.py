@@ -62,9 +62,11 @@ class Track(NamedTuple):
     """Exponential average of log(1 + nis / degrees), ``(N,)``."""
     action: Array
     """Applied to the last measurement, ``(A, N)``."""
+    correction: Array | None = None
+    """Of the state by the last update, in deviations of the process noise, ``(n, N)``; None where none sees it."""
 
 
-class KalmanBank(Bank[StateSpace, Measurement, Any]):
+class KalmanBank(Bank[StateSpace, Measurement, Track]):
     """What the banks with one filter share."""
 
     parameters: StateSpaceParameters
@@ -102,7 +104,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
             Block("last_action", lambda f, _: f.action, "action applied before", self.answers, ACTION),
         )
 
-    def start(self, initial: Initial) -> Any:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
         zero = 0.0 * initial.mean[0]
         return Track(
@@ -123,12 +125,12 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
         """Likewise of the measurement."""
         return self.equations.R[:, :, None]
 
-    def predict(self, state: Any, measurement: Measurement) -> Any:
+    def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict, and compare under the noises of the last action."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
-    def compare(self, state: Any, measurement: Measurement) -> Any:
+    def compare(self, state: Track, measurement: Measurement) -> Track:
         """What is known of the measurement as it was predicted."""
         xp = self.xp
         received = self.received(state, measurement, state.action)
@@ -146,11 +148,11 @@ class KalmanBank(Bank[StateSpace, Measurement, Any]):
             average=state.average + weight * (xp.log1p(share) - state.average),
         )
 
-    def received(self, state: Any, measurement: Measurement, action: Array) -> Received:
+    def received(self, state: Track, measurement: Measurement, action: Array) -> Received:
         """What was received, under the noises of an action."""
         return self.equations.receive(measurement, state.mean, self.sensor_noise(action))
 
-    def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: Track, measurement: Measurement) -> dict[str, Array]:
         """How likely the measurement was; NaN where nothing was received."""
         degrees = ordered_sum(measurement.available)
         there = degrees > 0.0
@@ -204,20 +206,6 @@ class GainBank(KalmanBank):
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
-class KalmanNetTrack(NamedTuple):
-    """As :class:`Track`, with what a network sees of the state."""
-
-    mean: Array
-    covariance: Array
-    innovation: Array
-    nis: Array
-    log_likelihood: Array
-    average: Array
-    action: Array
-    correction: Array
-    """Of the state by the last update, in deviations of the process noise, ``(n, N)``."""
-
-
 class KalmanNetBank(KalmanBank):
     r"""The filter inside the learned estimator ``kalman-net``: a network sets noises, gain and motion.
 
@@ -255,7 +243,7 @@ class KalmanNetBank(KalmanBank):
         names = names if len(names) > 1 else ()
         xp = self.xp
 
-        def spread(f: KalmanNetTrack, _: Measurement) -> Array:
+        def spread(f: Track, _: Measurement) -> Array:
             variances = xp.stack([f.covariance[i, i] for i in range(self.states)])
             return 0.5 * xp.log(1e-12 + variances * self.scales**2)
 
@@ -274,9 +262,9 @@ class KalmanNetBank(KalmanBank):
             Block("spread", spread, "deviation of the state, likewise", names, KEPT_AS_LOG),
         )
 
-    def start(self, initial: Initial) -> KalmanNetTrack:
+    def start(self, initial: Initial) -> Track:
         """Start where everyone starts."""
-        return KalmanNetTrack(**super().start(initial)._asdict(), correction=0.0 * initial.mean)
+        return super().start(initial)._replace(correction=0.0 * initial.mean)
 
     def _part(self, action: Array, place: int) -> Array:
         """Entries of an action: process, sensor, agility, caution, offset."""
@@ -298,13 +286,13 @@ class KalmanNetBank(KalmanBank):
         matrix = matrix[:, :, None] if matrix.ndim == 2 else matrix
         return outer(scale, scale) * matrix
 
-    def predict(self, state: KalmanNetTrack, measurement: Measurement) -> KalmanNetTrack:
+    def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict with the offset that was answered, and compare."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
-    def act(self, state: KalmanNetTrack, measurement: Measurement, action: Array) -> KalmanNetTrack:
+    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
         """Update as the network answers."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)

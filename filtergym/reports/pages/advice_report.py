@@ -5,7 +5,7 @@ Time in pictures is in seconds since the first row of the log.
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy
 import xarray
@@ -25,6 +25,7 @@ from ..tables.advice import (
     parameter_size,
     parameter_text,
     price_rows,
+    reading_lines,
     verdict,
 )
 from ..tables.results import Settings
@@ -39,13 +40,6 @@ WINDOWS_OF_NIS = 40
 SHORTEST_WINDOW = 10
 DIGITS = 6
 ROLES = {"fitted": "fitted to", "chosen": "chosen by", "judged": "judged by"}
-
-
-class LogFacts(NamedTuple):
-    """What a log holds, and what was found in it."""
-
-    facts: list[tuple[str, str]]
-    notes: tuple[str, ...]
 
 
 def advice_html(
@@ -79,7 +73,8 @@ def advice_html(
         has_truth=advice.recording.truth is not None,
         rival=advice.rival,
         diverging=advice.diverging,
-        log=_log_facts(advice, task),
+        log=list(_log_lines(advice)),
+        noted=bool(advice.recording.notes),
         settings=settings,
         figures=pack(
             {
@@ -108,53 +103,18 @@ def _parameters(advice: Advice, name: str) -> Iterator[tuple[str, ParameterText]
         yield parameter_name(key), parameter_text(key, value, interval, tunable, key in found.at_limit)
 
 
-def _log_facts(advice: Advice, task: Task) -> LogFacts:
-    """Count what is in the log."""
-    recording, share = advice.recording, advice.share
-    total = int(recording.rows.sum())
-    steps = numpy.diff(recording.seconds, axis=1)
-    steps = steps[numpy.isfinite(steps)]
-    duration = float(numpy.nansum(numpy.nanmax(recording.seconds, axis=1) + recording.started))
-    facts = [("measurements after the start of the track", f"{total:,}"), ("duration", f"{duration:,.6g} s")]
-    if len(recording.names) > 1:
-        facts.insert(0, ("tracks", f"{len(recording.names):,}"))
-    available = recording.measurements.get("available")
-    if len(steps):
-        # Where missed scans have a row, the longest interval between rows says nothing: the longest gap does.
-        longest = "" if available is not None else f", {steps.max():.4g} s at most"
-        facts.append(("interval", f"{numpy.median(steps):.4g} s in the median{longest}"))
-    if available is not None:
-        there = numpy.isfinite(recording.seconds)
-        missed = there & ~(available > 0.0)
-        facts.append(
-            ("without a measurement", f"{missed.sum():,} ({100.0 * missed.sum() / there.sum():.1f} %)")
-        )
-        facts.append(
-            ("longest time between measurements", f"{_longest_gap(recording.seconds, available):.4g} s")
-        )
-    facts += [
-        (name.replace("_", " "), f"{value:g}, as the log states it")
-        for name, value in recording.typical.items()
-    ]
-    facts.append(("truth", "in the log" if recording.truth is not None else "none"))
+def _log_lines(advice: Advice) -> Iterator[str]:
+    """What was read, and which part of it served for what."""
+    yield from reading_lines(advice.recording)
+    share = advice.share
     counts = [
         sum(span.last - span.first for span in spans) for spans in (share.fitted, share.chosen, share.judged)
     ]
-    facts.append(
-        (
-            "measurements that are fitted, that choose, that judge",
-            " / ".join(f"{count:,}" for count in counts),
-        )
+    yield (
+        "Measurements that are fitted, that choose, that judge: {:,} / {:,} / {:,}.".format(*counts)
         if share.apart
-        else ("use of them", "too few to be shared out: all are fitted, choose and judge")
+        else "Too few measurements to be shared out: all are fitted, choose and judge."
     )
-    return LogFacts(facts, recording.notes)
-
-
-def _longest_gap(seconds: numpy.ndarray, available: numpy.ndarray) -> float:
-    """Longest time from one measurement to the next, s."""
-    times = [each[there > 0.0] for each, there in zip(seconds, available, strict=True)]
-    return max((float(numpy.nanmax(numpy.diff(each))) for each in times if len(each) > 1), default=0.0)
 
 
 # --- pictures
