@@ -243,7 +243,7 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
         lambda place: save_checkpoint(model, env, normalisation, place),
         lambda place: save_agent(policy, run, place),
     )
-    with interruption() as stop:
+    with contextlib.closing(logger), interruption() as stop:
         books = Bookkeeping(run, session, trainee, stop, curves_beside(logger), began)
         trainer = _Trainer(books, session.progress)
         remaining = run.steps - model.num_timesteps
