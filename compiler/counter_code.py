@@ -246,5 +246,10 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     for array in arrays:
         table += [address_of(array), array.strides[0] // array.itemsize]
     table += [normals, len(rows) - normals]
-    code = Code(lambda: native_text(llvm_text(block_for(processor()[1]))))
-    return Call(code, numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
+    text = llvm_text(block_for(processor()[1]))
+    return Call(
+        Code(functools.partial(native_text, text)),
+        numpy.array(table, dtype=numpy.int64),
+        arrays,
+        numpy.empty(0),
+    )
