@@ -205,8 +205,9 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
 
 
 def test_shares_are_apart_and_are_all(tmp_path):
-    recording = read(write_log(tmp_path))
+    recording = read(write_log(tmp_path, count=962))
     share = share_out(recording)
+    assert len(share.judged) == 6  # one in four of the blocks of forty measurements
     taken = np.zeros(int(recording.rows[0]), dtype=int)
     for spans in (share.fitted, share.chosen, share.judged):
         for span in spans:
