@@ -205,8 +205,9 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
 
 
 def test_shares_are_apart_and_are_all(tmp_path):
-    recording = read(write_log(tmp_path))
+    recording = read(write_log(tmp_path, count=962))
     share = share_out(recording)
+    assert len(share.judged) == 6  # one in four of the blocks of forty measurements
     taken = np.zeros(int(recording.rows[0]), dtype=int)
     for spans in (share.fitted, share.chosen, share.judged):
         for span in spans:
@@ -294,6 +295,11 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path):
         path.write_text(json.dumps(table | change))
         with pytest.raises(ValueError, match=message):
             read_artefact(path, PROBLEM)
+    # A policy steers a control, which no log has.
+    uav = problem_of("filtergym/UavAutopilot-v0")
+    path.write_text(json.dumps(table | {"environment": uav.id, "filter": "fixed-best"}))
+    with pytest.raises(ValueError, match="has no filter 'fixed-best' that can be fitted"):
+        read_artefact(path, uav)
 
 
 @pytest.fixture

@@ -467,6 +467,7 @@ def test_the_best_agent_is_kept_and_when_the_paper_was_beaten_is_noted(tmp_path)
     assert 0.0 < noted["seconds"] <= run.seconds
     beaten = ["better than imm for the first time" in line for line in lines]
     assert beaten == [False, False, True, False, False]
+    assert lines[1].endswith("imm 1, difference -10.0 % (-30.0 % to +10.0 %)")
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "kalman-net"])

@@ -234,6 +234,7 @@ def test_list_names_everything(run):
         *("knows when every manoeuvre begins and ends", "knows the acceleration in every scan"),
     ):
         assert word in shown
+    assert shown.count("(default)") == 2  # one control, one scenario
 
 
 def test_doctor_says_what_an_issue_needs(run, monkeypatch):

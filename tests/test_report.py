@@ -225,6 +225,7 @@ def test_no_number_is_cut_at_any_width(width, result, command_console):
         r for r in result.records if (r.metric, r.window, r.component) == ("rmse", "all", "position")
     )
     assert (with_interval(position) in text) == (width != 100)
+    assert ("shows the intervals of the RMSE" in tables[-1].caption) == (width == 100)
 
 
 @pytest.fixture

@@ -283,6 +283,8 @@ def test_the_command_prints_a_line_each_and_writes_both_files(command, tmp_path,
     found = json.loads(written[0].read_text())
     assert [one["alteration"] for one in found] == [*(one.name for one in SHORT[:3]), "restore", "long-run"]
     assert code == int(any(one["verdict"] == "failed" for one in found))
+    # Where nothing is altered, the error itself is a ratio to the reference's.
+    assert [one["reference_error"] is None for one in found[:3]] == [True, False, False]
     for one in found:
         assert f"{one['alteration']}" in printed
     page = written[1].read_text()
