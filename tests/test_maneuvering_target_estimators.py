@@ -20,6 +20,7 @@ from filtergym.baselines.maneuvering_target.estimators import (
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
+from filtergym.envs.maneuvering_target.semi_markov import TRAINING
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 from models import begin, make_model, next_row, watch_estimator
@@ -272,6 +273,12 @@ def test_untuned_values_are_those_in_force():
         assert found == pytest.approx(expected, rel=1e-9), name
         made = maker.func if isinstance(maker, Variant) else maker
         assert isinstance(untuned(make_model(ID, None, "random").task), made)
+
+
+def test_the_tunable_semi_markov_filter_begins_with_its_prior(model):
+    tunable = baselines_of(ID).tunable["semi-markov"]
+    found = tunable.apply(tunable.start)[1](model.task).prior
+    assert np.hstack(found) == pytest.approx(np.hstack(TRAINING), rel=1e-12)
 
 
 # --- the reference
