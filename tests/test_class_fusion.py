@@ -80,6 +80,7 @@ def test_identity_is_a_bank_of_kalman_filters(seed):
     rng = numpy.random.default_rng(seed)
     N, scans = 8, 60
     channels = class_fusion.design_channels(MODELS, START, scans)
+    assert {part.shape[-1] for part in channels} == {scans + 1}
     mean = numpy.zeros((3, 3, N)) + numpy.array([1e3, -5.0, 0.0])[:, None, None]
     general, general_covariance = mean, START[..., None] + numpy.zeros(N)
     P = Q = numpy.full((3, N), 1 / 3)

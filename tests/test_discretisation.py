@@ -133,6 +133,17 @@ def test_the_filter_is_that_of_the_discretised_model(make, backend):
         np.testing.assert_allclose(kept[-1][3][:, :, lane], P, rtol=1e-12, atol=1e-12)
 
 
+def test_a_linear_drift_moves_by_the_exponential(make):
+    """With input and constant force; of a measurement with a deviation of 1e8 nothing is learned."""
+    drift = lambda x, u: [x[1], -4.0 * x[0] - 0.5 * x[1] + 2.0 * u[0] + 0.3]  # noqa: E731
+    start, ((_, m, mean, *_),) = simulate(make(drift=drift, R=[[1e16]]), 1, 8, jitter=0.9)
+    held = np.array([[0.0, 1.0, 0.0, 0.0], [-4.0, -0.5, 2.0, 0.3], [0.0] * 4, [0.0] * 4])
+    for lane in range(8):
+        before = [*start.measurement.mean[:, lane], m.inputs[0, lane], 1.0]
+        expected = scipy.linalg.expm(held * m.interval[lane]) @ before
+        np.testing.assert_allclose(mean[:, lane], expected[:2], atol=1e-7)
+
+
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [

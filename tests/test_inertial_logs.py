@@ -118,6 +118,9 @@ def test_alignment_finds_attitude_and_bias(pyins):
     assert found.start["roll"] == pytest.approx(1.0, abs=0.01)
     assert found.start["pitch"] == pytest.approx(2.0, abs=0.01)
     assert found.start["heading"] == pytest.approx(0.0, abs=0.1)
+    # The same where the first course is 34 degrees, 3 s into the circle; a sample of the rates is 0.3 degrees.
+    late = strapdown.align(inertial, fixes[(fixes.index < 10.5) | (fixes.index > 18.0)])
+    assert late.start["heading"] == pytest.approx(0.0, abs=0.6)
     # What is left of the rates before the motion is the rotation of the Earth, 15 degrees an hour.
     still = found.increments[found.increments.index < drive.standstill]
     left = (still[["theta_x", "theta_y", "theta_z"]].sum() / still["dt"].sum()).to_numpy()

@@ -232,6 +232,12 @@ def test_detection_of_made_up_faults():
     np.testing.assert_array_equal((~np.isnan(found["false"])).sum(axis=1), [10, 10, 5, 30])
 
 
+def test_alarms_under_jamming_are_not_false():
+    """Of a jamming that raises alarms before any of its errors is so large that it counts as an outlier."""
+    records = tidy_records(evaluate(ID, ["augmented"], "jamming", episodes=8, jamming_factor=(3.0, 3.0)))
+    assert next(r.value for r in records if r.metric == "false_alarms") == 0.0
+
+
 def test_records_name_the_position():
     records = tidy_records(evaluate(ID, ["plain-reduced"], "paper", episodes=16, axes=2))
     rmse = {r.component for r in records if r.metric == "rmse"}

@@ -17,13 +17,16 @@ from filtergym.baselines.maneuvering_target.estimators import (
     KalmanTurnInteractingMultipleModel,
     UnscentedTurn,
 )
+from filtergym.baselines.maneuvering_target.log_families import ConstantAcceleration
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.baselines.tuning import Candidate, episode_costs
+from filtergym.envs.maneuvering_target.semi_markov import TRAINING
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 from models import begin, make_model, next_row, watch_estimator
 from naive import transition
+from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate, tidy_records
@@ -256,6 +259,21 @@ def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(model):
     compare(model, VariationalBayesPrediction(model.task, acceleration, tau), track)
 
 
+def test_constant_acceleration_equals_naive_loops(model):
+    jerk, acceleration = 0.2, 1.5
+
+    def track(x, P):
+        x, P = np.append(x, [0.0, 0.0]), block_diag(P, acceleration**2 * np.eye(2))
+        z, R, dt = yield
+        while True:
+            F = np.kron([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]], np.eye(2))
+            g = np.kron([[dt**3 / 6], [dt**2 / 2], [dt]], np.eye(2))
+            x, P, _ = kalman_update(F @ x, F @ P @ F.T + jerk**2 * g @ g.T, z, R, np.eye(2, 6))
+            z, R, dt = yield x[:4], P[:4, :4]
+
+    compare(model, ConstantAcceleration(model.task, jerk, acceleration), track)
+
+
 @pytest.mark.slow
 def test_untuned_values_are_those_in_force():
     known = baselines_of(ID)
@@ -272,6 +290,12 @@ def test_untuned_values_are_those_in_force():
         assert found == pytest.approx(expected, rel=1e-9), name
         made = maker.func if isinstance(maker, Variant) else maker
         assert isinstance(untuned(make_model(ID, None, "random").task), made)
+
+
+def test_the_tunable_semi_markov_filter_begins_with_its_prior(model):
+    tunable = baselines_of(ID).tunable["semi-markov"]
+    found = tunable.apply(tunable.start)[1](model.task).prior
+    assert np.hstack(found) == pytest.approx(np.hstack(TRAINING), rel=1e-12)
 
 
 # --- the reference
