@@ -76,6 +76,7 @@ def pytest_runtest_teardown(item, nextitem):
     """Forget what was traced for one file before the next, where that has grown large."""
     if nextitem is None or nextitem.path == item.path or _resident() < max(LARGEST, _remained[0] + GROWN):
         return
+    compiled._make_once.cache_clear()
     compiled._trace_once.cache_clear()
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
