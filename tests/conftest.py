@@ -11,6 +11,7 @@ import importlib
 import os
 import re
 import resource
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -149,6 +150,9 @@ def _random_actions():
 @pytest.fixture
 def command(monkeypatch, capsys):
     """Run the command line; returns exit code, output and errors."""
+    # As the command finds modules: not where the tests were started, where a reader may have written README's mine.py.
+    root = str(Path(__file__).parent.parent)
+    monkeypatch.setattr("sys.path", [place for place in sys.path if place != root])
 
     def run(*words, program=main):
         monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
