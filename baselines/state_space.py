@@ -4,6 +4,7 @@ filter that is told the true model.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy
@@ -232,23 +233,17 @@ class Unscented(Extended):
         )
         spread = spread + self.equations.input_noise(state.mean, measurement)
         Q = self.process_noise(mean, measurement)
-        own = self.equations
-        z, near = _numbers(measurement, self.xp), own.measure(mean, measurement)
-
-        def h(x: Array) -> Array:
-            return own.measure(x, measurement)
-
-        def h_near(x: Array) -> Array:
-            """Measurements of sigma points, angles near that of the mean."""
-            return near[:, None] + own.subtract(h(x), near[:, None])
-
-        if own.wraps:
-            z = near + own.subtract(z, near)
+        own, P = self.equations, spread + Q
+        z, h, points = (
+            _numbers(measurement, self.xp),
+            partial(own.measure, passed=measurement),
+            unscented.GAUSSIAN,
+        )
+        if own.periods:
+            z, h, points = own.unwrap(z, mean, P, measurement)
         R = own.measured_noise(self.R, mean, measurement)
         gates = own.within_gates if own.gated else None
-        result = unscented_update(
-            mean, spread + Q, z, h_near if own.wraps else h, R, measurement.available, gates
-        )
+        result = unscented_update(mean, P, z, h, R, measurement.available, gates, points)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 

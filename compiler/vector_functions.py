@@ -41,6 +41,7 @@ class VectorFunction:
         given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
+        linear_rows: places in the value whose row of the Jacobian is the same everywhere.
 
     Raises:
         NotTraceable: if the function is no straight line of arithmetic.
@@ -68,6 +69,9 @@ class VectorFunction:
         self._value = _program(graph, answer.nodes.tolist())
         self._jacobian = _program(graph, nodes)
         known = [graph.values[node] for node in nodes]
+        self.linear_rows = frozenset(
+            row for row in range(self.size) if None not in known[row * size : (row + 1) * size]
+        )
         self.matrix = self.offset = None
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)

@@ -19,7 +19,7 @@ from .gaussian import log_density
 from .kalman import Update
 from .ordered_sums import ordered_sum
 from .small_matrices import apply, mirror_lower, product, solve_definite, transpose
-from .unscented import transform
+from .unscented import GAUSSIAN, Spread, transform
 
 
 class Received(NamedTuple):
@@ -97,6 +97,7 @@ def unscented_update(
     R: Array,
     available: Array,
     within_gates: Callable[[Array, Array], Array] | None = None,
+    spread: Spread = GAUSSIAN,
 ) -> Update:
     """Measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
     Proceedings of the IEEE 92 (2004), 401-422.
@@ -110,11 +111,12 @@ def unscented_update(
         available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
         within_gates: from innovation ``(m, N)`` and its covariance to 1 for entries that are taken in, else 0,
             ``(m, N)``; the likelihood counts the others all the same. None: all are.
+        spread: parameters of the transform.
     """
     xp = namespace(mean)
     n = mean.shape[0]
     R = R[..., None] if R.ndim == 2 else R
-    joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]))
+    joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
     nu = available * (z - joint[n:])
     S = _independent(spread_out[n:, n:] + R, available)
     cross = available[:, None] * spread_out[n:, :n]

@@ -9,24 +9,28 @@ r"""The scaled unscented transform: mean and covariance of a function of a Gauss
 
 S. J. Julier, The scaled unscented transformation, Proc. American Control Conference (2002), 4555-4559; E. A. Wan and
 R. van der Merwe, The unscented Kalman filter, chapter 7 of S. Haykin, Kalman Filtering and Neural Networks (2001).
-With alpha = 1 and kappa = 0 no weight is negative, so the covariance cannot lose its definiteness.
+With alpha = 1 and kappa = 0 no weight is negative. With differences d_i = f(X_i) - f(X_0) and their weighted mean s,
+
+    P_y = sum W_i d_i d_i^T + (beta - alpha^2) s s^T          (i > 0, kappa = 0)
+
+so P_y stays positive semidefinite for every alpha up to sqrt(beta).
 
 Shapes: means ``(n, ...)``, covariances ``(n, n, ...)``, batch last.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .array_namespace import Array, namespace
 from .ordered_sums import ordered_sum
-from .small_matrices import cholesky, outer
+from .small_matrices import apply, cholesky, outer
 
 
 class Spread(NamedTuple):
     """Parameters of the transform."""
 
-    alpha: float = 1.0
-    """How far the points lie from the mean."""
+    alpha: float | Array = 1.0
+    """How far the points lie from the mean; a number, or one of each lane, ``(...)``."""
     beta: float = 2.0
     """What is known of the fourth moments; 2 is best for a Gaussian variable."""
     kappa: float = 0.0
@@ -54,7 +58,7 @@ def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> A
     )
 
 
-def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[float], list[float]]:
+def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
     """Weights of the points for the mean and for the covariance, 2n + 1 each.
 
     Args:
@@ -65,6 +69,27 @@ def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[float], list[float]
     others = [0.5 / total] * (2 * n)
     first = (total - n) / total
     return [first, *others], [first + 1.0 - spread.alpha**2 + spread.beta, *others]
+
+
+def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
+    """Spread whose sigma points move a function of the mean by no more than a limit, to first order.
+
+    The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are measured
+    up to whole turns, so points that move one by half a turn or more have no difference of known sign.
+
+    Args:
+        jacobian: rows H of the function at the mean, ``(m, n, ...)``.
+        covariance: ``(n, n, ...)``.
+        limit: greatest difference of a row.
+    """
+    n, xp = covariance.shape[0], namespace(covariance)
+    variances = [
+        ordered_sum(row * apply(covariance, row)) for row in (jacobian[i] for i in range(jacobian.shape[0]))
+    ]
+    alpha = 1.0
+    for variance in variances:
+        alpha = xp.minimum(alpha, limit / xp.sqrt(xp.maximum(n * variance, limit**2)))
+    return Spread(alpha)
 
 
 def transform(

@@ -3,6 +3,10 @@
 import numpy as np
 import pytest
 from filtergym.filters.unscented import Spread, sigma_points, transform, weights
+from own_models import make_models
+
+import filtergym
+from filtergym import Sensor
 
 SPREADS = [Spread(), Spread(0.5, 2.0, 0.0), Spread(1.0, 0.0, -2.0), Spread(1e-3, 2.0, 0.0)]
 
@@ -54,3 +58,62 @@ def test_moments_of_linear_and_quadratic_functions_are_exact(spread):
     squares, _ = transform(mean, covariance, lambda x: x * x, spread)
     variances = np.stack([covariance[i, i] for i in range(5)])
     np.testing.assert_allclose(squares, mean**2 + variances, rtol=1e3 * tolerance)
+
+
+@pytest.fixture
+def make():
+    yield from make_models({})
+
+
+@pytest.fixture
+def updated(make):
+    """Update of an unscented filter of n states that stand still by an angle."""
+
+    def update(n, h, mean, covariance, R, z):
+        cls = make(
+            f=lambda x: [x[i] for i in range(n)],
+            Q=(1e-15 * np.eye(n)).tolist(),
+            sensors={
+                "angle": Sensor(h, R=R, wraps="rad"),
+                "curve": Sensor(lambda x: [np.sin(x[n - 1])], R=1.0),
+            },
+            mean=mean,
+            covariance=covariance,
+        )
+        filter = filtergym.online(cls.id, "unscented")
+        filter.start(mean=mean, covariance=covariance)
+        return filter.update(angle=z)
+
+    return update
+
+
+@pytest.mark.parametrize("n", [2, 4, 9])
+@pytest.mark.parametrize("variance", [1e-4, 1.0, (np.pi / 2) ** 2, 10.0, 100.0])
+def test_a_heading_is_updated_right_at_any_spread(updated, n, variance):
+    """Beside the product of prior and likelihood in the turn that is nearest to the prior mean."""
+    mean, covariance, R = np.r_[0.5, np.zeros(n - 1)], np.diag([variance, *[0.01] * (n - 1)]), 0.04
+    expected = 1.0 / (1.0 / variance + 1.0 / R) * (0.5 / variance + 1.5 / R)
+    circle = lambda x: [np.arctan2(np.sin(x[0]), np.cos(x[0]))]  # noqa: E731
+    for h in ([[1.0] + [0.0] * (n - 1)], circle):
+        for turns in (-2, 0, 1):
+            estimate = updated(n, h, mean, covariance, R, 1.5 + turns * 2.0 * np.pi)
+            # The process noise adds 1e-15, and sin and cos of a few rad round at 1e-16.
+            np.testing.assert_allclose(estimate.mean[0], expected, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(estimate.covariance[0, 0], 1.0 / (1.0 / variance + 1.0 / R), rtol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1.0, 3.0, 10.0, 30.0])
+@pytest.mark.parametrize("variance", [1e-2, 1.0, 10.0, 100.0])
+def test_a_bearing_at_any_spread_leaves_an_honest_covariance(updated, distance, variance):
+    """Beside 400,000 weighted particles, whose mean has an error far below the deviations compared here."""
+    mean, covariance = np.array([distance, 0.3]), variance * np.eye(2)
+    estimate = updated(2, lambda x: [np.arctan2(x[1], x[0])], mean, covariance, 0.01, 0.4)
+    particles = mean + np.sqrt(variance) * np.random.default_rng(0).normal(size=(400_000, 2))
+    nu = (0.4 - np.arctan2(particles[:, 1], particles[:, 0]) + np.pi) % (2.0 * np.pi) - np.pi
+    weights = np.exp(-0.5 * nu**2 / 0.01)
+    errors = particles - estimate.mean
+    nees = np.average(
+        np.einsum("ki,ij,kj->k", errors, np.linalg.inv(estimate.covariance), errors), weights=weights
+    )
+    assert nees < 3.0  # 2 of an exact Gaussian posterior; the prior of a wide one is cut to a wedge
+    assert np.trace(estimate.covariance) <= np.trace(covariance) * (1.0 + 1e-9)

@@ -12,7 +12,7 @@ input, too, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: that this err
 same one, G N D^T, is left out.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +22,7 @@ from ...compiler.vector_functions import VectorFunction
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import product, transpose
+from ...filters.unscented import GAUSSIAN, Spread, narrow
 from ..contract.observation import Array
 from .inputs import Input
 from .sensors import Channel
@@ -159,6 +160,8 @@ class Passage(NamedTuple):
     inputs: Array | None
 
 
+QUARTER = 0.25
+"""Of a turn, by which sigma points may move an angle: half of what has a nearest turn."""
 Passed = Measurement | Passage
 """What says how a state moved since the measurement before."""
 
@@ -180,7 +183,7 @@ class Equations:
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
         self.channels = task.definition.channels
-        self.wraps = any(channel.period for channel in self.channels)
+        self.periods = {row: one.period for one in self.channels if one.period for row in one.numbers}
         self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
@@ -286,19 +289,43 @@ class Equations:
 
     def subtract(self, z: Array, predicted: Array) -> Array:
         """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
-        nu = z - predicted
-        if not self.wraps:
-            return nu
-        rows = []
-        for channel in self.channels:
-            for place in channel.numbers:
-                turns = (
-                    0.0
-                    if channel.period is None
-                    else channel.period * self.xp.round(nu[place] / channel.period)
-                )
-                rows.append(nu[place] - turns)
+        return self._shorten(z - predicted, self.periods)
+
+    def _shorten(self, difference: Array, periods: Mapping[int, float]) -> Array:
+        """Difference ``(m, ...)`` with whole turns taken off some of its rows, by the periods of these."""
+        if not periods:
+            return difference
+        rows = [difference[row] for row in range(difference.shape[0])]
+        for row, period in periods.items():
+            rows[row] = rows[row] - period * self.xp.round(rows[row] / period)
         return self.xp.stack(rows)
+
+    def unwrap(
+        self, z: Array, mean: Array, covariance: Array, passed: Passed
+    ) -> tuple[Array, Callable[[Array], Array], Spread]:
+        """Measurement, function and sigma points of a transform that sees angles without their turns.
+
+        A linear row has no turns to take off. Of another row each point keeps the turn nearest to the mean's, and the
+        points lie close enough for that turn to be the right one.
+
+        Args:
+            z: measurement, ``(m, N)``.
+            mean: predicted state, ``(n, N)``.
+            covariance: of it, ``(n, n, N)``.
+            passed: what went on until then.
+        """
+        near = self.measure(mean, passed)
+        folded = {row: turn for row, turn in self.periods.items() if row not in self.model.h.linear_rows}
+
+        def measure(x: Array) -> Array:
+            return near[:, None] + self._shorten(self.measure(x, passed) - near[:, None], folded)
+
+        spread = GAUSSIAN
+        if folded:
+            H = self.measurement_matrix(mean, passed)
+            turns = self.xp.stack([H[row] / turn for row, turn in folded.items()])
+            spread = narrow(turns, covariance, QUARTER)
+        return near + self.subtract(z, near), measure, spread
 
     def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.

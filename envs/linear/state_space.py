@@ -207,7 +207,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         available = 1.0 + 0.0 * values
         if truth.sensors is not None and truth.sensors.bias is not None:
             values = values + truth.sensors.bias
-        if self.equations[0].wraps:
+        if self.equations[0].periods:
             values = self.equations[0].subtract(values, 0.0 * values)
         for part in here:
             if part is not None:
