@@ -225,7 +225,7 @@ def test_a_change_moves_the_weight_to_its_class():
     agile = weights[:, 2, to_agile].mean(axis=1)
     # Scans 30 and 80: 5 s before the change and 20 s after it.
     assert agile[29] < 0.2
-    assert agile[79] > 0.8
+    assert agile[79] > 0.75  # silences leave the share of targets that never change
 
 
 def test_ideal_is_consistent_where_errors_are_coloured_correlated_and_glint():

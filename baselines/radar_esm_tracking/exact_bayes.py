@@ -66,7 +66,7 @@ class ClassPrior(NamedTuple):
     sides: int = 3
     """Points of it on either side."""
     calm: float = 1.0 / 6.0
-    """Probability of a target without silences, change of class and second emitter."""
+    """Probability of a target without change of class and second emitter."""
     outliers: float = 0.0
     """Probability of an outlier of the radar."""
     outlier_factor: float = 5.0
@@ -170,11 +170,12 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
         q, f, g = prior.second_emitter, prior.silence_start, prior.silence_end
         share = (1.0 - prior.calm) / (len(q) * len(f) * len(g))
         rates = [(*point, share) for point in itertools.product(q, f, g)]
-        if prior.calm:
-            rates.append((0.0, 0.0, 1.0, prior.calm))
+        silences = list(itertools.product(f, g)) if prior.calm else []
+        rates += [(0.0, *point, prior.calm / len(silences)) for point in silences]
         grid = emitters.surroundings(task.types, prior.separation, prior.sides, rates)
         self.start_table = task.constant(emitters.start_table(grid, int(used.sum())))
-        disturbed = (grid.silence_start > 0.0) | (grid.second_emitter > 0.0)
+        disturbed = numpy.ones_like(grid.weight, dtype=bool)
+        disturbed[len(disturbed) - len(silences) * task.types :] = False
         self.disturbed = task.constant(disturbed.astype(float))
         self.by_type = [numpy.flatnonzero(grid.other_type == i).tolist() for i in range(task.types)]
         self.disturbed_by_type = [[v for v in points if disturbed[v, 0]] for points in self.by_type]

@@ -29,9 +29,10 @@ class Step(NamedTuple):
 
 
 def undisturbed(draws: Draws, parameters: Any) -> Array | None:
-    """Return whether nothing goes wrong in an episode, booleans ``(N,)``; None where no episode is like that.
+    """Draw which episodes have no hidden disturbance, booleans ``(N,)``; None where no episode is like that.
 
-    It is drawn where it is asked for first.
+    The first call takes a random number. Disturbances that a measurement reports are drawn in these episodes by the
+    same law as in all others, so that no report shows whether an episode is one of them.
 
     Args:
         draws: what fixes the scenario of each episode.
@@ -93,11 +94,13 @@ class Disturbance(ABC):
         return state
 
     def quiet(self, state: Any, calm: Array) -> Any:
-        """Return the state of :meth:`complete` as it is in an episode in which nothing goes wrong.
+        """Return the state of :meth:`complete` for episodes without hidden disturbances.
+
+        A disturbance that the measurement reports leaves its state as it is, see :func:`undisturbed`.
 
         Args:
             state: at the start of the track.
-            calm: where the episode is like that, booleans ``(N,)``.
+            calm: which episodes have no hidden disturbance, booleans ``(N,)``.
         """
         return state
 
@@ -194,7 +197,7 @@ class Disturbances:
         return {part.name: states[part.name] for part in self.parts}
 
     def quiet(self, states: dict[str, Any], calm: Array | None) -> dict[str, Any]:
-        """States as they are where nothing goes wrong, see :func:`undisturbed`."""
+        """States with no hidden disturbance in some episodes, see :func:`undisturbed`."""
         if calm is None:
             return states
         return {part.name: part.quiet(states[part.name], calm) for part in self.parts}

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
 from ..contract.draws import Draws, draw_between
-from ..contract.faults import Colour, ColouredErrors, Disturbance, Outliers, Step, undisturbed
+from ..contract.faults import Colour, ColouredErrors, Disturbance, Outliers, Step
 from ..contract.observation import Array
 from ..contract.schedules import Steps, within
 from ..contract.task import Task
@@ -74,9 +74,6 @@ class NoiseChanges(Disturbance):
         xp, p = self.xp, self.parameters
         factor = draws.log_uniform("receiver_factor", p.receiver_factor)
         changes = draws.integer("noise_changes", p.noise_changes)
-        calm = undisturbed(draws, p)
-        if calm is not None:
-            factor, changes = xp.where(calm, 1.0, factor), xp.where(calm, 0.0, changes)
         first, second = number_at(draws.uniform("change_start", p.change_start, 2), p)
         factors = [factor, *draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2)]
         unreported = draws.event("unreported", p.unreported, 2)
@@ -89,6 +86,10 @@ class NoiseChanges(Disturbance):
             reported.append(xp.where(silent, reported[-1], level))
         change = xp.stack([earlier, later])
         return Levels(xp.stack(levels), xp.stack(reported), change, levels[0], reported[0])
+
+    def quiet(self, state: Levels, calm: Array) -> Levels:
+        """The receiver reports its true noise; the law of its reports stays."""
+        return state._replace(true=self.xp.where(calm, state.reported, state.true))
 
     def advance(self, state: Levels, step: Step) -> Levels:
         """Take the levels of this measurement."""
@@ -176,10 +177,6 @@ class _Once(Disturbance):
         window = xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
         return Spell(window, zero, zero)
 
-    def quiet(self, state: Spell, calm: Array) -> Spell:
-        """Never."""
-        return state._replace(window=self.xp.where(calm, NEVER, state.window))
-
     def advance(self, state: Spell, step: Step) -> Spell:
         """Count."""
         return state._replace(number=step.number)
@@ -207,7 +204,15 @@ class Outage(_Once):
         return state, measurement._replace(fix=available * measurement.fix, available=available)
 
 
-class Jamming(_Once):
+class _Hidden(_Once):
+    """A disturbance that the measurement does not report."""
+
+    def quiet(self, state: Spell, calm: Array) -> Spell:
+        """Remove it."""
+        return state._replace(window=self.xp.where(calm, NEVER, state.window))
+
+
+class Jamming(_Hidden):
     """The noise of the receiver rises; nobody says so. Its strength is the standard deviation over that without."""
 
     name = "jamming"
@@ -230,7 +235,7 @@ class Jamming(_Once):
         return {**super().context(state), "jamming_gain": state.strength}
 
 
-class Spoofing(_Once):
+class Spoofing(_Hidden):
     """Every axis is pulled off; its strength is the rate, m/s."""
 
     name = "spoofing"

@@ -115,7 +115,8 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     which lasts for seconds."""
 
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode in which nothing fails and all noises are as modelled."""
+    """Probability of an episode in which the receiver reports its true noise, its errors are white, nothing jams or
+    spoofs it, and the INS is as modelled. Outages and reported changes of the noise have the law of other episodes."""
 
     averaging_measurements: float = parameter(25.0, above=0.0)
     """Time constant of the averages of innovations shown, measurements; ours: 0.25 s, the time constant of the

@@ -35,7 +35,7 @@ SCENARIOS: Mapping[str, Scenario] = {
             "Training distribution: a motion of the episode's own; "
             "drift, coloured and white noise from far less than modelled to three times it; "
             "receiver noise over a decade, with up to two changes, unreported half of the time, and a coloured error "
-            "beside it; outages, jamming and spoofing in some episodes each; in one of six nothing fails.",
+            "beside it; outages, jamming and spoofing in some episodes each; in one of six no hidden disturbance.",
             {
                 **_DRAWN,
                 "drift_factor": DOWN_TO_QUIET,

@@ -88,8 +88,7 @@ class ManeuveringTargetParameters(TaskParameters):
     gate_acceleration: float = parameter(3.0, at_least=0.0)
     """Standard deviation of an acceleration that the prediction of the gate allows for, m/s^2 (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode in which every scan sees the target, none comes early and no errors are coloured, where
-    others may (ours)."""
+    """Probability of an episode without coloured errors, where others have some (ours)."""
     unmodelled_acceleration: float = parameter(0.87, at_least=0.0, at_most=100.0)
     """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
     the covariance that control ``gain`` reports (ours)."""

@@ -95,9 +95,7 @@ class UnreliableScans(RegularScans):
         p, never = self.parameters, 0.0 * motion[0][0]
         seen = draws.uniform("detection_probability", p.detection_probability)
         jitter = draws.uniform("scan_jitter", p.scan_jitter)
-        calm = undisturbed(draws, p)
-        if calm is not None:
-            seen, jitter = self.xp.where(calm, 1.0, seen), self.xp.where(calm, 0.0, jitter)
+        undisturbed(draws, p)  # takes its random number here
         return Reliability(seen, jitter, never, never, *motion)
 
     def advance(

@@ -31,8 +31,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "random",
-            "Training distribution: any start, speed and course; up to three manoeuvres of any kind; in half of the "
-            "episodes scans miss the target and come early, from hardly ever to four of ten, and coloured errors of up "
+            "Training distribution: any start, speed and course; up to three manoeuvres of any kind; scans miss "
+            "the target, from hardly ever to four of ten, and come early; in half of the episodes coloured errors of up "
             "to half the deviation of the white ones are added to these.",
             {
                 "flight": "random",

@@ -117,8 +117,8 @@ class RadarEsmTrackingParameters(TaskParameters):
     """Limits of the correlation of the white errors of range and range rate, as of a pulse with frequency modulation,
     whose range shifts with the Doppler frequency; likewise (ours)."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode without silence, second emitter, change of class, and coloured and correlated radar
-    errors (ours)."""
+    """Probability of an episode without second emitter, change of class, and coloured and correlated radar errors
+    (ours). Silences have the law of other episodes."""
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ SCENARIOS: Mapping[str, Scenario] = {
             "random",
             "Training distribution: any range and speed, one type each, failed associations; silences from none to "
             "long ones, a second emitter heard up to six times of ten, a change of class in a third of the episodes, "
-            "coloured radar errors up to half of the white ones; in one of six nothing of these.",
+            "coloured radar errors up to half of the white ones; in one of six none of these but silences.",
             {
                 **_ANY_TARGET,
                 "radar_bearing_sigma": 1.5,

@@ -164,9 +164,10 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             change = xp.where(changes, change, self.never)
         calm = undisturbed(draws, p)
         if calm is not None:
-            silence_start, second_emitter = (xp.where(calm, 0.0, x) for x in (silence_start, second_emitter))
-            silence_end, change = xp.where(calm, 1.0, silence_end), xp.where(calm, self.never, change)
-            coloured, correlation = (xp.where(calm, 0.0, x) for x in (coloured, correlation))
+            change = xp.where(calm, self.never, change)
+            second_emitter, coloured, correlation = (
+                xp.where(calm, 0.0, x) for x in (second_emitter, coloured, correlation)
+            )
         wandering = GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp)
         acceleration = xp.take(self.acceleration_sigma, target_class, axis=0) * normals[0]
         truth = Truth(

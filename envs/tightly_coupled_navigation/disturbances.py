@@ -100,10 +100,6 @@ class _Once(_OfSatellites):
         """Draw which satellites it concerns: here none."""
         return None
 
-    def quiet(self, state: Fault, calm: Array) -> Fault:
-        """Never."""
-        return state._replace(window=self.xp.where(calm, -1.0, state.window))
-
     def advance(self, state: Fault, step: Step) -> Fault:
         """Look whether it happens."""
         happens = (step.number >= state.window[0]) & (step.number <= state.window[1])
@@ -122,7 +118,15 @@ class _Once(_OfSatellites):
         return {self.name: self.xp.where(window[1] >= window[0], window, -1.0)}
 
 
-class StuckAccelerometers(_Once):
+class _Hidden(_Once):
+    """A disturbance that the measurement does not report."""
+
+    def quiet(self, state: Fault, calm: Array) -> Fault:
+        """Remove it."""
+        return state._replace(window=self.xp.where(calm, -1.0, state.window))
+
+
+class StuckAccelerometers(_Hidden):
     """The accelerometers repeat their last reading, its own state, m/s^2, ``(3, N)``."""
 
     name, title = "stuck", "stick"
@@ -148,7 +152,7 @@ class StuckAccelerometers(_Once):
         return {**super().context(state), "stuck_now": state.now}
 
 
-class NoisyRate(_Once):
+class NoisyRate(_Hidden):
     """The rate of one satellite is noisier than stated, by a factor of its own, ``(N,)``."""
 
     name, title = "noisy", "rate_fault"
@@ -272,12 +276,9 @@ class Reflections(_OfSatellites):
     def complete(self, state: Reception, draws: Draws) -> Reception:
         """Draw whether the episode is between houses."""
         urban = _draw_share(draws, "urban", self.parameters, state.urban)
-        return self.quiet(state._replace(urban=urban), urban < 0.5)
-
-    def quiet(self, state: Reception, calm: Array) -> Reception:
-        """Open country."""
-        cn0 = self.xp.where(calm, self.parameters.clear_cn0, state.cn0)
-        return state._replace(urban=self.xp.where(calm, 0.0, state.urban), cn0=cn0)
+        return state._replace(
+            urban=urban, cn0=self.xp.where(urban < 0.5, self.parameters.clear_cn0, state.cn0)
+        )
 
     def advance(self, state: Reception, step: Step) -> Reception:
         """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now."""
@@ -325,7 +326,7 @@ def _draw_share(draws: Draws, name: str, parameters: Any, zero: Array) -> Array:
     return draws.xp.astype(draws.event(name, share), zero.dtype)
 
 
-class Ramp(_Once):
+class Ramp(_Hidden):
     """One pseudorange drifts off from some time to the end; its own state, by how much, ``(2, N)``, m: the bias with
     which that begins, and now.
     """
@@ -379,10 +380,6 @@ class Aperture(_OfSatellites):
     def complete(self, state: Array, draws: Draws) -> Array:
         """Draw whether they do."""
         return _draw_share(draws, "aperture", self.parameters, state)
-
-    def quiet(self, state: Array, calm: Array) -> Array:
-        """They do not."""
-        return self.xp.where(calm, 0.0, state)
 
     def change_measurement(self, state: Array, measurement: Any, step: Step) -> tuple[Array, Any]:
         """Take away what is too far from the state ``(17, N)`` that they expect."""

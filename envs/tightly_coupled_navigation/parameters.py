@@ -180,8 +180,8 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     pseudorange_correlation_time: tuple[float, float] = parameter((10.0, 10.0), above=0.0, ascending=True)
     """Limits of its correlation time, s. Ours."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode in which no sensor fails, with neither reception between houses nor apertures nor
-    coloured errors. Ours."""
+    """Probability of an episode without noisy rates, stuck accelerometers and coloured errors. Ours. Hidden satellites,
+    lost rates, reception between houses and apertures, which measurements show, have the law of other episodes."""
     urban: bool = False
     """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""

@@ -54,7 +54,7 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 "Training distribution: legs of rest, constant velocity and manoeuvre at random, or one manoeuvre "
                 "throughout, gentle to hard; a noisy rate channel, stuck accelerometers, lost rates or hidden "
                 "satellites for a while, reception between houses, tracking loops steered by the filter, each in some "
-                "episodes, and coloured errors of pseudoranges; in one of six nothing of these.",
+                "episodes, and coloured errors of pseudoranges; in one of six no hidden disturbance.",
                 {
                     "strength": (0.5, 40.0),
                     "manoeuvre_throughout": 0.15,

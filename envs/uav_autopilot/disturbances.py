@@ -125,10 +125,6 @@ class Dropouts(_OfSensors):
             stops.append(starts[-1] + length)
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
-    def quiet(self, state: Holds, calm: Array) -> Holds:
-        """None of them lasts."""
-        return state._replace(stops=self.xp.where(calm, state.starts, state.stops))
-
     def change_measurement(self, state: Holds, measurement: Any, step: Step) -> tuple[Holds, Any]:
         """Hold the last reading of each sensor that is out."""
         xp, available = self.xp, measurement.available

@@ -159,7 +159,8 @@ class UavAutopilotParameters(TaskParameters):
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
     """Range of their length in measurements. Ours: up to half a settling time."""
     undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability of an episode without dropouts in which all levels and factors are one. Ours."""
+    """Probability of an episode in which all levels and factors are one. Ours. Dropouts have the law of other
+    episodes."""
 
     gain_decades: float = parameter(0.5, above=0.0, at_most=4.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the

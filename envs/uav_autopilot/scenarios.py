@@ -41,7 +41,7 @@ SCENARIOS: Mapping[str, Scenario] = {
             "random",
             "Training distribution: steps and doublets of the command; gust level and sensor noise drawn for each "
             "episode and changing inside it, coloured errors of the sensors beside the white ones; short dropouts of "
-            "single sensors; in one of six nothing of these.",
+            "single sensors; in one of six all noise is white and nominal.",
             _RANDOM,
             {"steady": (50, 600)},
             training=True,
