@@ -11,7 +11,7 @@ from filtergym.evaluation.storage.blind import write_blind
 from filtergym.evaluation.storage.dataset import NO_ROW, notes_of
 from filtergym.evaluation.storage.estimates import write_estimates
 
-from filtergym import evaluate, record, tidy_records
+from filtergym import evaluate, read_recording, record, tidy_records
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SETTINGS = {"scenario": "irregular-scans", "episodes": 6, "horizon": 20, "detection_probability": (0.8, 0.8)}
@@ -161,3 +161,87 @@ def test_a_blind_recording_holds_all_that_is_received_and_no_truth(files, tmp_pa
     np.testing.assert_array_equal(start["mean_velocity_y"], recording.initial["mean"][:, 3])
     assert not [name for name in [*table, *start] if "truth" in name]
     assert b"truth" not in (tmp_path / "measurements.nc").read_bytes()
+
+
+START = 1_403_715_273_262_142_976
+"""ns since 1970, of a log at 20 Hz."""
+STAMPS = START + 50_000_000 * np.arange(60)
+CLOCKS = {
+    "seconds": lambda stamp: f"{stamp // 10**9}.{stamp % 10**9:09d}",
+    "ns": str,
+    "us": lambda stamp: str(stamp // 1000),
+    "ms": lambda stamp: str(stamp // 10**6),
+    "ISO": lambda stamp: f"{np.datetime64(int(stamp), 'ns')}Z",
+    "since the first": lambda stamp: f"{(stamp - START) / 1e9:.9f}",
+}
+
+
+def write_log(path, header, stamps, places, clock, separator=",", end=""):
+    lines = [
+        separator.join([CLOCKS[clock](int(stamp)), *(f"{value:.5f}" for value in place)]) + end
+        for stamp, place in zip(stamps, places, strict=True)
+    ]
+    path.write_text("\n".join([*header, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def timed(tmp_path_factory):
+    """Measurements and truth of a log, and the RMSE of a program that repeats the measurements."""
+    folder, time = tmp_path_factory.mktemp("times"), 0.05 * np.arange(60)
+    truth = 30.0 + np.column_stack([2.0 * np.cos(0.3 * time), 2.0 * np.sin(0.4 * time)])
+    seen = truth + np.random.default_rng(2).normal(0.0, 0.05, truth.shape)
+    both = np.column_stack([seen, truth])
+    columns = ["time,x,y,truth_position_x,truth_position_y"]
+    for clock in CLOCKS:
+        write_log(folder / f"{clock}.csv", columns, STAMPS, both, clock)
+    return folder, seen.round(5), truth.round(5)
+
+
+def error_of(folder, log, estimates):
+    found = evaluate(TARGET, f"file:{estimates}", scenario=read_recording(folder / f"{log}.csv", TARGET))
+    error = found["error"].values[0, 0, :, :2]
+    return error[np.isfinite(error).all(axis=1)]
+
+
+@pytest.mark.parametrize("log", ["seconds", "ns", "ISO"])
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("form", ["time", "log_time", "tum"])
+def test_times_of_another_program_are_found_by_the_time_of_the_log(timed, tmp_path, log, clock, form):
+    folder, seen, truth = timed
+    if form == "tum":
+        if clock == "ISO":
+            pytest.skip("a trajectory has numbers")
+        path = write_log(tmp_path / "mine.tum", [], STAMPS, seen, clock, " ", " 0 0 0 0 1")
+    else:
+        if (form, clock) == ("log_time", "since the first"):
+            pytest.skip("is no time of this log")
+        path = write_log(tmp_path / "mine.csv", [f"{form},position_x,position_y"], STAMPS, seen, clock)
+    # The track starts with the second row; five decimals of numbers near 30 m.
+    np.testing.assert_allclose(error_of(folder, log, path), (seen - truth)[2:], atol=1e-12)
+
+
+@pytest.mark.parametrize("log", ["seconds", "ns", "ISO", "since the first"])
+def test_a_trajectory_has_the_time_of_the_log(timed, tmp_path, log):
+    folder, _, _ = timed
+    recording = read_recording(folder / f"{log}.csv", TARGET)
+    whole = evaluate(TARGET, "kalman-imm-turn", scenario=recording, tracks=True)
+    write_estimates(tmp_path / "e.tum", whole)
+    (name,) = (each for each in (tmp_path / "e.tum").iterdir() if not each.name.startswith("truth"))
+    rows = np.loadtxt(name)
+    begin = 0.0 if log == "since the first" else START / 1e9
+    # A double of seconds since 1970 is right to 0.24 us.
+    np.testing.assert_allclose(rows[:, 0] - begin, 0.05 * np.arange(2, 2 + len(rows)), atol=5e-7)
+    np.testing.assert_allclose(
+        error_of(folder, log, name)[: len(rows)], whole["error"].values[0, 0, : len(rows), :2], atol=1e-8
+    )
+
+
+def test_estimates_of_another_clock_are_refused_with_both_spans(timed, tmp_path):
+    folder, seen, _ = timed
+    later = write_log(tmp_path / "later.csv", ["time,position_x,position_y"], STAMPS + 10**16, seen, "ns")
+    with pytest.raises(ValueError, match=r"0 % of the measurements .* 2014-10-19T.* log from 2014-06-25T"):
+        error_of(folder, "ns", later)
+    few = write_log(tmp_path / "few.csv", ["time,position_x,position_y"], STAMPS[:20], seen[:20], "ns")
+    with pytest.raises(ValueError, match=r"31 % of the measurements"):
+        error_of(folder, "seconds", few)

@@ -122,7 +122,7 @@ def test_scans_without_a_row_have_no_truth(tmp_path):
     log = aircraft()
     time = TIME + np.random.default_rng(1).uniform(-1.0, 1.0, COUNT)
     recording = read(log.assign(time=time).drop(index=range(20, 26)), tmp_path)
-    assert recording.notes == ("6 scans have no row: they missed the target",)
+    assert recording.notes == ("6 missed measurements: these have no row",)
     truth = recording.truth[0]
     assert np.isnan(truth).all(axis=1).nonzero()[0].tolist() == [*range(18, 24)]
     np.testing.assert_array_equal(truth[24:], log.iloc[26:, 5:].to_numpy())
@@ -312,7 +312,7 @@ def test_clocks_of_every_kind(tmp_path):
 @pytest.mark.parametrize(
     ("zone", "start", "sentence"),
     [
-        ("Europe/Paris", "2026-10-25T00:57:00Z", "time decreases between rows 35 and 36: .*, in UTC if the clock"),
+        ("Europe/Paris", "2026-10-25T00:57:00Z", "time decreases from .* in row 35 .* in UTC if the clock"),
         ("Europe/Paris", "2026-03-29T00:57:00Z", "3,605 s pass .* did the clock change, as in daylight saving"),
     ],
 )  # fmt: skip
@@ -397,3 +397,36 @@ def test_a_deviation_that_is_named_wins_and_several_logs_take_their_median(tmp_p
     assert read(untold(sigma_x=None, sigma_y=None), tmp_path).typical == {
         "range_sigma": pytest.approx(40.0, rel=0.1)
     }
+
+
+def test_positions_of_a_receiver_without_a_fix_are_no_measurements(tmp_path):
+    """At latitude 0 and longitude 0, where they would lie 5,000 km off; the first row of them is named."""
+    time = np.arange(40.0)
+    table = {"time": time, "latitude": 51.5 + 1e-4 * time, "longitude": -0.1 + 1e-4 * time}
+    pandas.DataFrame(table).to_csv(tmp_path / "all.csv", index=False)
+    for name in ("latitude", "longitude"):
+        table[name][[10, 30]] = 0.0
+    pandas.DataFrame(table).to_csv(tmp_path / "zero.csv", index=False)
+    whole, found = (read_recording(tmp_path / name, TARGET) for name in ("all.csv", "zero.csv"))
+    assert any("2 positions at latitude 0, longitude 0, the first in row 10" in note for note in found.notes)
+    available = found.measurements["available"][0]
+    np.testing.assert_array_equal(np.flatnonzero(available == 0.0), [8, 28])  # the track starts with row 1
+    there = available > 0.0
+    np.testing.assert_array_equal(
+        found.measurements["position"][0, there], whole.measurements["position"][0, there]
+    )
+
+
+@pytest.mark.parametrize(
+    ("times", "hint"),
+    [
+        ([0.0, 1.0, 3.0, 2.0, 4.0], "time decreases from 3 in row 2 to 2 in row 3: sort the rows by time$"),
+        ([4294967293, 4294967295, 1, 3, 5], "starts again: add 4294967296 to the times from row 2 on"),
+        ([4294967.1, 4294967.2, 0.004, 0.1, 0.2], "starts again: add 4294967.296 to the times from row 2 on"),
+    ],
+)
+def test_times_that_decrease_get_what_to_do(tmp_path, times, hint):
+    table = {"time": times, "x": np.arange(5.0), "y": np.arange(5.0)}
+    pandas.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(ValueError, match=hint):
+        read_recording(tmp_path / "log.csv", TARGET)

@@ -588,3 +588,25 @@ def test_policies_and_agents_say_where_they_are_lost():
     assert estimate.lost == estimate.departure == ["", ""]
     broken = {"mean": estimate.mean, "covariance": estimate.covariance * np.array([1.0, -1.0])}
     assert filter._estimate(np.zeros(2), broken).lost == ["", "the covariance is not positive definite"]
+
+
+def test_times_since_1970_are_of_the_unit_that_they_must_have():
+    """As in a recording; a nanosecond more or less is beyond the digits of seconds since 1970."""
+    start, mean, covariance = 1_403_715_273_262_142_976, [21e3, 30.5e3, -180.0, 40.0], 1600.0 * np.eye(4)
+
+    def run(times):
+        filter = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn")
+        filter.start(mean, covariance, time=times[0])
+        return [filter.update(time, x=21e3 - 720 * k, y=30.5e3) for k, time in enumerate(times[1:], 1)]
+
+    nanoseconds = [start + 4_000_000_000 * k for k in range(4)]
+    expected = run([4.0 * k for k in range(4)])
+    for unit in (1, 10**3, 10**6, 10**9):
+        found = run([ns // unit if unit < 10**9 else ns / 1e9 for ns in nanoseconds])
+        for one, other in zip(found, expected, strict=True):
+            # Milliseconds cut up to 0.9 ms of 4 s off, and the target flies 180 m/s.
+            np.testing.assert_allclose(one.mean, other.mean, atol=0.5 if unit == 10**6 else 1e-3)
+    filter = filtergym.online("filtergym/ManeuveringTarget-v0", "kalman-imm-turn")
+    filter.start(mean, covariance)
+    with pytest.raises(ValueError, match=r"is since 1970, and the last one, 0\.0 s, is not: start the track"):
+        filter.update(start, x=21e3, y=30.5e3)

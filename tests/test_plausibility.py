@@ -165,7 +165,7 @@ NOTED = [
 def test_what_is_noteworthy_is_said(env, columns, sentence, tmp_path):
     path = table(tmp_path / "log.csv", **columns)
     *others, note = further_notes(read_recording(path, env))
-    assert others == (["120 scans have no row: they missed the target"] if columns is LOST else [])
+    assert others == (["120 missed measurements: these have no row"] if columns is LOST else [])
     assert re.search(sentence, note), note
     again = table(tmp_path / "again.csv", **columns)
     assert f"again: {note}" in read_recording([path, again], env).notes

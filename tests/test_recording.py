@@ -441,7 +441,7 @@ def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
             "no column states deviations of x and y, assumed as positions scatter about their neighbours: "
         )
         assert read.notes == (
-            "c.csv: left out: time decreases between rows 1 and 2: rows must be in the order of their times",
+            "c.csv: left out: time decreases from 5 in row 1 to 4 in row 2: sort the rows by time",
             f"a: {assumed}sigma_x 121 m, sigma_y 121 m",
             f"b: {assumed}sigma_x 90.8 m, sigma_y 90.8 m",
             "d: left out: sampling_interval is 6.0, and of a 5.0",
@@ -475,7 +475,7 @@ WRONG = [
     (TARGET, changed(y=[1.0, 2.0, None, 4.0, 5.0]), "row 2 has one coordinate of two"),
     (TARGET, {"time": PLOTS["time"], "sigma_x": ONE, "sigma_y": ONE}, "needs x and y"),
     (TARGET, changed(x=["a", 1.0, 2.0, 3.0, 4.0]), "x has 'a' in row 0, which is no number"),
-    (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases between rows 1 and 2"),
+    (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases from 5 in row 1 to 4 in row 2"),
     (TARGET, changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]), "is the same in rows 1 and 2: 1 of 5 rows"),
     (TARGET, changed(time=None), "reads time and x, y"),
     (TARGET, {name: values[:2] for name, values in PLOTS.items()}, "it has 2 plots"),

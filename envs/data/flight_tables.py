@@ -68,6 +68,12 @@ CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)")
 OFFSET = r":\d{2}.*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
 """Of local time from UTC, at the end of a date."""
 DAY = 86400.0
+COUNTERS = (2.0**32, 2.0**32 / 1e3, 2.0**32 / 1e6)
+"""After which counters of 32 bits start again, in their unit, or in s of those of milli- and microseconds."""
+COUNTER_SHARE = 0.01
+"""Of such a time, that may lie between two rows."""
+SINCE_1970 = 1e8
+"""s, from which on a time in seconds is one since 1970: a log of three years begins with zero, a date after 1973."""
 UNITS: Mapping[str, tuple[str, ...]] = {
     "time": ("s", "second", "seconds", "sec"),
     "x": ("m", "metre", "metres", "meter", "meters"),
@@ -458,8 +464,35 @@ def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
         return "times of day", found.to_numpy()
     if not numpy.isfinite(found).all():
         raise ValueError(f"time has no value in row {found.isna().idxmax()}")
-    dates = unit > 1.0 or (len(found) > 0 and found.iloc[0] >= 1e8)
+    dates = unit > 1.0 or (len(found) > 0 and found.iloc[0] >= SINCE_1970)
     return "dates" if dates else "seconds", (found / unit).to_numpy()
+
+
+def check_order(time: numpy.ndarray) -> None:
+    """Raise ValueError for times that decrease, with both times and what to do.
+
+    Args:
+        time: s, ``(rows,)``.
+    """
+    steps = numpy.diff(time)
+    if (steps < 0.0).any():
+        row = int((steps < 0.0).argmax())
+        before, after = (numpy.format_float_positional(t, trim="-") for t in time[row : row + 2])
+        turn = next((turn for turn in COUNTERS if abs(steps[row] + turn) < COUNTER_SHARE * turn), None)
+        hint = "sort the rows by time"
+        if turn is not None:
+            hint = f"a counter that starts again: add {turn:.10g} to the times from row {row + 1} on"
+        elif steps[row] <= -1800.0 and (steps < 0.0).sum() <= 2:
+            hint += ", or write times in UTC if the clock was changed"
+        raise ValueError(f"time decreases from {before} in row {row} to {after} in row {row + 1}: {hint}")
+
+
+def time_unit(time: float) -> float:
+    """How many of a number's unit are a second: 1e9, 1e6 or 1e3 of a number that is too large for seconds since 1970.
+
+    1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
+    """
+    return next((unit for unit in (1e9, 1e6, 1e3) if time > SINCE_1970 * unit), 1.0)
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":
@@ -514,7 +547,4 @@ def _parse_times(values: "pandas.Series") -> tuple["pandas.Series", float]:
             raise ValueError(f"time has no value in row {values.isna().idxmax()}")
         return values, 1.0
     found = numbers("time", values)
-    first = found.iloc[0] if len(found) else 0.0
-    # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
-    unit = next((unit for unit in (1e9, 1e6, 1e3) if first > 1e8 * unit), 1.0)
-    return found, unit
+    return found, time_unit(found.iloc[0] if len(found) else 0.0)

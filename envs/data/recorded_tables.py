@@ -16,7 +16,16 @@ from ...filters.geodesy import PlaneOrigin
 from ..contract.live_input import LARGEST
 from ..contract.log_format import TrackLog
 from ..contract.task import Task
-from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, ColumnNames, list_names, numbers, read_table, seconds
+from .flight_tables import (
+    COLUMNS,
+    FLIGHT_SUFFIXES,
+    ColumnNames,
+    check_order,
+    list_names,
+    numbers,
+    read_table,
+    seconds,
+)
 from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
 from .recorded_world import measure_once
 from .recording import Recording, side_by_side
@@ -153,6 +162,7 @@ class Columns:
             for name in names:
                 if self.has(name):
                     raise ValueError(f"it has {name} and {latitude}: leave one of them out")
+            self._drop_null_positions(latitude, longitude)
             check_degrees(latitude, self[latitude], 90.0)
             check_degrees(longitude, self[longitude], 360.0)
             there = numpy.isfinite(self[latitude]) & numpy.isfinite(self[longitude])
@@ -176,6 +186,20 @@ class Columns:
             height = self[name] if self.has(name) else numpy.full(len(self.time), numpy.nan)
             found = usual.east_north(self[latitude], self[longitude], height)
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
+
+    def _drop_null_positions(self, latitude: str, longitude: str) -> None:
+        """Empty the positions at latitude 0 and longitude 0, which many receivers write without a fix."""
+        null = ((self.table[latitude] == 0.0) & (self.table[longitude] == 0.0)).to_numpy()
+        if not null.any():
+            return
+        self.table = self.table.assign(
+            **{name: self.table[name].mask(null) for name in (latitude, longitude)}
+        )
+        count = int(null.sum())
+        self.notes.append(
+            f"{count:,} position{'s' * (count > 1)} at {latitude} 0, {longitude} 0, the first in row {null.argmax()}: "
+            "a receiver without a fix, no measurement"
+        )
 
     def note_offset(self, plane: tuple[str, ...]) -> None:
         """Say which offset of its clock would bring the truth nearer to what was measured.
@@ -447,13 +471,7 @@ def _check_times(time: numpy.ndarray) -> None:
         raise ValueError(f"it has {len(time)} row{'s' * (len(time) != 1)}, and a recording needs several")
     if not numpy.isfinite(time).all():
         raise ValueError(f"time has no value in row {int((~numpy.isfinite(time)).argmax())}")
-    steps = numpy.diff(time)
-    if (steps < 0.0).any():
-        row = int((steps < 0.0).argmax())
-        hint = ", in UTC if the clock was changed" if steps[row] <= -1800.0 else ""
-        raise ValueError(
-            f"time decreases between rows {row} and {row + 1}: rows must be in the order of their times{hint}"
-        )
+    check_order(time)
 
 
 def _side_by_side(

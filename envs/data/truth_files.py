@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ..contract.log_format import LogFormat
-from .flight_tables import COLUMNS, clock_seconds, list_names, numbers, read_table
+from .flight_tables import COLUMNS, check_order, clock_seconds, list_names, numbers, read_table
 
 if TYPE_CHECKING:
     import pandas
@@ -76,9 +76,7 @@ def read_truth(
         )
     clock, time = clock_seconds(table[time_name])
     first = numpy.append(True, numpy.diff(time) != 0.0)
-    if (numpy.diff(time) < 0.0).any():
-        row = int(numpy.argmax(numpy.diff(time) < 0.0))
-        raise ValueError(f"time decreases between rows {row} and {row + 1}")
+    check_order(time)
     return TruthTable(clock, time[first], {name: values[first] for name, values in found.items()}, notes)
 
 

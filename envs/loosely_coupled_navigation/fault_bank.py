@@ -9,8 +9,8 @@ hypotheses share; it enters each filter as a Gaussian sum.
 Before each measurement, every ``spacing`` measurements, each hypothesis without a pull gives birth to one that is
 pulled from here on, in the place of the oldest. A pull ends with the hazard of a duration that is uniform between
 ``shortest`` and ``longest``; what ends is merged with the hypothesis of the same noises that knows of no pull, by its
-moments. What is as modelled is never pulled off: an undisturbed episode has no hidden disturbance, and a drift of the INS looks
-like a slow pull. So there are J + (J - 1) B filters.
+moments. What is as modelled is never pulled off: an undisturbed episode has no hidden
+disturbance, and a drift of the INS looks like a slow pull. So there are J + (J - 1) B filters.
 
 Reading: one pull and one chain of levels serve all axes, but the rate of the pull is estimated on each axis alone.
 

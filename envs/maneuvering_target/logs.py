@@ -177,7 +177,9 @@ def _stale_notes(stale: numpy.ndarray) -> tuple[str, ...]:
 def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
     count = int((rows < 0).sum())
     return (
-        (f"{count:,} scan{'s have' if count > 1 else ' has'} no row: they missed the target",)
+        (
+            f"{count:,} missed measurement{'s' * (count > 1)}: {'these have' if count > 1 else 'it has'} no row",
+        )
         if count
         else ()
     )
@@ -337,7 +339,7 @@ def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray
         gap = int(numpy.argmax(scans > LARGEST_GAP + 1))
         raise ValueError(
             f"{now[gap] - before[gap]:g} s lie between rows {first + gap} and {first + gap + 1}, {scans[gap] - 1:,} "
-            f"scans of {interval:g} s: cut it"
+            f"intervals of {interval:g} s: cut it"
         )
     step = numpy.repeat(numpy.arange(len(scans)), scans)
     number = numpy.arange(1, len(step) + 1) - (numpy.cumsum(scans) - scans)[step]

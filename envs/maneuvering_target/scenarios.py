@@ -32,8 +32,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario(
             "random",
             "Training distribution: any start, speed and course; up to three manoeuvres of any kind; scans miss "
-            "the target, from hardly ever to four of ten, and come early; in half of the episodes coloured errors of up "
-            "to half the deviation of the white ones are added to these.",
+            "the target, from hardly ever to four of ten, and come early; in half of the episodes coloured errors of "
+            "up to half the deviation of the white ones are added to these.",
             {
                 "flight": "random",
                 "detection_probability": (0.6, 1.0),

@@ -14,6 +14,7 @@ import numpy
 from ...envs.contract.filter import Filter, Input, Stated
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
+from ...envs.data.flight_tables import clock_seconds
 from ..storage.dataset import NO_ROW
 from ..storage.estimate_tables import EstimateTable, read_estimates
 
@@ -21,6 +22,8 @@ SAME_TIME = 1e-3
 """s, within which a row is of a measurement; at most a quarter of the time between two."""
 ENDED = 10
 """Sampling intervals after the last row of a track from which on it is lost: some programs answer less often."""
+LEAST_SHARE = 0.5
+"""Of the measurements, that must have a row: with fewer the times are of another clock, or of another log."""
 SHOWN = 5
 """Names of tracks in an error."""
 
@@ -81,28 +84,94 @@ class TrackEstimates(NamedTuple):
 
 
 def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, numpy.ndarray] | None:
-    """Times of the measurements of a recording by the clock of the estimates."""
-    import pandas
+    """Times of the measurements of a recording by the clock of the estimates, of each track.
 
-    from ...envs.data.flight_tables import clock_seconds
+    Seconds may count from the first measurement of the log, or be those of the log: the clock by which most
+    measurements have a row is taken.
+
+    Raises:
+        ValueError: if the estimates are of another clock, or fewer than half of the measurements have a row.
+    """
+    import pandas
 
     recording = task.recording
     if recording is None:
         if table.clock != "seconds":
             raise ValueError(f"the times of {name} are {table.clock}, and those of a simulation seconds")
+        _check_simulated(task, table, name)
         return None
-    times = recording.seconds + recording.started[:, None]
-    if table.clock == "seconds":
-        return dict(zip(recording.names, times, strict=True))
-    if recording.log_time is None:
-        raise ValueError(f"the times of {name} are {table.clock}, and {recording.name!r} knows seconds only")
-    found = {}
-    for track, rows, said in zip(recording.names, recording.rows, recording.log_time, strict=True):
-        clock, own = clock_seconds(pandas.Series(said[:rows]))
-        if clock != table.clock and table.clock != "log":
-            raise ValueError(f"the times of {name} are {table.clock}, and those of the log {clock}")
-        found[track] = own
-    return found
+    clocks: list[dict[str, numpy.ndarray]] = []
+    own_clock = "seconds"
+    if recording.log_time is not None:
+        found = [
+            (track, *clock_seconds(pandas.Series(written[:rows])))
+            for track, rows, written in zip(recording.names, recording.rows, recording.log_time, strict=True)
+        ]
+        own_clock = found[0][1]
+        clocks.append({track: time for track, _, time in found})
+    if table.clock in ("seconds", "log"):
+        # Of a log in seconds either may be meant; a file that names the time of the log means that.
+        since = recording.seconds + recording.started[:, None]
+        elapsed = {
+            track: time[:rows]
+            for track, time, rows in zip(recording.names, since, recording.rows, strict=True)
+        }
+        if table.clock == "log" and own_clock == "seconds" and clocks:
+            clocks.append(elapsed)
+        else:
+            clocks = [elapsed, *(clocks if own_clock == "seconds" else [])]
+    elif own_clock != table.clock:
+        raise ValueError(f"the times of {name} are {table.clock}, and those of the log {own_clock}")
+    tolerance = _tolerance(task)
+    shares = [_share_found(table, times, tolerance) for times in clocks]
+    best = int(numpy.argmax(shares))
+    if shares[best] < LEAST_SHARE:
+        raise ValueError(
+            f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, and "
+            f"{100.0 * LEAST_SHARE:.0f} % must: its times go from {_span([table.time], table.clock)}, those of the "
+            "log from "
+            + " or, since its first measurement, from ".join(
+                _span(list(times.values()), table.clock) for times in clocks
+            )
+        )
+    return clocks[best]
+
+
+def _tolerance(task: Task) -> float:
+    """Time within which a row is of a measurement, s."""
+    return min(SAME_TIME, 0.25 * _usual_interval(task))
+
+
+def _usual_interval(task: Task) -> float:
+    return getattr(task.parameters, "sampling_interval", None) or task.interval or 1.0
+
+
+def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
+    """Raise ValueError where most rows are beyond the episodes of a simulation."""
+    end = (task.horizon + 1) * _usual_interval(task)
+    if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
+        raise ValueError(
+            f"the times of {name} go from {_span([table.time], 'seconds')}, and those of an episode from 0 to {end:g} s"
+        )
+
+
+def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
+    """First and last time, in words."""
+    first, last = min(time.min() for time in times), max(time.max() for time in times)
+    if clock != "dates":
+        return f"{first:.9g} to {last:.9g} s"
+    return " to ".join(str(numpy.datetime64(int(time * 1e3), "ms")) for time in (first, last))
+
+
+def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
+    """Share of the measurements of all tracks that have a row."""
+    found = total = 0
+    for track, time in times.items():
+        rows = numpy.sort(table.time if {*table.track} == {""} else table.time[table.track == track])
+        at = numpy.searchsorted(rows, time + tolerance, side="right") - 1
+        found += int(((at >= 0) & (rows[numpy.maximum(at, 0)] >= time - tolerance)).sum()) if len(rows) else 0
+        total += len(time)
+    return found / max(total, 1)
 
 
 class FileState(NamedTuple):
@@ -150,9 +219,7 @@ class FileTrack(Filter[Task, Any, FileState]):
             self._last.append(table.time[rows[-1]] if len(rows) else -numpy.inf)
         self._order, self._keys = numpy.concatenate(order), numpy.concatenate(keys)
         self._first = numpy.cumsum([0, *map(len, order)])[:-1]
-        usual = getattr(task.parameters, "sampling_interval", None) or task.interval
-        self._interval = usual or 1.0
-        self._tolerance = min(SAME_TIME, 0.25 * self._interval)
+        self._interval, self._tolerance = _usual_interval(task), _tolerance(task)
 
     def start(self, initial: Any) -> FileState:
         """Nothing is measured yet."""

@@ -16,6 +16,7 @@ from ...compiler.functions import leaves, map_arrays, round_up_lanes
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
+from ...envs.data.flight_tables import SINCE_1970, time_unit
 from ...envs.engine.episode_noise import MeasurementRow
 from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
@@ -111,7 +112,8 @@ class OnlineFilter:
         Args:
             mean: initial estimate, ``(C,)``, or of several tracks ``(C, N)``.
             covariance: of its error, ``(C, C)`` or ``(C, C, N)``.
-            time: s, a number or ``(N,)``.
+            time: s, a number or ``(N,)``; a number too large for seconds since 1970 is milli-, micro- or nanoseconds
+                since then, as in a log.
             tracks: numbers of those that start anew while the others go on; default: all. What came before them cannot
                 come late any more, of any track.
             **values: what else the environment is given at the start, see ``input.start_values``.
@@ -189,6 +191,11 @@ class OnlineFilter:
         """Take in a measurement that is not older than the last."""
         before = self._running()
         last = before.input["time"]
+        if ((at >= SINCE_1970) & (last < SINCE_1970)).any():
+            raise ValueError(
+                f"time {quote_shortened(_plain(at))} s is since 1970, and the last one, {_plain(last)} s, is not: start "
+                "the track with start(time=...) of the same clock"
+            )
         together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
         if not ((at > last).all() or together):
             raise ValueError(
@@ -446,7 +453,7 @@ class OnlineFilter:
             raise ValueError(
                 f"time must be finite seconds, a number or ({self.tracks},) numbers, got {quote_shortened(time)}"
             )
-        return numpy.broadcast_to(found, (self.tracks,)).copy()
+        return numpy.broadcast_to(found / time_unit(found.flat[0]), (self.tracks,)).copy()
 
     def _has_interval(self) -> bool:
         return bool(getattr(self.task.parameters, "sampling_interval", None) or self.task.interval)

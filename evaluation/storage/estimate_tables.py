@@ -5,11 +5,13 @@ A row is an estimate: its track, its time in seconds, the mean of each component
 columns are those that ``filtergym evaluate --estimates`` and the programs of ``filtergym export`` write:
 
     track (or recording, episode)      name of the track; left out where there is one track
-    seconds (or time, t), log_time     s since the start of the track; or the time as it stands in a log
+    seconds (or time, t), log_time     time of the log, or s since the start of the track; see below
     estimate_X (or mean_X, X)          mean of the component X, in its unit
     sigma_X                            its standard deviation; or
     covariance_X_Y                     of two components, in either order; zero where a pair is left out
     log_likelihood, nis, nis_degrees   how well the measurement was predicted
+
+Times are read as those of a log are: seconds, or a unit that a date since 1970 must have, dates, or times of day.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +41,8 @@ class EstimateTable(NamedTuple):
     time: numpy.ndarray
     """s by ``clock``, ``(R,)``."""
     clock: str
-    """What the times are: ``seconds`` since the start of the track, or of a log ``dates`` or ``times of day``."""
+    """What the times are: ``dates`` in s since 1970, ``times of day`` since midnight, ``seconds``, or ``log``: seconds
+    of the log."""
     mean: numpy.ndarray
     """``(C, R)``; NaN of a component that the file does not hold."""
     known: tuple[bool, ...]
@@ -139,6 +142,8 @@ def _several(names: Sequence[str]) -> ValueError:
 
 def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> EstimateTable:
     """Put the columns of a file into arrays."""
+    import pandas
+
     if "policy" in columns and len(names := sorted({*map(str, columns["policy"])})) > 1:
         raise _several(names)
     found = {}
@@ -151,7 +156,7 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
     time_name = next((name for name in (LOG_TIME, *SECONDS) if name in columns), None)
     if time_name is None:
         raise ValueError("it needs a column seconds, the time since the start of the track")
-    clock, time = _times(columns[time_name])
+    clock, time = clock_seconds(pandas.Series(columns[time_name]))
     track = next((columns[name] for name in TRACK if name in columns), None)
     rows = len(time)
     mean = numpy.full((len(components), rows), numpy.nan)
@@ -166,21 +171,6 @@ def _of_columns(columns: Mapping[str, Any], components: Sequence[str]) -> Estima
         *_covariance(columns, components, rows),
         {name: columns[name] for name in LIKELIHOOD if name in columns},
     )
-
-
-def _times(values: Any) -> tuple[str, numpy.ndarray]:
-    """Clock of a column of times, and the times in seconds."""
-    import pandas
-
-    if not isinstance(values, pandas.Series):
-        return "seconds", values
-    try:  # seconds since the start of the track may be large, and are no date
-        time = numbers("time", values).to_numpy()
-    except ValueError:
-        return clock_seconds(values)
-    if not numpy.isfinite(time).all():
-        raise ValueError(f"time has no value in row {int(numpy.argmin(numpy.isfinite(time)))}")
-    return "seconds", time
 
 
 def _track_name(value: Any) -> str:
@@ -209,7 +199,9 @@ def _covariance(
 
 
 def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
-    """Positions of one file, or of a folder with a file for each track; what is said of the orientation is not read."""
+    """Positions of one file, or of a folder with a file for each track; the orientation is not read."""
+    import pandas
+
     axes = [components.index(name) for name in AXES if name in components]
     if len(axes) < 2:
         raise ValueError("a trajectory is of the components position_x and position_y, and there are none")
@@ -231,9 +223,8 @@ def _trajectories(path: Path, components: Sequence[str]) -> EstimateTable:
     mean[axes] = table[:, 1 : 1 + len(axes)].T
     known = tuple(i in axes for i in range(len(components)))
     silent, none = (False,) * len(components), numpy.full((*2 * [len(components)], len(table)), numpy.nan)
-    return EstimateTable(
-        numpy.array(tracks, dtype=str), table[:, 0], "seconds", mean, known, silent, none, {}
-    )
+    clock, time = clock_seconds(pandas.Series(table[:, 0]))
+    return EstimateTable(numpy.array(tracks, dtype=str), time, clock, mean, known, silent, none, {})
 
 
 def _trajectory(file: Path) -> numpy.ndarray:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy
 import xarray
 
+from ...envs.data.flight_tables import clock_seconds
 from .estimate_tables import AXES
 from .files import whole_file, whole_files
 
@@ -88,7 +89,8 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
 def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
     """Write positions as trajectories in the format of the TUM RGB-D benchmark, which ``evo`` reads.
 
-    A file has the lines ``seconds x y z qx qy qz qw``, m; the orientation is none, and a z that is not estimated zero.
+    A file has the lines ``time x y z qx qy qz qw``, s and m; the orientation is none, and a z that is not estimated
+    zero. The time is that of the log, of dates since 1970; without a log it counts from the start of the track.
     There is a file for each competitor and episode, ``NAME.EPISODE.tum``, and one for the truth where it is known,
     ``truth.NAME.EPISODE.tum``: in a closed loop every competitor has a truth of its own.
 
@@ -110,16 +112,25 @@ def write_trajectories(folder: Path, dataset: xarray.Dataset) -> None:
         for policy in found["policy"].values.tolist():
             for episode in found["episode"].values.tolist():
                 own = found.sel(policy=policy, episode=episode)
+                time = _log_seconds(own) if "log_time" in own.coords else own["seconds"].values
                 name = f"{re.sub(r'[^A-Za-z0-9_.-]', '_', policy)}.{episode}.tum"
                 for prefix, kind in (("", "estimate"), ("truth.", "truth")):
                     if kind in own:
-                        _write_trajectory(
-                            waiting / f"{prefix}{name}", own["seconds"], own[kind].values[:, axes]
-                        )
+                        _write_trajectory(waiting / f"{prefix}{name}", time, own[kind].values[:, axes])
 
 
-def _write_trajectory(path: Path, seconds: xarray.DataArray, positions: numpy.ndarray) -> None:
+def _log_seconds(own: xarray.Dataset) -> numpy.ndarray:
+    """Times of the log in s, ``(T,)``; NaN beyond the end of a shorter episode."""
+    import pandas
+
+    found = numpy.full(own.sizes["time"], numpy.nan)
+    there = numpy.isfinite(own["seconds"].values)
+    found[there] = clock_seconds(pandas.Series(own["log_time"].values[there]))[1]
+    return found
+
+
+def _write_trajectory(path: Path, seconds: numpy.ndarray, positions: numpy.ndarray) -> None:
     rows = numpy.zeros((len(positions), 8))
-    rows[:, 0], rows[:, 1 : 1 + positions.shape[1]], rows[:, 7] = seconds.values, positions, 1.0
+    rows[:, 0], rows[:, 1 : 1 + positions.shape[1]], rows[:, 7] = seconds, positions, 1.0
     # Beyond the end of a shorter episode, or where nobody knows the truth, there is no position.
     numpy.savetxt(path, rows[numpy.isfinite(rows).all(axis=1)], fmt="%.9f")

@@ -446,7 +446,7 @@ def _outliers(advice: Advice) -> Iterator[str]:
     for episode, k in numpy.argwhere(found)[:MOST_OUTLIERS]:
         track = f"{recording.names[episode]}: " if len(recording.names) > 1 else ""
         time = recording.seconds[episode, k] if recording.log_time is None else recording.log_time[episode, k]
-        written = time if isinstance(time, str) else f"{float(time):.10g}"
+        written = time if isinstance(time, str) else numpy.format_float_positional(float(time), trim="-")
         places.append(f"{track}{k + 1} (time {written})")
     more = f" and {count - len(places)} more" if count > len(places) else ""
     yield f"{text}: {count} here, measurements after the start {', '.join(places)}{more}."
