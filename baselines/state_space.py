@@ -228,9 +228,8 @@ class Unscented(Extended):
     def take(self, state: Track, one: Past) -> Track:
         """Predict to a measurement and take it in by sigma points."""
         measurement = one.measurement
-        mean, spread = unscented.transform(
-            state.mean, state.covariance, lambda x: self.equations.move(x, measurement)
-        )
+        motion, points = self.equations.unwrapped_motion(state.mean, state.covariance, measurement)
+        mean, spread = unscented.transform(state.mean, state.covariance, motion, points)
         spread = spread + self.equations.input_noise(state.mean, measurement)
         Q = self.process_noise(mean, measurement)
         own, P = self.equations, spread + Q

@@ -41,7 +41,7 @@ class VectorFunction:
         given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
-        linear_rows: places in the value whose row of the Jacobian is the same everywhere.
+        linear_rows: places in the value that are linear in the n numbers.
 
     Raises:
         NotTraceable: if the function is no straight line of arithmetic.
@@ -69,13 +69,23 @@ class VectorFunction:
         self._value = _program(graph, answer.nodes.tolist())
         self._jacobian = _program(graph, nodes)
         known = [graph.values[node] for node in nodes]
-        self.linear_rows = frozenset(
-            row for row in range(self.size) if None not in known[row * size : (row + 1) * size]
-        )
         self.matrix = self.offset = None
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
+        self.linear_rows = self._find_linear_rows() if size else frozenset()
+
+    def _find_linear_rows(self) -> frozenset[int]:
+        """Rows with one Jacobian that also accounts for long ways, as the remainder of a division does not."""
+        rng = numpy.random.default_rng(0)
+        x = rng.normal(size=(self._inputs + self.given, 12)) * numpy.repeat([1.0, 10.0, 1e3], 4)
+        x[self._inputs :] = rng.uniform(0.1, 1.0, (self.given, 1))
+        with numpy.errstate(all="ignore"):
+            value, jacobian = self.value(x, numpy), self.jacobian(x, numpy)
+            moved = numpy.einsum("mn,nk->mk", jacobian[..., 0], (x - x[:, :1])[: self._inputs])
+            same = (jacobian == jacobian[..., :1]).all(axis=(1, 2))
+            same &= (numpy.abs(value - value[:, :1] - moved) <= 1e-9 * (1.0 + numpy.abs(moved))).all(axis=1)
+        return frozenset(numpy.flatnonzero(same).tolist())
 
     def value(self, x: Any, xp: Any) -> Any:
         """Value at vectors.

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy
@@ -11,6 +12,7 @@ from . import register_task
 from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
 from .envs.contract.parameters import Limits, check, check_integer, quote_shortened
+from .envs.contract.task import Component
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition, StateSpaceModel
 from .envs.linear.inputs import Input
@@ -22,6 +24,7 @@ from .envs.linear.state_space import (
     state_space_attributes,
 )
 from .evaluation.running.seeds import episode_seeds
+from .own_angles import find_periods, warn_of_turns
 from .own_equations import (
     Function,
     Surroundings,
@@ -56,6 +59,7 @@ def state_space(
     sensors: Mapping[str, Sensor] | None = None,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
+    angles: Mapping[str, str] = MappingProxyType({}),
     measured: Sequence[str] = (),
     inputs: Mapping[str, Input] | Sequence[str] = (),
     weights: Any = None,
@@ -89,7 +93,9 @@ def state_space(
         R: covariance of the measurement noise, ``(m, m)``, positive definite.
         sensors: by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
-        units: of the components; default: ``1``.
+        units: of the components; default: ``1``, of an angle its unit.
+        angles: components that are angles, ``"rad"`` or ``"deg"`` by their names: their errors are the shortest
+            differences, whatever turn the truth, an estimate or f is on.
         measured: names of the m numbers that h returns, which are the columns of a table of yours; default: ``z1``,
             ``z2`` and so on.
         inputs: known inputs, each with what a simulation draws for it and the noise with which it is told; or their
@@ -162,18 +168,24 @@ def state_space(
     _check_sources(filters, sensors)
     count = len(world)
     names = names or tuple(f"x{i + 1}" for i in range(n))
-    units = units or ("1",) * n
+    m = world[0].h.size
+    counts = [trace_measurement("h", one.h, n, len(inputs)).size for one in sensors.values()] or [m]
+    channels = find_channels(sensors, counts, interval)
+    places = components_measured(world[0].h)
+    periods = find_periods(angles, names, places, channels)
+    units = units or tuple(angles.get(name, "1") for name in names)
     if len(names) != n or len(units) != n:
         raise ValueError(
             f"names and units must be {n} each, got {quote_shortened(names)} and {quote_shortened(units)}"
         )
-    m = world[0].h.size
-    counts = [trace_measurement("h", one.h, n, len(inputs)).size for one in sensors.values()] or [m]
-    channels = find_channels(sensors, counts, interval)
+    components = tuple(
+        Component(*one, periods.get(i)) for i, one in enumerate(zip(names, units, strict=True))
+    )
     columns = dict.fromkeys(measured or [f"z{j + 1}" for j in range(m)], "")
     columns = sensor_columns(sensors, channels) if sensors else columns
     check_columns(measured or tuple(columns), m, inputs)
-    places = components_measured(world[0].h)
+    usual = numpy.concatenate([mean, [interval], around.usual_inputs])
+    warn_of_turns(world[0], usual, {name: i in periods for i, name in enumerate(names)}, channels)
     measures = [units[places.index(j)] if j in places else "1" for j in range(m)]
     definition = StateSpaceDefinition(
         world,
@@ -191,7 +203,7 @@ def state_space(
         raise ValueError(f"weights must not be negative, nor all zero, got {definition.weights.tolist()}")
     name = id.rpartition("/")[2].rpartition("-")[0] or id
     module = sys._getframe(1).f_globals.get("__name__", "__main__")
-    attributes = state_space_attributes(definition, names, units, dict(parameters))
+    attributes = state_space_attributes(definition, components, dict(parameters))
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
     cls.reward_unit = _RewardUnit(StateSpaceParameters(**parameters))

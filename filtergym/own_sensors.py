@@ -7,7 +7,8 @@ import numpy
 
 from .envs.contract.parameters import quote_shortened
 from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
-from .envs.linear.sensors import PERIODS, Channel, Sensor
+from .envs.linear.sensors import Channel, Sensor
+from .filters.angles import PERIODS
 from .own_equations import Function, check_array, check_covariance, further_arguments, trace_measurement
 
 RESERVED = (RECORDING, "values", "available")

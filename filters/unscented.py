@@ -74,8 +74,8 @@ def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[Any], list[Any]]:
 def narrow(jacobian: Array, covariance: Array, limit: float) -> Spread:
     """Spread whose sigma points move a function of the mean by no more than a limit, to first order.
 
-    The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are measured
-    up to whole turns, so points that move one by half a turn or more have no difference of known sign.
+    The columns of the scaled root of P move a row H of the function by at most alpha sqrt(n H P H^T). Angles are
+    measured up to whole turns, so points that move one by half a turn or more have no difference of known sign.
 
     Args:
         jacobian: rows H of the function at the mean, ``(m, n, ...)``.

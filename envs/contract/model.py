@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
+from ...filters.angles import unwrap
 from .causes import Moment, cause_number
 from .draws import Draws
 from .filter import Filter, Input
@@ -214,7 +215,7 @@ class Model:
 
     def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
-        return self.filter.mean(episode.filter) - self.task.world.state(episode.truth)
+        return self.task.subtract(self.filter.mean(episode.filter), self.task.world.state(episode.truth))
 
     def covariance(self, episode: Episode) -> Array:
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
@@ -235,8 +236,13 @@ class Model:
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}
 
     def _truth_and_estimate(self, episode: Episode) -> dict[str, Array]:
-        true = {"truth": self.task.world.state(episode.truth)} if self.task.has_truth else {}
-        return {**true, "estimate": self.mean(episode), "covariance": self.covariance(episode)}
+        estimate = {"estimate": self.mean(episode), "covariance": self.covariance(episode)}
+        if not self.task.has_truth:
+            return estimate
+        truth = self.task.world.state(episode.truth)
+        if self.task.periods:  # angles are drawn on the turn of the truth
+            estimate["estimate"] = unwrap(estimate["estimate"], truth, self.task.periods)
+        return {"truth": truth, **estimate}
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""

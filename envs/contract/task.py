@@ -38,6 +38,7 @@ returns is given to the next :meth:`World.advance`. Each filter then flies a tru
 """
 
 import ast
+import functools
 import importlib
 import inspect
 import re
@@ -51,6 +52,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
+from ...filters.angles import shorten
 from ...filters.array_namespace import lane_arrays, stack_nested
 from .causes import MISSED, Cause
 from .draws import Draws
@@ -66,6 +68,8 @@ class Component(NamedTuple):
 
     name: str
     unit: str
+    period: float | None = None
+    """Of an angle, in its unit: errors are the shortest differences. None: it is no angle."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,15 @@ class Task(ABC):
     def on(self, xp: ModuleType, device: Any = None) -> "Task":
         """Return the same problem on other arrays."""
         return type(self)(self.parameters, xp, device, self.recording)
+
+    @functools.cached_property
+    def periods(self) -> dict[int, float]:
+        """Periods of the components that are angles, by their numbers."""
+        return {i: one.period for i, one in enumerate(self.components) if one.period is not None}
+
+    def subtract(self, estimate: Array, truth: Array) -> Array:
+        """Estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
+        return shorten(estimate - truth, self.periods)
 
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""

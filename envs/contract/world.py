@@ -150,7 +150,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
             truth: at the measurement that the estimate is for.
             mean: of the estimate, ``(C, N)``.
         """
-        return self.error_cost(mean - self.state(truth))
+        return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
     def charge(self, truth: Truth, mean: Array) -> Array:
         """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is

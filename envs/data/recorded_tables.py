@@ -6,12 +6,13 @@ and true values, ``truth_NAME`` for the components of the environment.
 """
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
+from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
 from ..contract.live_input import LARGEST
 from ..contract.log_format import TrackLog
@@ -39,6 +40,8 @@ RECORDING = "recording"
 TRUTH = "truth_"
 GEODETIC = ("latitude", "longitude", "altitude")
 """Columns, of which the last may lack; they may be called as in flights."""
+TURN_SHARE = 0.05
+"""Of a turn, by which a jump of an angle may differ from a whole one."""
 MOST_TWICE = 0.1
 """Share of rows that may have the time of the row before and say something else."""
 UNEVEN = 0.01
@@ -186,6 +189,22 @@ class Columns:
             height = self[name] if self.has(name) else numpy.full(len(self.time), numpy.nan)
             found = usual.east_north(self[latitude], self[longitude], height)
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
+
+    def note_turns(self, angles: Collection[str]) -> None:
+        """Note true values that jump by a whole turn, as angles do, of components that are not declared angles.
+
+        Args:
+            angles: columns of those that are.
+        """
+        for name in (name for name in self.true if name not in angles):
+            steps = numpy.abs(numpy.diff(self[name]))
+            for unit, period in PERIODS.items():
+                jumps = numpy.abs(steps - period) < TURN_SHARE * period
+                if jumps.any() and numpy.nanmedian(steps) < TURN_SHARE * period:
+                    self.notes.append(
+                        f"{name} jumps by a turn after row {jumps.argmax()}, and its error then counts as one: declare "
+                        f"angles={{{name.removeprefix(TRUTH)!r}: {unit!r}}}"
+                    )
 
     def _drop_null_positions(self, latitude: str, longitude: str) -> None:
         """Empty the positions at latitude 0 and longitude 0, which many receivers write without a fix."""
@@ -344,6 +363,9 @@ def read_columns(
         table, told = _add_truth(table, read[time_name], cls, keywords, truth)
         notes = (*notes, *told)
     parts = []
+    angles = {
+        TRUTH + one.name for one in cls(cls.Parameters(**keywords)).components if one.period is not None
+    }
     log_time = _times_as_written(read[time_name])
     for name, rows in _by_recording(table, read.get(RECORDING)).items():
         own = Columns(
@@ -352,6 +374,7 @@ def read_columns(
         try:
             _check_times(own.time)
             own.drop_duplicates()
+            own.note_turns(angles)
             if log_format.plane:
                 own.project_to_plane(log_format.plane)
                 if truth is not None:
@@ -383,10 +406,11 @@ def _add_truth(
     here = [name for name in table if name.startswith(TRUTH)]
     if here:
         raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
-    components = [component.name for component in cls(cls.Parameters(**keywords)).components]
+    components = cls(cls.Parameters(**keywords)).components
+    periods = {TRUTH + one.name: one.period for one in components if one.period is not None}
     try:
-        found = read_truth(truth.path, log_format, components, TRUTH, TIME)
-        columns, note = match_truth(found, times, truth.offset)
+        found = read_truth(truth.path, log_format, [one.name for one in components], TRUTH, TIME)
+        columns, note = match_truth(found, times, truth.offset, periods)
     except ValueError as error:
         raise ValueError(f"truth {truth.path}: {error}") from error
     return table.assign(**columns), (note, *(f"truth: {each}" for each in found.notes))

@@ -87,7 +87,7 @@ def _wanted(log_format: LogFormat) -> str:
 
 
 def match_truth(
-    truth: TruthTable, times: "pandas.Series", offset: float
+    truth: TruthTable, times: "pandas.Series", offset: float, periods: Mapping[str, float]
 ) -> tuple[dict[str, numpy.ndarray], str]:
     """Return the truth at the times of a log, NaN where it is not known, and a sentence on how many have one.
 
@@ -95,6 +95,7 @@ def match_truth(
         truth: of :func:`read_truth`.
         times: of the log, as they are written.
         offset: added to the times of the truth, s.
+        periods: of the columns that are angles, which are interpolated the shorter way round.
 
     Raises:
         ValueError: if both clocks differ, or no time has a truth.
@@ -116,7 +117,10 @@ def match_truth(
     same = numpy.abs(now - then[near]) <= SAME_TIME
     columns = {}
     for name, values in truth.columns.items():
-        inside = values[before] + share * (values[after] - values[before])
+        step = values[after] - values[before]
+        if name in periods:
+            step = step - periods[name] * numpy.round(step / periods[name])
+        inside = values[before] + share * step
         columns[name] = numpy.where(same, values[near], numpy.where(between, inside, numpy.nan))
     known = numpy.logical_and.reduce([numpy.isfinite(values) for values in columns.values()])
     if not known.any():

@@ -87,7 +87,7 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
         mean: of the teacher, ``(C, N)``.
         covariance: S, ``(C, C, N)``.
     """
-    world, difference = model.task.world, model.mean(state) - mean
+    world, difference = model.task.world, model.task.subtract(model.mean(state), mean)
     reward = -compress(model, world.charge(state.truth, world.state(state.truth) + difference))
     weight = LIKELIHOOD_WEIGHTS[kind] / len(model.task.components)
     if not weight:

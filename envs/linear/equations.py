@@ -14,11 +14,13 @@ same one, G N D^T, is left out.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
 from ...compiler.vector_functions import VectorFunction
+from ...filters.angles import shorten, unwrap
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import product, transpose
@@ -135,6 +137,11 @@ def process_noise(
     return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
+def _nonlinear(function: VectorFunction, periods: Mapping[int, float]) -> dict[int, float]:
+    """Periods of the rows that are not linear in the state."""
+    return {row: period for row, period in periods.items() if row not in function.linear_rows}
+
+
 class Measurement(NamedTuple):
     """What the sensors say."""
 
@@ -184,6 +191,8 @@ class Equations:
         )
         self.channels = task.definition.channels
         self.periods = {row: one.period for one in self.channels if one.period for row in one.numbers}
+        """Of the numbers of a measurement that are angles."""
+        self.angles = task.periods
         self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
@@ -289,16 +298,7 @@ class Equations:
 
     def subtract(self, z: Array, predicted: Array) -> Array:
         """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
-        return self._shorten(z - predicted, self.periods)
-
-    def _shorten(self, difference: Array, periods: Mapping[int, float]) -> Array:
-        """Difference ``(m, ...)`` with whole turns taken off some of its rows, by the periods of these."""
-        if not periods:
-            return difference
-        rows = [difference[row] for row in range(difference.shape[0])]
-        for row, period in periods.items():
-            rows[row] = rows[row] - period * self.xp.round(rows[row] / period)
-        return self.xp.stack(rows)
+        return shorten(z - predicted, self.periods)
 
     def unwrap(
         self, z: Array, mean: Array, covariance: Array, passed: Passed
@@ -315,17 +315,48 @@ class Equations:
             passed: what went on until then.
         """
         near = self.measure(mean, passed)
-        folded = {row: turn for row, turn in self.periods.items() if row not in self.model.h.linear_rows}
+        measure, spread = self._unfold(
+            partial(self.measure, passed=passed),
+            near,
+            _nonlinear(self.model.h, self.periods),
+            lambda: self.measurement_matrix(mean, passed),
+            covariance,
+        )
+        return unwrap(z, near, self.periods), measure, spread
 
-        def measure(x: Array) -> Array:
-            return near[:, None] + self._shorten(self.measure(x, passed) - near[:, None], folded)
+    def unwrapped_motion(
+        self, mean: Array, covariance: Array, passed: Passed
+    ) -> tuple[Callable[[Array], Array], Spread]:
+        """Motion and sigma points of a transform in which angles of the state keep the turn nearest to the mean's.
 
-        spread = GAUSSIAN
-        if folded:
-            H = self.measurement_matrix(mean, passed)
-            turns = self.xp.stack([H[row] / turn for row, turn in folded.items()])
-            spread = narrow(turns, covariance, QUARTER)
-        return near + self.subtract(z, near), measure, spread
+        Args:
+            mean: state, ``(n, N)``.
+            covariance: of it, ``(n, n, N)``.
+            passed: what went on until the next measurement.
+        """
+        return self._unfold(
+            partial(self.move, passed=passed),
+            self.move(mean, passed),
+            _nonlinear(self.model.f, self.angles),
+            lambda: self.transition_matrix(mean, passed),
+            covariance,
+        )
+
+    def _unfold(
+        self,
+        function: Callable[[Array], Array],
+        near: Array,
+        periods: Mapping[int, float],
+        jacobian: Callable[[], Array],
+        covariance: Array,
+    ) -> tuple[Callable[[Array], Array], Spread]:
+        """Function whose rows with a period are near those of the mean, and points that are not half a turn away."""
+        if not periods:
+            return function, GAUSSIAN
+        J = jacobian()
+        turns = self.xp.stack([J[row] / period for row, period in periods.items()])
+        around = near[:, None]
+        return lambda x: unwrap(function(x), around, periods), narrow(turns, covariance, QUARTER)
 
     def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.

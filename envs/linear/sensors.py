@@ -4,13 +4,13 @@ A measurement holds the numbers of all sensors, one after the other, and says wh
 say at one time is taken in together: their noises are independent, so the order would matter only to linearisation.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
+from ...filters.angles import PERIODS
 from ..contract.causes import Cause, Moment
 from ..contract.draws import Draws
 from ..contract.observation import Array
@@ -19,8 +19,6 @@ from ..contract.parameters import Limits, check, freeze
 if TYPE_CHECKING:
     from .state_space import StateSpace
 
-PERIODS = {"rad": 2.0 * math.pi, "deg": 360.0}
-"""Of angles, by their units."""
 LIMITS: dict[str, tuple[Any, Limits]] = {
     "interval": (float | None, Limits(above=0.0)),
     "availability": (float, Limits(above=0.0, at_most=1.0)),

@@ -365,16 +365,14 @@ class StateSpace(Task):
 
 def state_space_attributes(
     definition: StateSpaceDefinition,
-    names: Sequence[str],
-    units: Sequence[str],
+    components: tuple[Component, ...],
     defaults: dict[str, Any],
 ) -> dict[str, Any]:
     """Attributes of a task's class that follow from what its author gives.
 
     Args:
         definition: the models.
-        names: of the components.
-        units: of each.
+        components: of the state.
         defaults: parameters in the training distribution, where they are not those of every such task.
     """
     from .state_space_banks import KalmanNetBank, bank_tables
@@ -397,7 +395,7 @@ def state_space_attributes(
         **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
         "measurement_words": definition.measurement_words,
         "log_format": state_space_log_format(definition, defaults),
-        "components": tuple(map(Component, names, units)),
+        "components": components,
         "banks": banks,
         "actions": actions,
         "trained_banks": {"kalman-net": KalmanNetBank},

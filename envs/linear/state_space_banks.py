@@ -17,6 +17,7 @@ import gymnasium
 import numpy
 
 from ...filters import imm
+from ...filters.angles import unwrap
 from ...filters.innovation_update import Received, update_with_gain
 from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import outer, product, transpose
@@ -422,7 +423,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         """Mix, and let every hypothesis predict and take the measurement in, as none of that depends on the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
-        means, covariances = imm.mix(state.means, state.covariances, chain.mixing)
+        means, covariances = imm.mix(self._align(state.means), state.covariances, chain.mixing)
         updates = []
         for j, equations in enumerate(self.task.believed):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
@@ -437,6 +438,10 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
             nis=xp.stack([u.squared_distance for u in updates]),
         )
 
+    def _align(self, means: Array) -> Array:
+        """Means of the hypotheses, ``(n, M, N)``, with angles on the turn of the first."""
+        return unwrap(means, means[:, :1], self.task.periods)
+
     def act(self, state: Mixture, measurement: Measurement, action: Array) -> Mixture:
         """Weigh the hypotheses."""
         probabilities = bank_probabilities(
@@ -447,7 +452,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
             self.parameters.evidence_scale,
             self.xp,
         )
-        mean, covariance = imm.combine(state.means, state.covariances, probabilities)
+        mean, covariance = imm.combine(self._align(state.means), state.covariances, probabilities)
         action = self.xp.clip(action, -1.0, 1.0)
         return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
 

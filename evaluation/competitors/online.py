@@ -193,8 +193,8 @@ class OnlineFilter:
         last = before.input["time"]
         if ((at >= SINCE_1970) & (last < SINCE_1970)).any():
             raise ValueError(
-                f"time {quote_shortened(_plain(at))} s is since 1970, and the last one, {_plain(last)} s, is not: start "
-                "the track with start(time=...) of the same clock"
+                f"time {quote_shortened(_plain(at))} s is since 1970, and the last one, {_plain(last)} s, is not: "
+                "start the track with start(time=...) of the same clock"
             )
         together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
         if not ((at > last).all() or together):

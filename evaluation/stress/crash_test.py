@@ -120,6 +120,12 @@ class StreamFilter(OnlineFilter):
         return {name: values[..., : self.tracks] for name, values in found.items()}
 
 
+def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
+    """Errors ``(K, C, N)`` of means at the first K measurements; of angles the shortest differences."""
+    means, truth = (numpy.moveaxis(values, 1, 0) for values in (means, stream.truth[: len(means)]))
+    return numpy.moveaxis(stream.task.subtract(means, truth), 0, 1)
+
+
 class CrashTest:
     """Streams of measurements, altered in every way, and the reference filter that all are compared with.
 
@@ -210,7 +216,7 @@ class CrashTest:
         """Errors of the mean, ``(K, C, N)``."""
         filter.begin(stream.initial)
         means = numpy.stack([filter.take(stream.at(k))["mean"] for k in range(len(stream))])
-        return means - stream.truth
+        return _subtract(stream, means)
 
     def _run(self, filter: StreamFilter, stream: Stream, begin: bool = True) -> Run:
         """Give a filter a stream; what it raises ends the run."""
@@ -231,7 +237,7 @@ class CrashTest:
             none = numpy.empty((0, stream.episodes))
             return Run(none, none, none, 0.0, 0.0, error)
         mean, covariance = (numpy.stack([one[name] for one in found]) for name in ("mean", "covariance"))
-        deviation = mean - stream.truth[: len(found)]
+        deviation = _subtract(stream, mean)
         with numpy.errstate(all="ignore"):
             size = numpy.sqrt(((deviation / self.scale[:, None]) ** 2).mean(axis=1))
             flat = numpy.moveaxis(deviation, 1, 0), numpy.moveaxis(covariance, 0, 2)

@@ -1,0 +1,107 @@
+"""Angles of a state-space model: those that are declared, and turns that its functions take off and nobody declares."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy
+
+from .compiler.vector_functions import VectorFunction
+from .envs.contract.parameters import quote_shortened
+from .envs.linear.equations import StateSpaceModel
+from .envs.linear.sensors import Channel
+from .filters.angles import PERIODS
+
+STEPS = ((0.01, 1001), (1.0, 1001))
+"""Steps, and how many, by which a component of the state is moved to find jumps: 10 rad and 1,000 degrees."""
+EXACT = 1e-3
+"""Share of a turn by which a jump may differ from one."""
+
+
+def find_periods(
+    angles: Any, names: Sequence[str], places: Sequence[int | None], channels: Sequence[Channel]
+) -> dict[int, float]:
+    """Return the periods of the components that are angles, by their numbers: those that are declared, and those that a
+    sensor of angles measures as they are.
+
+    Args:
+        angles: unit of each, by its name.
+        names: of all components.
+        places: component that each number of a measurement is, or None.
+        channels: the sensors.
+
+    Raises:
+        ValueError: for another component or unit.
+    """
+    if not isinstance(angles, Mapping):
+        raise ValueError(
+            f"angles must be units by names, such as {{'{names[0]}': 'rad'}}, got {quote_shortened(angles)}"
+        )
+    for name, unit in angles.items():
+        if name not in names:
+            raise ValueError(
+                f"angles names {quote_shortened(name)}, and the components are {', '.join(names)}"
+            )
+        if unit not in PERIODS:
+            raise ValueError(
+                f"the unit of the angle {name!r} must be 'rad' or 'deg', got {quote_shortened(unit)}"
+            )
+    of_rows = {row: one.period for one in channels if one.period is not None for row in one.numbers}
+    measured = {
+        place: of_rows[row] for row, place in enumerate(places) if place is not None and row in of_rows
+    }
+    return {**measured, **{names.index(name): PERIODS[unit] for name, unit in angles.items()}}
+
+
+def warn_of_turns(
+    model: StateSpaceModel,
+    given: numpy.ndarray,
+    components: Mapping[str, bool],
+    channels: Sequence[Channel],
+) -> None:
+    """Warn of a component or a sensor whose function jumps by a whole turn and that is not declared an angle.
+
+    Args:
+        model: traced equations.
+        given: a usual state, then the interval and the inputs that the functions take, ``(n + 1 + p,)``.
+        components: whether each is declared, by its name.
+        channels: the sensors.
+    """
+    n, inputs = len(components), given[len(components) + 1 :]
+    of_motion = given if model.timed else numpy.concatenate([given[:n], inputs])
+    jumping = _jumping_rows(model.f, of_motion[: n + model.f.given], n)
+    for row, (name, declared) in enumerate(components.items()):
+        if row in jumping and not declared:
+            unit = jumping[row]
+            _warn(
+                f"f takes whole turns off {name}, which is no declared angle: write angles={{{name!r}: {unit!r}}}"
+            )
+    jumping = _jumping_rows(model.h, numpy.concatenate([given[:n], inputs])[: n + model.h.given], n)
+    for channel in channels:
+        found = next((jumping[row] for row in channel.numbers if row in jumping), None)
+        if found is not None and channel.period is None:
+            where = f"the sensor {channel.name!r}" if channel.name else "h"
+            _warn(
+                f"{where} measures an angle that jumps by a turn: declare it by Sensor(..., wraps={found!r})"
+            )
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UserWarning, stacklevel=4)
+
+
+def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dict[int, str]:
+    """Units of the turns by which rows of a function jump along a component of the state, by their numbers."""
+    found: dict[int, str] = {}
+    for place in range(n):
+        for step, count in STEPS:
+            points = given[:, None] + numpy.zeros((1, count))
+            points[place] += step * (numpy.arange(count) - count // 2)
+            with numpy.errstate(all="ignore"):
+                change = numpy.diff(function.value(points, numpy), axis=1)
+                usual = 0.5 * (change[:, :-2] + change[:, 2:])
+                jump = numpy.abs(change[:, 1:-1] - usual)
+                for unit, period in PERIODS.items():
+                    rows = (numpy.abs(jump - period) < EXACT * period).any(axis=1)
+                    found |= dict.fromkeys(numpy.flatnonzero(rows).tolist(), unit)
+    return found
