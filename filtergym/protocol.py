@@ -213,8 +213,8 @@ class EnvironmentResult(NamedTuple):
     time: ProcessorTime | None
     paper_time: ProcessorTime | None
     costs: Mapping[str, Mapping[str, numpy.ndarray]]
-    """Mean cost of every episode, ``(episodes,)``, by scenario and by the name of the competitor, the paper's algorithm or
-    a reference."""
+    """Mean cost of every episode, ``(episodes,)``, by scenario and by the name of what ran: the competitor, the paper's
+    algorithm or a reference."""
 
     @property
     def logarithms(self) -> numpy.ndarray:

@@ -16,8 +16,9 @@ the protocol on fresh episodes, from a seed that did not exist when the file was
 number by number. The interval of a difference of independent numbers a in [a_l, a_u] and b in [b_l, b_u] with a > b has
 the half-width sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner,
 Construction of confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are
-stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance refuses at
-most the share :data:`ALARM` of honest submissions. Ratios of costs are compared by their logarithms.
+stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance refuses
+about the share :data:`ALARM` of honest submissions, and of those over 32 episodes, whose intervals are somewhat short,
+fewer than one in a thousand. Ratios of costs are compared by their logarithms.
 """
 
 import hashlib
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6
 """Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""
 ALARM = 1e-4
-"""Share of honest submissions that chance refuses on fresh episodes, at most."""
+"""Share of honest submissions that chance refuses on fresh episodes where estimates are normal, at most."""
 SEED_BITS = 128
 """Random bits of the seed of fresh episodes: more than a competitor can try."""
 NEGLIGIBLE = 5e-5
@@ -470,7 +471,7 @@ class Deviation(NamedTuple):
     """The number of some results that is furthest from what was found."""
 
     size: float
-    """In units of what rounding, or on fresh episodes chance, explains; infinite where one of both has no such number."""
+    """In units of what rounding, or on fresh episodes chance, explains; infinite where one of both has no number."""
     sentence: str
 
     @property
@@ -553,7 +554,7 @@ def _errors_apart(one: Figure, other: Figure) -> float:
         if figure.metric in LOGARITHMIC:
             numbers = [math.log(max(1.0 + number, SMALLEST)) for number in numbers]
         scale.append(numbers)
-    (a, a_low, a_high), (b, b_low, b_high) = sorted(scale)
+    (a, _, a_high), (b, b_low, _) = sorted(scale)
     within = statistics.NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
     error = math.hypot(a_high - a, b - b_low) / within
     if math.isnan(error) or not math.isfinite(b - a):
