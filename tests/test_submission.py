@@ -516,7 +516,8 @@ def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, comman
         ("Mine.kind = 'reference'\n", "only an estimator"),
         ("Mine.task_keywords = {'range_sigma': 1.0}\n", "in the environment as it is"),
         ("del Mine\n", "'Mine' is no estimator"),
-        ("import filtergym\n", "'source of edited.json' takes no part: ModuleNotFoundError"),
+        ("from filtergym import record\n", "'source of edited.json' takes no part: ImportError"),
+        ("import filtergym.envs\n", "'source of edited.json' takes no part: ModuleNotFoundError"),
         ("def (\n", "'source of edited.json' takes no part: SyntaxError"),
     ],
 )
