@@ -77,7 +77,7 @@ FROZEN = protocol_names()[-1]
 """Name of the newest frozen protocol."""
 TRIAL = "trial"
 """Name of a short one, to try."""
-LOGARITHMIC = ("geometric_cost_difference", "relative_cost_difference")
+LOGARITHMIC = ("geometric_cost_difference",)
 """Metrics that are a ratio of costs less one."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""
