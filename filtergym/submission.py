@@ -5,7 +5,7 @@ names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and execut
 text, which runs only where the reader says that it is trusted, and then in a process that is told what is measured and
 nothing else (:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
 
-Whoever runs a file again finds the same numbers but for rounding: the noise of an episode is a function of its seed.
+A second run of a file gives the same numbers but for rounding: the noise of an episode is a function of its seed.
 Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
 relative. A filter hands on what n measurements have left of an error times the condition number of what it inverts,
 kappa, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7. :data:`TOLERANCE` is the
@@ -17,8 +17,8 @@ number by number. The interval of a difference of independent numbers a in [a_l,
 the half-width sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner,
 Construction of confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are
 stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance refuses
-about the share :data:`ALARM` of honest submissions, and of those over 32 episodes, whose intervals are somewhat short,
-fewer than one in a thousand. Ratios of costs are compared by their logarithms.
+about the share :data:`ALARM` of honest submissions; over 32 episodes, where intervals are somewhat short, RATE. The
+geometric mean of ratios of costs is compared by its logarithm.
 """
 
 import hashlib
@@ -77,8 +77,11 @@ FROZEN = protocol_names()[-1]
 """Name of the newest frozen protocol."""
 TRIAL = "trial"
 """Name of a short one, to try."""
-LOGARITHMIC = ("geometric_cost_difference",)
-"""Metrics that are a ratio of costs less one."""
+GEOMETRIC = "geometric_cost_difference"
+"""A ratio of costs less one, whose logarithm is compared."""
+NOT_COMPARED = "relative_cost_difference"
+"""Metric of fresh episodes: a ratio of two means. Where few lost tracks rule both, its interval is too short; the mean
+cost is compared itself."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""
 
@@ -520,7 +523,8 @@ def fresh_deviation(claimed: Sequence[Figure], fresh: Sequence[Figure]) -> Devia
     Raises:
         KeyError: for other scenarios or metrics.
     """
-    said, known = _by_name(claimed), _by_name(fresh)
+    said = _by_name(claimed)
+    known = {key: own for key, own in _by_name(fresh).items() if own.metric != NOT_COMPARED}
     worst, critical = Deviation(0.0, ""), _critical(len(known))
     for key, own in known.items():
         size = _errors_apart(said[key], own) / critical
@@ -551,7 +555,7 @@ def _errors_apart(one: Figure, other: Figure) -> float:
     scale = []
     for figure in (one, other):
         numbers = [math.nan if number is None else number for number in _numbers(figure)]
-        if figure.metric in LOGARITHMIC:
+        if figure.metric == GEOMETRIC:
             numbers = [math.log(max(1.0 + number, SMALLEST)) for number in numbers]
         scale.append(numbers)
     (a, _, a_high), (b, b_low, _) = sorted(scale)

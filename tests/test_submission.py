@@ -365,6 +365,14 @@ def test_intervals_are_compared_by_the_ends_that_face_each_other(claimed, fresh,
     assert found.size == pytest.approx(size * 1.959964 / submissions._critical(1), rel=1e-6)
 
 
+def test_a_ratio_of_means_is_not_compared_on_fresh_episodes():
+    one, other = (
+        Figure("random", "relative_cost_difference", *numbers) for numbers in ((0, 0, 0), (1, 1, 1))
+    )
+    assert fresh_deviation([one], [other]) == (0.0, "")
+    assert not deviation([one], [other]).holds
+
+
 # --- arrays swapped
 
 
