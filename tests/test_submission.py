@@ -96,6 +96,7 @@ def test_an_honest_submission_holds(name, honest, command):
     assert "the numbers hold" in shown
     digest = read_submission(honest / f"{name}.json")[1]
     assert f"SHA-256 {digest}" in shown
+    assert "to repeat it: filtergym verify" in shown
 
 
 def test_results_are_those_of_an_evaluation(honest):
