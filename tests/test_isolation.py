@@ -73,6 +73,13 @@ def state(truth, N):
     return np.concatenate([truth.position, truth.velocity])[:, :N].astype(float)
 
 
+def truth_of(lanes):
+    try:
+        return lanes.state.truth
+    except IndexError:  # of an earlier evaluation
+        return None
+
+
 class Frames(Honest):
     """Looks into the frames of whoever calls."""
 
@@ -91,7 +98,7 @@ class TwoWords(Honest):
     """Takes the two words from what runs the episodes to the truth, of all objects that there are."""
 
     def known(self, N):
-        everywhere = [own.state.truth for own in gc.get_objects() if type(own).__name__ == "Lanes"]
+        everywhere = [truth_of(own) for own in gc.get_objects() if type(own).__name__ == "Lanes"]
         found = [own for own in (state(truth, N) for truth in everywhere) if own is not None]
         return min(found, key=lambda own: np.nansum(abs(own[:2] - self.m.position)), default=None)
 '''
