@@ -143,6 +143,8 @@ class Entry(NamedTuple):
     environment: ProtocolEnvironment
     name: str
     maker: Any
+    references: tuple[str, ...] = ()
+    """Names of references of the environment that run over the same episodes."""
 
 
 def find_entries(
@@ -210,8 +212,16 @@ class EnvironmentResult(NamedTuple):
     """Held-out scenario with the highest cost against the paper, and that cost; None where there is none."""
     time: ProcessorTime | None
     paper_time: ProcessorTime | None
-    logarithms: numpy.ndarray
-    """Of the cost ratios of all episodes."""
+    costs: Mapping[str, Mapping[str, numpy.ndarray]]
+    """Mean cost of every episode, ``(episodes,)``, by scenario and by the name of what ran: the competitor, the paper's
+    algorithm or a reference."""
+
+    @property
+    def logarithms(self) -> numpy.ndarray:
+        """Logarithms of the cost ratios of the episodes of the training distribution, ``(episodes,)``."""
+        own = self.entry.environment
+        costs = self.costs[own.training]
+        return numpy.log(costs[self.entry.name] / costs[own.paper])
 
 
 class ProtocolResult(NamedTuple):
@@ -300,10 +310,11 @@ def measurements_of(protocol: Protocol, entries: Sequence[Entry]) -> int:
 
 
 def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iterator[list[EvaluationRequest]]:
-    """Yield the requests of each scenario: the paper's algorithm, and the competitor unless it is that."""
+    """Yield the requests of each scenario: the paper's algorithm, references, and the competitor unless it is one."""
     own = entry.environment
     problem = problem_of(own.id)
-    makers = {own.paper: problem.competitor(own.paper), entry.name: entry.maker}
+    makers = {name: problem.competitor(name) for name in (own.paper, *entry.references)}
+    makers[entry.name] = entry.maker
     for scenario in (own.training, *own.held_out):
         usual = scenario == own.training
         episodes = protocol.episodes if usual else protocol.held_out_episodes
@@ -333,12 +344,9 @@ def _result(entry: Entry, cells: Mapping[str, list[Summary]]) -> tuple[Environme
     held = {scenario: estimate(scenario, "geometric_cost_difference").value for scenario in own.held_out}
     worst = max(held, key=held.__getitem__, default=None)
     times = times_of_records(records[own.training])
-    costs = [one.contender.costs for one in cells[own.training]]
-    own_costs, paper_costs = costs[-1], costs[0]
-    assert own_costs is not None  # simulated episodes have a truth
-    assert paper_costs is not None
+    costs = {scenario: dict(_costs(each)) for scenario, each in cells.items()}
     # A count over a number: sums over blocks differ in the last bit from processor to processor, which a tie shows.
-    episodes = len(own_costs)
+    episodes = len(costs[own.training][name])
     lost = round(estimate(own.training, "lost_tracks").value * episodes) / episodes
     return EnvironmentResult(
         entry,
@@ -348,8 +356,14 @@ def _result(entry: Entry, cells: Mapping[str, list[Summary]]) -> tuple[Environme
         None if worst is None else (worst, held[worst]),
         times.get(name),
         times.get(own.paper),
-        numpy.log(own_costs / paper_costs),
+        costs,
     ), [record for each in records.values() for record in each]
+
+
+def _costs(found: Sequence[Summary]) -> Iterator[tuple[str, numpy.ndarray]]:
+    for one in found:
+        assert one.contender.costs is not None  # simulated episodes have a truth, and no bound takes part
+        yield one.contender.name, one.contender.costs
 
 
 def bib_entry(result: ProtocolResult, version: str) -> str:

@@ -5,27 +5,41 @@ names a file. An agent is its arrays (:mod:`..agents.learned_policy`) and execut
 text, which runs only where the reader says that it is trusted, and then in a process that is told what is measured and
 nothing else (:mod:`.evaluation.competitors.isolation`). A competitor of this package is its name.
 
-Whoever runs a file again finds the same numbers but for rounding: the noise of an episode is a function of its seed.
+A second run of a file gives the same numbers but for rounding: the noise of an episode is a function of its seed.
 Processors and libraries agree on sums and products, and differ by some units in the last place of functions, u = 2^-53
 relative. A filter hands on what n measurements have left of an error times the condition number of what it inverts,
 kappa, so that costs differ by about n * kappa * u: of n = 3000 and kappa = 10^6, 3 * 10^-7. :data:`TOLERANCE` is the
 next power of ten.
+
+The seeds of a protocol are public, and a competitor can carry the truth of its episodes. So a verification also runs
+the protocol on fresh episodes, from a seed that did not exist when the file was written, and compares both results
+number by number. The interval of a difference of independent numbers a in [a_l, a_u] and b in [b_l, b_u] with a > b has
+the half-width sqrt((a - a_l)^2 + (b_u - b)^2) (method of variance estimates recovery: G. Y. Zou and A. Donner,
+Construction of confidence limits about effect measures, Statistics in Medicine 27, 2008). The 95 % intervals are
+stretched to the confidence 1 - ALARM / n of a normal distribution for n numbers (Bonferroni), so that chance refuses
+about the share :data:`ALARM` of honest submissions. Over 32 episodes intervals are somewhat short: of pairs of
+batches up to six in 10,000 were refused in the five environments. The geometric mean of ratios of costs is compared by
+its logarithm.
 """
 
 import hashlib
 import inspect
 import math
+import secrets
+import statistics
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
+import numpy
 
 from .agents.learned_policy import load_policy, pretrained_path
 from .agents.named_policies import pretrained_agents
 from .agents.training_run import best_agent, training_scenarios
 from .baselines.problem import Problem, problem_of
+from .envs.contract.parameters import check_integer
 from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import import_user_module, nearest
 from .envs.engine.scenario_choice import find_mixture
@@ -33,6 +47,7 @@ from .evaluation.competitors.isolation import isolate_source
 from .evaluation.competitors.kinds import RANKED, kind_of
 from .evaluation.running.parallel import Workers
 from .evaluation.running.rollout import Progress
+from .evaluation.statistics.bootstrap import CONFIDENCE
 from .evaluation.storage.files import whole_file
 from .protocol import Entry, Protocol, protocol_names, read_protocol, run_protocol
 
@@ -41,6 +56,14 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-6
 """Largest relative difference of a number that is run again; of a ratio, absolute where it is below one."""
+ALARM = 1e-4
+"""Share of honest submissions that chance refuses on fresh episodes where estimates are normal, at most."""
+SEED_BITS = 128
+"""Random bits of the seed of fresh episodes: more than a competitor can try."""
+NEGLIGIBLE = 5e-5
+"""Relative difference of costs that is rounding."""
+SMALLEST = 1e-300
+"""Cost, or ratio of costs, that stands for zero where a logarithm is taken."""
 MOST_BYTES = 8_000_000
 """Of a file."""
 OWN = "submission"
@@ -55,6 +78,11 @@ FROZEN = protocol_names()[-1]
 """Name of the newest frozen protocol."""
 TRIAL = "trial"
 """Name of a short one, to try."""
+GEOMETRIC = "geometric_cost_difference"
+"""A ratio of costs less one, whose logarithm is compared."""
+NOT_COMPARED = "relative_cost_difference"
+"""Metric of fresh episodes: a ratio of two means. Where few lost tracks rule both, its interval is too short; the mean
+cost is compared itself."""
 METRICS = ("cost", *RATIOS, TIME)
 """Metrics of results, beside the one that the environment calls physical."""
 
@@ -342,8 +370,8 @@ def make_submission(
     held, path = pack(problem, name), Path(name)
     submission = Submission(problem.id, __version__, protocol, digest, card, held, ())
     submission = _decode(path, msgspec.json.encode(submission))  # of its declared types
-    results = run_submission(problem, submission, path, True, workers, progress)
-    return msgspec.structs.replace(submission, results=results)
+    made = run_submission(problem, submission, path, True, workers, progress)
+    return msgspec.structs.replace(submission, results=made.figures)
 
 
 def check_submission(problem: Problem, submission: Submission, path: Path) -> Protocol:
@@ -360,6 +388,26 @@ def check_submission(problem: Problem, submission: Submission, path: Path) -> Pr
     return protocol
 
 
+class Suspicion(NamedTuple):
+    """A cost significantly below that of a reference, which knows what no sensor measures."""
+
+    scenario: str
+    reference: str
+    knows: str
+    """What the reference knows beyond the measurements."""
+    difference: float
+    """Geometric mean of the ratios of the episodes' costs, less one."""
+
+
+class Run(NamedTuple):
+    """Results of a submission over the episodes of one seed."""
+
+    seed: int
+    figures: tuple[Figure, ...]
+    suspicions: tuple[Suspicion, ...]
+    """Of the references that took part."""
+
+
 def run_submission(
     problem: Problem,
     submission: Submission,
@@ -367,8 +415,10 @@ def run_submission(
     trust: bool,
     workers: Workers,
     progress: Progress | None = None,
-) -> tuple[Figure, ...]:
-    """Run the competitor of a submission over its protocol, and return the results.
+    seed: int | None = None,
+    references: bool = False,
+) -> Run:
+    """Run the competitor of a submission over the scenarios of its protocol.
 
     Args:
         problem: that it is of.
@@ -376,15 +426,42 @@ def run_submission(
         path: of the file, for errors.
         trust: run source.
         workers: who shares the work.
-        progress: told of measurements done.
+        progress: called with the measurements done.
+        seed: of other episodes than those of the protocol; None: those of the protocol.
+        references: also run the reference of the environment, and compare costs with it.
 
     Raises:
         ValueError: as :func:`check_submission` and :func:`unpack`.
     """
     protocol = check_submission(problem, submission, path)
-    entry = Entry(protocol.environments[0], OWN, unpack(problem, submission, path, trust))
+    if seed is not None:
+        protocol = msgspec.structs.replace(protocol, seed=seed)
+    beside = [problem.baselines.score_reference] if references else []
+    beside = [name for name in beside if name in problem.baselines.references]  # a bound has no cost
+    maker = unpack(problem, submission, path, trust)
+    entry = Entry(protocol.environments[0], OWN, maker, tuple(beside))
     found = run_protocol(protocol, submission.protocol_sha256, [entry], workers, progress)
-    return tuple(_figures(found.records, problem.baselines.physical))
+    suspicions = _suspicions(problem, beside, found.environments[0].costs)
+    return Run(protocol.seed, tuple(_figures(found.records, problem.baselines.physical)), tuple(suspicions))
+
+
+def _suspicions(
+    problem: Problem, references: Sequence[str], costs: Mapping[str, Mapping[str, numpy.ndarray]]
+) -> Iterator[Suspicion]:
+    """Yield the references whose costs are significantly above those of the submission, by a paired t-test.
+
+    Args:
+        problem: whose references they are.
+        references: their names.
+        costs: of every episode, by scenario and competitor.
+    """
+    critical = _critical(len(references) * len(costs))
+    for name in references:
+        for scenario, own in costs.items():
+            logs = numpy.log(numpy.maximum(own[OWN], SMALLEST) / numpy.maximum(own[name], SMALLEST))
+            mean, error = float(logs.mean()), float(logs.std(ddof=1)) / math.sqrt(len(logs))
+            if mean + critical * error < -NEGLIGIBLE:
+                yield Suspicion(scenario, name, problem.knows[name], math.expm1(mean))
 
 
 def _figures(records: "Sequence[Record]", physical: tuple[str, str]) -> Iterator[Figure]:
@@ -398,12 +475,12 @@ class Deviation(NamedTuple):
     """The number of some results that is furthest from what was found."""
 
     size: float
-    """In units of :data:`TOLERANCE`; infinite where one of both has no such number."""
+    """In units of what rounding, or on fresh episodes chance, explains; infinite where one of both has no number."""
     sentence: str
 
     @property
     def holds(self) -> bool:
-        """Whether rounding explains it."""
+        """Whether rounding or chance explains it."""
         return self.size <= 1.0
 
 
@@ -414,19 +491,16 @@ def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
         claimed: of a file.
         found: here.
     """
-
-    def table(figures: Sequence[Figure]) -> dict[tuple[str, str, str], list[float | None]]:
-        own = [f for f in figures if f.metric != TIME]
-        return {(f.scenario, f.metric, f.component): [f.value, f.low, f.high] for f in own}
-
-    said, known = table(claimed), table(found)
+    said, known = _by_name(claimed), _by_name(found)
     worst = Deviation(0.0, "")
     if said.keys() != known.keys() or len(said) != sum(f.metric != TIME for f in claimed):
         odd = sorted(said.keys() ^ known.keys())
         which = " ".join(odd[0]) if odd else "a number twice"
         return Deviation(float("inf"), f"its results are not those of its protocol: {which}")
-    for key, numbers in known.items():
-        for one, other, which in zip(said[key], numbers, ("", "lower end of ", "upper end of "), strict=True):
+    for key, own in known.items():
+        for one, other, which in zip(
+            _numbers(said[key]), _numbers(own), ("", "lower end of ", "upper end of "), strict=True
+        ):
             size = 0.0 if one is None and other is None and which else float("inf")
             if one is not None and other is not None:
                 size = abs(one - other) / (TOLERANCE * (abs(other) + (key[1] in RATIOS)) or 1.0)
@@ -438,6 +512,65 @@ def deviation(claimed: Sequence[Figure], found: Sequence[Figure]) -> Deviation:
                     size, f"{name} in scenario {key[0]!r} is {_number(other)}, and it says {_number(one)}"
                 )
     return worst
+
+
+def fresh_deviation(claimed: Sequence[Figure], fresh: Sequence[Figure]) -> Deviation:
+    """Compare results with those of as many other episodes, by both intervals; times are not compared.
+
+    Args:
+        claimed: results of a file, which hold on their own episodes.
+        fresh: results on fresh episodes, of the same scenarios and metrics.
+
+    Raises:
+        KeyError: for other scenarios or metrics.
+    """
+    said = _by_name(claimed)
+    known = {key: own for key, own in _by_name(fresh).items() if own.metric != NOT_COMPARED}
+    worst, critical = Deviation(0.0, ""), _critical(len(known))
+    for key, own in known.items():
+        size = _errors_apart(said[key], own) / critical
+        if size > worst.size:
+            name = f"{key[1]} {key[2]}".rstrip()
+            worst = Deviation(
+                size,
+                f"{name} in scenario {key[0]!r} is {_estimate(own)}, and the file states {_estimate(said[key])}",
+            )
+    return worst
+
+
+def _by_name(figures: Sequence[Figure]) -> dict[tuple[str, str, str], Figure]:
+    return {(f.scenario, f.metric, f.component): f for f in figures if f.metric != TIME}
+
+
+def _numbers(figure: Figure) -> tuple[float | None, float | None, float | None]:
+    return figure.value, figure.low, figure.high
+
+
+def _critical(count: int) -> float:
+    """Return how many standard errors all of some numbers are within with probability ``1 - ALARM``, at least."""
+    return statistics.NormalDist().inv_cdf(1.0 - 0.5 * ALARM / max(count, 1))
+
+
+def _errors_apart(one: Figure, other: Figure) -> float:
+    """Return the difference of two independent numbers in standard errors; infinite where there is no interval."""
+    scale = []
+    for figure in (one, other):
+        numbers = [math.nan if number is None else number for number in _numbers(figure)]
+        if figure.metric == GEOMETRIC:
+            numbers = [math.log(max(1.0 + number, SMALLEST)) for number in numbers]
+        scale.append(numbers)
+    (a, _, a_high), (b, b_low, _) = sorted(scale)
+    within = statistics.NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
+    error = math.hypot(a_high - a, b - b_low) / within
+    if math.isnan(error) or not math.isfinite(b - a):
+        return math.inf
+    if b - a <= TOLERANCE * max(abs(a), abs(b)):  # also where both have no width
+        return 0.0
+    return (b - a) / error if error > 0.0 else math.inf
+
+
+def _estimate(figure: Figure) -> str:
+    return f"{_number(figure.value)} [{_number(figure.low)}, {_number(figure.high)}]"
 
 
 def _number(value: float | None) -> str:
@@ -454,6 +587,17 @@ class Verification(NamedTuple):
     """Of the results of the file from those over the same episodes here."""
     again: tuple[Figure, ...]
     """Those."""
+    fresh: Run | None
+    """Results over fresh episodes, with the seed that repeats them; None where the same episodes decided."""
+    fresh_deviation: Deviation
+    """Of the results of the file from the fresh ones."""
+    suspicions: tuple[Suspicion, ...]
+    """Costs below what is attainable, over the fresh episodes, or over the same where there are none."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether rounding explains the one deviation, and chance the other."""
+        return self.deviation.holds and self.fresh_deviation.holds
 
 
 def verify(
@@ -461,20 +605,43 @@ def verify(
     trust: bool = False,
     workers: Workers | None = None,
     progress: Progress | None = None,
+    seed: int | None = None,
+    same_seeds: bool = False,
 ) -> Verification:
-    """Run the protocol of a submission again.
+    """Run the protocol of a submission again, on its own episodes and then on fresh ones.
+
+    Results that do not hold on their own episodes are not run on fresh ones.
 
     Args:
         path: of the file.
         trust: run source.
         workers: who shares the work; default: this process.
-        progress: told of measurements done.
+        progress: called with the measurements done.
+        seed: of the fresh episodes, to repeat a verification; default: 128 random bits.
+        same_seeds: run the episodes of the protocol only. A competitor that carries their truth passes.
 
     Raises:
         ValueError: if it is no submission, not of this package's protocol, or holds source and is not
-            trusted.
+            trusted; and for a seed that is none, is the protocol's, or is given with ``same_seeds``.
     """
     submission, digest = read_submission(path)
     problem = problem_of(submission.environment)
-    again = run_submission(problem, submission, path, trust, workers or Workers(), progress)
-    return Verification(submission, digest, deviation(submission.results, again), again)
+    if seed is not None:
+        seed = check_integer("seed", seed, 0)
+        if same_seeds:
+            raise ValueError(f"the same seeds leave no choice of a seed: leave out seed {seed} or same_seeds")
+        if seed == check_submission(problem, submission, path).seed:
+            raise ValueError(
+                f"seed {seed} is that of the protocol, whose episodes are public: choose another, or same_seeds"
+            )
+    workers = workers or Workers()
+    again = run_submission(problem, submission, path, trust, workers, progress, None, same_seeds)
+    found = deviation(submission.results, again.figures)
+    if same_seeds or not found.holds:
+        return Verification(
+            submission, digest, found, again.figures, None, Deviation(0.0, ""), again.suspicions
+        )
+    seed = secrets.randbits(SEED_BITS) if seed is None else seed
+    fresh = run_submission(problem, submission, path, trust, workers, progress, seed, True)
+    apart = fresh_deviation(submission.results, fresh.figures)
+    return Verification(submission, digest, found, again.figures, fresh, apart, fresh.suspicions)

@@ -149,6 +149,8 @@ def test_a_blind_recording_holds_all_that_is_received_and_no_truth(files, tmp_pa
     experiment = problem_of(TARGET).experiment(None)
     recording = record(TARGET, **SETTINGS)
     write_blind(tmp_path, recording, experiment.make_task())
+    assert "seed" in recording.source
+    assert b"seed" not in (tmp_path / "measurements.nc").read_bytes()
     table = pandas.read_csv(tmp_path / "measurements.csv").set_index(["track", "measurement"])
     written = pandas.read_csv(folder / "imm.csv").set_index(["recording", "measurement"])
     np.testing.assert_allclose(table["seconds"], written["seconds"], rtol=1e-12)

@@ -1,11 +1,13 @@
 """An estimator in a process of its own: it answers what it answers anywhere, and finds no truth."""
 
+import json
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors import isolation
 from filtergym.evaluation.competitors.isolated_estimator import landlock_version
 from filtergym.evaluation.competitors.isolation import isolate_source
 from filtergym.evaluation.competitors.program_process import ENDED
@@ -57,7 +59,7 @@ class Recreates(Honest):
             again = filtergym.record("filtergym/ManeuveringTarget-v0", None, EPISODES, seed=SEED, horizon=HORIZON)
             self.who = ((initial.mean[None] - again.initial["mean"][:, :, None]) ** 2).sum(1).argmin(0)
             self.truth = again.truth
-        except ImportError:
+        except (ImportError, AttributeError):
             pass
         return super().start(initial, N)
 
@@ -69,6 +71,13 @@ def state(truth, N):
     if not hasattr(truth, "velocity") or np.shape(truth.position)[-1] < N:
         return None
     return np.concatenate([truth.position, truth.velocity])[:, :N].astype(float)
+
+
+def truth_of(lanes):
+    try:
+        return lanes.state.truth
+    except IndexError:  # of an earlier evaluation
+        return None
 
 
 class Frames(Honest):
@@ -89,7 +98,7 @@ class TwoWords(Honest):
     """Takes the two words from what runs the episodes to the truth, of all objects that there are."""
 
     def known(self, N):
-        everywhere = [own.state.truth for own in gc.get_objects() if type(own).__name__ == "Lanes"]
+        everywhere = [truth_of(own) for own in gc.get_objects() if type(own).__name__ == "Lanes"]
         found = [own for own in (state(truth, N) for truth in everywhere) if own is not None]
         return min(found, key=lambda own: np.nansum(abs(own[:2] - self.m.position)), default=None)
 '''
@@ -124,7 +133,7 @@ import ctypes, importlib, os, signal, socket, subprocess, sys
 import numpy as np
 
 ATTEMPTS = {
-    "the package": lambda: importlib.import_module("filtergym"),
+    "the package": lambda: importlib.import_module("filtergym.envs"),
     "its files": lambda: open(PACKAGE).read(),
     "what runs it": lambda: open(f"/proc/{os.getppid()}/cmdline").read(),
     "its memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
@@ -174,18 +183,74 @@ def test_nothing_can_be_reached_from_inside(tmp_path):
     assert names[np.concatenate(reached) > 0.0].tolist() == []
 
 
-def test_what_is_isolated_answers_what_it_answers_anywhere(monkeypatch):
+BESIDE = """
+import beside
+import linked
+
+
+class Beside:
+    def start(self, initial, N):
+        try:
+            open(PACKAGE)
+            return None
+        except PermissionError:
+            return initial
+
+    def update(self, measurement, memory):
+        return 0.0 * memory.mean + beside.STEP + linked.STEP, memory.covariance, memory
+"""
+
+
+@pytest.mark.skipif(landlock_version() < 1, reason="this system has no Landlock")
+def test_a_library_in_the_same_folder_as_the_package_is_found(tmp_path, monkeypatch):
+    """As in an installation from a wheel; some installers write links."""
+    folder, elsewhere = tmp_path / "site-packages", tmp_path / "elsewhere"
+    package = folder / "filtergym"
+    package.mkdir(parents=True)
+    elsewhere.mkdir()
+    (package / "__init__.py").touch()
+    (folder / "beside.py").write_text("STEP = 1.0\n")
+    (elsewhere / "linked.py").write_text("STEP = 2.0\n")
+    (folder / "linked.py").symlink_to(elsewhere / "linked.py")
+    monkeypatch.syspath_prepend(folder)
+    known = isolation.package_folders()
+    monkeypatch.setattr(isolation, "package_folders", lambda: [*known, package])
+    apart = isolate_source(f"PACKAGE = {str(package / '__init__.py')!r}\n{BESIDE}", "Beside", "beside")
+    model = make_model(ID, horizon=2)
+    for episode, _ in rollout(model, apart, [0]):
+        np.testing.assert_array_equal(episode.filter.mean[:, :1], 3.0)
+
+
+def test_links_to_the_files_of_the_package_open_no_way_to_them(tmp_path, monkeypatch):
+    """An editable installation may hold links to a clone, in which the estimator may lie."""
+    clone, links = tmp_path / "clone", tmp_path / "links"
+    (clone / "filtergym").mkdir(parents=True)
+    links.mkdir()
+    (clone / "filtergym" / "__init__.py").touch()
+    (clone / "mine.py").touch()
+    (links / "__init__.py").symlink_to(clone / "filtergym" / "__init__.py")
+    monkeypatch.setattr(isolation, "package_folders", lambda: [links])
+    request = json.loads(isolate_source("", "Mine", "mine", clone / "mine.py").preface)
+    assert str(clone / "mine.py") in request["readable"]
+    assert not [path for path in request["readable"] if (clone / "filtergym").is_relative_to(path)]
+    assert not [path for path in request["readable"] if Path(path).is_relative_to(clone / "filtergym")]
+
+
+@pytest.mark.parametrize("own", ["mine:Mine", "filterpy_filters:Imm", "stone_soup_kalman:Kalman"])
+def test_what_is_isolated_answers_what_it_answers_anywhere(own, monkeypatch):
+    """Filters of other libraries, too, whose adapters are in the package."""
     lanes = 11
     monkeypatch.syspath_prepend(EXAMPLES)
-    monkeypatch.delitem(sys.modules, "mine", raising=False)  # that of another test
+    module = own.partition(":")[0]
+    monkeypatch.delitem(sys.modules, module, raising=False)  # that of another test
     model = make_model(ID, scenario="glint", horizon=20)
     means = [
         np.stack(
             [e.filter.mean[:, :lanes].copy() for e, _ in rollout(model, competitor(ID, name), range(lanes))]
         )
-        for name in ("isolated:mine:Mine", "mine:Mine")
+        for name in (f"isolated:{own}", own)
     ]
-    sys.modules.pop("mine", None)
+    sys.modules.pop(module, None)
     np.testing.assert_allclose(
         means[0], means[1], rtol=1e-12
     )  # arrays may lie otherwise, and products round so

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -90,7 +91,7 @@ for k, line in enumerate(sys.stdin):
 def task_of(components=2):
     """A task as far as a program is told of it."""
     named = [Component(f"c{i}", "m") for i in range(components)]
-    return SimpleNamespace(id="mine/Task-v0", components=named, parameters=None, closes_loop=False)
+    return SimpleNamespace(id="mine/Task-v0", components=named, groups={}, parameters=None, closes_loop=False)
 
 
 def given(N, components=2):
@@ -215,6 +216,20 @@ def test_what_is_no_program_is_refused_before_anything_runs():
         pass
     with limit_programs(3.0, 70.0):
         assert Program("true").limits == LIMITS.get() == (3.0, 70.0)
+
+
+@pytest.mark.skipif(sys.prefix == sys.base_prefix, reason="this Python runs in no virtual environment")
+def test_python_is_the_one_of_the_environment_whether_it_is_activated_or_not(tmp_path, monkeypatch):
+    """It has the package, however that was installed."""
+    other = tmp_path / "python"
+    other.write_text("#!/bin/sh\nexit 3\n")
+    other.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    text = "import json, sys, filtergym.adapters; input(); print(json.dumps({'error': sys.prefix}))"
+    with pytest.raises(ValueError, match=f"takes no part: {re.escape(sys.prefix)}$"):
+        run(f'python -c "{text}"')
+    with pytest.warns(UserWarning, match="exit status 3"):
+        run(str(other))
 
 
 def test_a_process_cannot_go_back(hold):

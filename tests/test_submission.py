@@ -1,4 +1,4 @@
-"""Submissions: honest ones hold wherever they are run again; whatever lies is caught or refused."""
+"""Submissions: honest ones hold wherever they are run again; lies and stored answers are refused."""
 
 import base64
 import json
@@ -16,8 +16,10 @@ from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors import isolated_estimator
+from filtergym.evaluation.running import evaluate as evaluations
 from filtergym.evaluation.running.parallel import Workers
 
+import filtergym
 from filtergym import submission as submissions
 from filtergym.protocol import read_protocol
 from filtergym.submission import (
@@ -25,7 +27,10 @@ from filtergym.submission import (
     TIME,
     TOLERANCE,
     Card,
+    Figure,
+    Run,
     deviation,
+    fresh_deviation,
     make_submission,
     protocol_of,
     read_submission,
@@ -91,6 +96,7 @@ def test_an_honest_submission_holds(name, honest, command):
     assert "the numbers hold" in shown
     digest = read_submission(honest / f"{name}.json")[1]
     assert f"SHA-256 {digest}" in shown
+    assert "to repeat it: filtergym verify" in shown
 
 
 def test_results_are_those_of_an_evaluation(honest):
@@ -116,13 +122,13 @@ def test_results_are_those_of_an_evaluation(honest):
 @pytest.fixture(scope="module")
 def found(honest):
     """Results of the honest agent, run again once."""
-    return verify(honest / "agent.json").again
+    return verify(honest / "agent.json", same_seeds=True).again
 
 
 @pytest.fixture
 def run_once(found, monkeypatch):
     """Take those, for tests that edit nothing but what the file says of them."""
-    monkeypatch.setattr(submissions, "run_submission", lambda *arguments: found)
+    monkeypatch.setattr(submissions, "run_submission", lambda *arguments: Run(0, found, ()))
 
 
 def lower(figure):
@@ -180,6 +186,192 @@ def test_rounding_holds_and_times_are_not_compared(honest):
             assert not deviation(odd, known).holds
     nothing = [msgspec.structs.replace(f, value=None, low=None, high=None) for f in known]
     assert not deviation(nothing, nothing).holds
+
+
+# --- answers stored
+
+STORED = '''
+import base64
+
+import numpy
+
+
+def table(text, kind, *shape):
+    return numpy.frombuffer(base64.b85decode(text), kind).reshape(len(START), *shape)
+
+
+START = numpy.frombuffer(base64.b85decode({start!r})).reshape(-1, 2)
+FIRST, FULL = table({first!r}, "f8", 2), table({full!r}, "f4", -1, 4)
+HALF = table({half!r}, "f2", -1, 4)
+
+
+class Stored:
+    """Answers with the stored truth where it recognises an episode, and elsewhere by an alpha-beta filter."""
+
+    truth, keys, offset = FULL, START, 0.0
+
+    def start(self, initial, N):
+        self.shown, self.k = initial.mean[:2], 0
+        return initial.mean, initial.covariance
+
+    def update(self, m, memory):
+        mean, P = memory
+        predicted = mean[:2] + m.interval * mean[2:]
+        r = numpy.nan_to_num(m.position - predicted)
+        mean = numpy.concatenate([predicted + 0.5 * r, mean[2:] + 0.2 * r / m.interval])
+        if self.k == 0:
+            shown = self.shown if self.keys is START else m.position
+            away = numpy.nan_to_num(abs(self.keys[:, :, None] - shown).sum(1), nan=numpy.inf)
+            self.rows, self.known = away.argmin(0), away.min(0) < 1e-6
+        truth = self.truth[self.rows, self.k].T.astype(float) * (1.0 if self.truth is FULL else 1e3) + self.offset
+        self.k += 1
+        return numpy.where(self.known, truth, mean), P, (mean, P)
+
+
+class Offset(Stored):
+    """Far enough from the truth to cost something."""
+
+    offset = 25.0
+
+
+class Half(Stored):
+    """A small table."""
+
+    truth = HALF
+
+
+class Guesses(Stored):
+    """Guesses the seed by the first measurement."""
+
+    keys = FIRST
+'''
+
+
+@pytest.fixture(scope="module")
+def cheats(tmp_path_factory):
+    """Folder of submissions that carry the truth of the episodes of two seeds, that of the protocol among them."""
+    folder = tmp_path_factory.mktemp("cheats")
+    flown = [filtergym.record(ID, "random", 32, seed=seed) for seed in (1, 0)]
+    truth = np.concatenate([each.truth[:, :-1] for each in flown])
+    arrays = {
+        "start": np.concatenate([each.initial["mean"][:, :2] for each in flown]),
+        "first": np.concatenate([each.measurements["position"][:, 0] for each in flown]),
+        "full": truth.astype("f4"),
+        "half": (truth / 1e3).astype("f2"),
+    }
+    text = STORED.format(**{name: base64.b85encode(own.tobytes()).decode() for name, own in arrays.items()})
+    (folder / "stored_truth.py").write_text(text, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        patch.setattr(evaluations, "measure_time", lambda *arguments: None)
+        for name in ("Stored", "Offset", "Half", "Guesses"):
+            stored(folder / f"{name}.json", f"stored_truth:{name}")
+    sys.modules.pop("stored_truth", None)
+    return folder
+
+
+@pytest.fixture
+def untimed(monkeypatch):
+    """Leave out the measurement of times, which takes as long as all the rest."""
+    monkeypatch.setattr(evaluations, "measure_time", lambda *arguments: None)
+
+
+def headline(figures):
+    [found] = [f for f in figures if f.metric == "geometric_cost_difference"]
+    return found
+
+
+@pytest.mark.parametrize("name", ["Stored", "Offset", "Half", "Guesses"])
+def test_stored_answers_do_not_hold_on_fresh_episodes(name, cheats, untimed):
+    found = verify(cheats / f"{name}.json", trust=True)
+    assert headline(found.submission.results).value < -0.9
+    assert found.deviation.holds  # the numbers are those of the competitor, on these episodes
+    assert not found.holds
+    assert "and the file states" in found.fresh_deviation.sentence
+    assert headline(found.fresh.figures).value > 0.0
+    assert found.suspicions == ()
+
+
+def test_the_same_seeds_show_only_that_the_cost_is_unattainable(cheats, command, untimed):
+    code, shown, errors = command("verify", cheats / "Stored.json", "--trust", "--same-seeds")
+    assert code == 0, errors
+    assert "suspicious: in scenario 'random' the cost is 100 % below that of 'known-turn'" in shown
+    assert "stored answers would hold, too" in shown
+
+
+def test_an_honest_submission_holds_on_any_fresh_episodes_and_they_can_be_repeated(honest, untimed):
+    path, runs = honest / "shipped.json", []
+    for seed in (2**127 + 1, 2**127 + 2, 2**127 + 3, None, None):
+        found = verify(path, seed=seed)
+        assert (found.holds, found.suspicions) == (True, ())
+        assert 0.0 < found.fresh_deviation.size < 1.0
+        assert seed in (None, found.fresh.seed)
+        runs.append(found.fresh)
+    assert len({run.seed for run in runs}) == len({headline(run.figures).value for run in runs}) == 5
+    again = verify(path, seed=runs[-1].seed).fresh
+    assert deviation(again.figures, runs[-1].figures) == (0.0, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--seed", 0), "seed 0 is that of the protocol"),
+        (("--seed", -1), "seed"),
+        (("--seed", 5, "--same-seeds"), "leave out seed 5"),
+    ],
+)
+def test_a_seed_that_is_not_fresh_is_refused(words, sentence, honest, command):
+    assert sentence in refused(command, honest / "shipped.json", *words)
+
+
+def test_chance_refuses_as_often_as_it_is_meant_to():
+    """Of normal estimates of one law as many are some standard errors apart as the normal distribution has."""
+    rng, critical = np.random.default_rng(0), submissions._critical(1)
+
+    def figure(metric, value, error):
+        ends = value - 1.959964 * error, value + 1.959964 * error
+        if metric == "geometric_cost_difference":
+            value, *ends = np.expm1([value, *ends])
+        return [Figure("random", metric, value, *ends)]
+
+    for metric in ("anees", "geometric_cost_difference"):
+        apart = []
+        for one, other in rng.normal(1.0, [0.05, 0.12], (4000, 2)):
+            claimed, fresh = figure(metric, one, 0.05), figure(metric, other, 0.12)
+            found = fresh_deviation(claimed, fresh)
+            assert found.size * critical == pytest.approx(abs(one - other) / np.hypot(0.05, 0.12), rel=1e-5)
+            apart.append(found.size * critical)
+        for limit, share in ((1.0, 0.317), (1.96, 0.05), (2.58, 0.0099)):
+            # Four standard errors of a share of 4000.
+            assert np.mean(np.array(apart) > limit) == pytest.approx(
+                share, abs=4.0 * math.sqrt(share / 4000.0)
+            )
+
+
+@pytest.mark.parametrize(
+    ("claimed", "fresh", "size"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0),
+        ((1.0, 1.0, 1.0), (1.0 + 1e-9, 1.0 + 1e-9, 1.0 + 1e-9), 0.0),
+        ((1.0, 1.0, 1.0), (1.1, 1.1, 1.1), math.inf),
+        ((1.0, None, None), (1.0, 0.9, 1.1), math.inf),
+        ((1.0, 0.9, 1.1), (None, None, None), math.inf),
+        ((math.nan, 0.9, 1.1), (1.0, 0.9, 1.1), math.inf),
+        ((1.0, 0.0, 9.0), (3.0, 2.0, 4.0), 2.0 / math.hypot(8.0, 1.0)),
+        ((3.0, 2.0, 4.0), (1.0, 0.0, 9.0), 2.0 / math.hypot(8.0, 1.0)),
+    ],
+)
+def test_intervals_are_compared_by_the_ends_that_face_each_other(claimed, fresh, size):
+    found = fresh_deviation(*([Figure("random", "anees", *numbers, "state")] for numbers in (claimed, fresh)))
+    assert found.size == pytest.approx(size * 1.959964 / submissions._critical(1), rel=1e-6)
+
+
+def test_a_ratio_of_means_is_not_compared_on_fresh_episodes():
+    one, other = (
+        Figure("random", "relative_cost_difference", *numbers) for numbers in ((0, 0, 0), (1, 1, 1))
+    )
+    assert fresh_deviation([one], [other]) == (0.0, "")
+    assert not deviation([one], [other]).holds
 
 
 # --- arrays swapped
@@ -333,7 +525,8 @@ def test_a_name_in_a_file_imports_and_opens_nothing(change, trap, edited, comman
         ("Mine.kind = 'reference'\n", "only an estimator"),
         ("Mine.task_keywords = {'range_sigma': 1.0}\n", "in the environment as it is"),
         ("del Mine\n", "'Mine' is no estimator"),
-        ("import filtergym\n", "'source of edited.json' takes no part: ModuleNotFoundError"),
+        ("from filtergym import record\n", "'source of edited.json' takes no part: ImportError"),
+        ("import filtergym.envs\n", "'source of edited.json' takes no part: ModuleNotFoundError"),
         ("def (\n", "'source of edited.json' takes no part: SyntaxError"),
     ],
 )

@@ -1,18 +1,36 @@
 """Estimators that are written for one episode, in the table beside those that take all of them at once.
 
-One object an episode, each asked in turn: honest, and slow.
+One object an episode, each asked in turn: honest, and slow. An estimator in a process of its own has this module, too
+(:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy
 
-from ...envs.contract.task import Array, Task
-from .filters import select_lanes
-from .kinds import Kind
+if TYPE_CHECKING:
+    from ...envs.contract.task import Task
+    from .kinds import Kind
+
+Array = Any
+"""A NumPy array."""
+
+
+def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
+    """Return nested tuples and dictionaries of arrays with some entries of their last axis, each an array of its own,
+    or with one entry, without that axis.
+    """
+    if part is None:
+        return None
+    if isinstance(part, dict):
+        return {name: select_lanes(item, lanes) for name, item in part.items()}
+    if isinstance(part, tuple):
+        parts = [select_lanes(item, lanes) for item in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+    return part[..., lanes]
 
 
 class SingleTrackEstimator(ABC):
@@ -28,12 +46,12 @@ class SingleTrackEstimator(ABC):
         ValueError: if ``state`` lacks a component of the task.
     """
 
-    kind: ClassVar[Kind] = "estimator"
+    kind: ClassVar["Kind"] = "estimator"
     state: Sequence[str] = ()
     """Names of the numbers of the estimator's state, in its order: the task's components in any order, and whatever
     else there is. Default: the task's components in theirs."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "Task") -> None:
         self.task = task
         components = [component.name for component in task.components]
         self.state = tuple(self.state) or tuple(components)

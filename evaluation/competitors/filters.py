@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
-from ...compiler.functions import map_arrays
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
 from ...envs.contract.filter import Filter, Input, Likelihood, State, Stated
@@ -21,6 +20,7 @@ from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
+from .adapters import select_lanes
 from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, make_competitor
 from .programs import ProgramEstimator
 
@@ -28,13 +28,6 @@ AFTER_MISSED = 5.0
 """Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
 """What starts and updates with nothing but the initial estimate and the measurements."""
-
-
-def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
-    """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
-    entry, without that axis.
-    """
-    return map_arrays(lambda values: values[..., lanes], part)
 
 
 class Adapted(NamedTuple):

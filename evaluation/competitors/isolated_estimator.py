@@ -2,21 +2,24 @@
 
 :mod:`.isolation` starts this file with the interpreter's ``-I -S``. Its first line of input is a request in JSON: the
 source text of the estimator, or its file; the folders where libraries are; and what may be read at all. Then comes the
-hello. Nothing of the package is imported here, nor can it be: on Linux, Landlock (landlock(7)) lets the process read
-the libraries and the folder of the estimator, write nothing, begin no other program, open no TCP connection, and look
-into no other process. Elsewhere the package is only not on the path.
+hello. Of the package there is only what the request carries as text, ``filtergym.adapters``, which knows no world and
+no seed, so it does not matter how the package was installed. The rest cannot be imported: on Linux, Landlock
+(landlock(7)) lets the process read the libraries and the folder of the estimator, write nothing, begin no other
+program, open no TCP connection, and look into no other process. Elsewhere the package is only not on the path.
 """
 
 import ctypes
 import json
 import os
 import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 from typing import Any, BinaryIO
 
 LANES = 8
 """The number of episodes is filled up to a multiple, as the package does: rounding depends on it."""
-READ = (1 << 2) | (1 << 3)
+READ, LIST = 1 << 2, 1 << 3
 """Rights of Landlock to read a file and to list a folder; those handled are all that a version knows."""
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 """Rights over files, by the version of Landlock; later ones have as many as the last."""
@@ -35,11 +38,12 @@ def landlock_version() -> int:
     return version
 
 
-def wall(readable: list[str]) -> bool:
+def wall(readable: list[str], listable: list[str]) -> bool:
     """Close this process in, for good; returns whether the system can.
 
     Args:
         readable: files and folders that may be read, with all below them.
+        listable: folders of which the names may be read, with those of all folders below them.
     """
     version = landlock_version()
     if version < 1:
@@ -51,12 +55,12 @@ def wall(readable: list[str]) -> bool:
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     rules = libc.syscall(CREATE_RULESET, handled, ctypes.c_size_t(size), 0)
-    for path in readable:
+    for path, wanted in [*((path, READ | LIST) for path in readable), *((path, LIST) for path in listable)]:
         try:
             place = os.open(path, os.O_PATH | os.O_CLOEXEC)
         except OSError:
             continue
-        allowed = READ if os.path.isdir(path) else READ & (1 << 2)
+        allowed = wanted if os.path.isdir(path) else READ
         rule = allowed.to_bytes(8, "little") + place.to_bytes(4, "little")
         if libc.syscall(ADD_RULE, rules, 1, rule, 0):
             raise OSError(ctypes.get_errno(), f"landlock refuses {path}")
@@ -65,6 +69,27 @@ def wall(readable: list[str]) -> bool:
         raise OSError(ctypes.get_errno(), "landlock restricts nothing")
     os.close(rules)
     return True
+
+
+class SharedModules(MetaPathFinder, Loader):
+    """Finds the modules of the package that a request carries as text, with the packages around them.
+
+    Args:
+        texts: by the names of modules.
+    """
+
+    def __init__(self, texts: dict[str, str]) -> None:
+        self.texts = texts
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Find a module that is shared, or a package around one."""
+        around = any(shared.startswith(name + ".") for shared in self.texts)
+        return ModuleSpec(name, self, is_package=around) if around or name in self.texts else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run the text of a module; that of a package is empty."""
+        name = module.__name__
+        exec(compile(self.texts.get(name, ""), name, "exec", dont_inherit=True), module.__dict__)
 
 
 def nested(values: dict[str, Any], name: str) -> Any:
@@ -94,8 +119,13 @@ def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
     """Return what the constructor of an estimator is given in place of the task."""
     parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in hello["parameters"].items()}
     components = tuple(SimpleNamespace(**own) for own in hello["components"])
+    groups = {name: tuple(parts) for name, parts in hello["groups"].items()}
     return SimpleNamespace(
-        id=hello["environment"], components=components, parameters=Parameters(**parameters), xp=numpy
+        id=hello["environment"],
+        components=components,
+        groups=groups,
+        parameters=Parameters(**parameters),
+        xp=numpy,
     )
 
 
@@ -166,8 +196,9 @@ def main() -> None:
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what an estimator prints is no answer
     request, hello = json.loads(questions.readline()), json.loads(questions.readline())
-    closed = wall(request["readable"])
+    closed = wall(request["readable"], request["listable"])
     sys.path[:] = request["path"]
+    sys.meta_path.insert(0, SharedModules(request["shared"]))
     import numpy
 
     try:

@@ -1,8 +1,8 @@
 """Python estimators in a process of their own, which is told what is measured and nothing else.
 
 What :mod:`.isolated_estimator` needs is put together here: the text of the estimator, which this process never
-executes, and what the other one may read: Python's library, the installed packages but this one, and the folder of the
-estimator.
+executes, what the other one may read (Python's library, the installed packages but this one, and the folder of the
+estimator), and the texts of the modules of this package that are meant for estimators.
 """
 
 import json
@@ -10,6 +10,7 @@ import os
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 from ...envs.engine.catalogue import find_user_module
@@ -19,6 +20,10 @@ from .programs import LIMITS, Program
 
 ISOLATED = "isolated:"
 """Before ``module:Class`` of an estimator, for one in a process of its own."""
+SHARED = ("adapters", "evaluation.competitors.adapters", "evaluation.competitors.stone_soup")
+"""Modules of this package that an isolated estimator may import: they know one track, no world and no seed."""
+INIT = "__init__.py"
+"""File that each folder of this package has."""
 SYSTEM = (
     "/lib",
     "/lib64",
@@ -65,15 +70,22 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
     """
     folder = [] if file is None else [str(file.parent.absolute())]
     libraries = _libraries()
-    forbidden = [place.resolve() for place in package_folders()]
-    readable = [*SYSTEM, *libraries, sys.base_prefix + "/lib", *folder]
+    # Some editable installations hold links to files, so the folders of these count, too.
+    forbidden = [
+        own.resolve() for place in package_folders() for own in (place, (place / INIT).resolve().parent)
+    ]
+    allowed = [Path(place) for place in (*SYSTEM, *libraries, sys.base_prefix + "/lib", *folder)]
+    allowed += [place for library in libraries for place in Path(library).glob("*") if place.is_symlink()]
     request = {
         "source": text,
         "file": name if file is None else str(file.absolute()),
         "module": "isolated" if file is None else file.stem,
         "name": attribute,
         "path": [*libraries, *folder],
-        "readable": sorted({path for place in readable for path in _without(Path(place), forbidden)}),
+        "readable": sorted({path for place in allowed for path in _without(place, forbidden)}),
+        # An import needs the names in the folder that holds a library; some installations have this package there, too.
+        "listable": [*libraries, *folder],
+        "shared": _shared_modules(),
     }
     return Program(
         name,
@@ -90,6 +102,13 @@ def _libraries() -> list[str]:
     extensions = [str(Path(place) / "lib-dynload") for place in own]
     packages = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     return list(dict.fromkeys([*own, *extensions, *packages]))
+
+
+def _shared_modules() -> dict[str, str]:
+    """Return the texts of the modules that an isolated estimator may import, by their names."""
+    package = __name__.partition(".")[0]
+    specs = [find_spec(f"{package}.{name}") for name in SHARED]
+    return {spec.name: Path(str(spec.origin)).read_text(encoding="utf-8") for spec in specs if spec}
 
 
 def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:

@@ -21,6 +21,7 @@ import json
 import os
 import shlex
 import shutil
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -67,6 +68,16 @@ def limit_programs(seconds: float, memory: float) -> Iterator[None]:
         LIMITS.reset(token)
 
 
+def search_path() -> str:
+    """Return the folders where programs are looked for, with those of the virtual environment first that runs this
+    process: ``python`` is the interpreter that has the package, whether the environment is activated or not.
+    """
+    usual = os.environ.get("PATH", os.defpath)
+    return (
+        usual if sys.prefix == sys.base_prefix else os.pathsep.join([os.path.join(sys.prefix, "bin"), usual])
+    )
+
+
 @dataclass(frozen=True)
 class Program:
     """A program that competes, as an estimator; made for a task it waits for a track to begin.
@@ -87,7 +98,7 @@ class Program:
     preface: bytes = field(default=b"", repr=False)
     """What is written before the hello."""
     environment: tuple[tuple[str, str], ...] | None = None
-    """Variables of the process; None: ours."""
+    """Variables of the process; None: ours, with :func:`search_path`."""
     kind: ClassVar[Kind] = "estimator"
 
     def __post_init__(self) -> None:
@@ -99,7 +110,7 @@ class Program:
             words = tuple(shlex.split(self.command))
         except ValueError as error:
             raise ValueError(f"{self.command!r} is no command: {error}") from None
-        if not words or shutil.which(words[0]) is None:
+        if not words or shutil.which(words[0], path=search_path()) is None:
             raise ValueError(
                 f"there is no program {words[0] if words else ''!r} to run: exec: takes a command, such as "
                 "'exec:./tracker --fast'"
@@ -215,9 +226,8 @@ class ProgramEstimator:
             self._steering = Field("feedback", shape, "float64", self.task.feedback_words)
         try:
             own = self.program.environment
-            self._process = ProgramProcess(
-                self.program.words, self.program.limits, None if own is None else dict(own)
-            )
+            variables = {**os.environ, "PATH": search_path()} if own is None else dict(own)
+            self._process = ProgramProcess(self.program.words, self.program.limits, variables)
         except OSError as error:
             raise ValueError(f"{self.program.command!r} cannot be started: {error.strerror}") from None
         return 0
@@ -283,6 +293,7 @@ class ProgramEstimator:
             "formats": ["json", "float64"],
             "environment": self.task.id,
             "components": [component._asdict() for component in self.task.components],
+            "groups": {name: list(parts) for name, parts in self.task.groups.items()},
             "initial": [own._asdict() for own in self._fields],
             "measurement": [own._asdict() for own in measured],
             **offered,

@@ -9,8 +9,7 @@ from stonesoup.types.detection import Detection
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 
-from ...envs.contract.task import Array
-from .adapters import SingleTrackEstimator
+from .adapters import Array, SingleTrackEstimator
 
 START = datetime(2000, 1, 1)
 """Stone Soup wants a date; which one is of no consequence."""

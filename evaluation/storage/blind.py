@@ -20,7 +20,7 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
     ``measurements.csv`` has a row for each measurement: ``track``, ``measurement`` from 1 on, ``seconds`` since the
     start of the track, and the numbers of every field, ``position_1``, ``position_2`` and so on; what was not received
     is empty. ``start.csv`` has a row for each track: ``mean_X`` and ``covariance_X_Y`` of the components, and what
-    else everyone is told. ``measurements.nc`` holds both. Numbers are written in full.
+    else everyone is told. ``measurements.nc`` holds both. Numbers are written in full. No file names the seed.
 
     Args:
         folder: for the files.
@@ -58,7 +58,9 @@ def write_blind(folder: Path, recording: Recording, task: Task) -> None:
     with whole_files(folder) as waiting:
         pandas.DataFrame(rows).to_csv(waiting / MEASUREMENTS, index=False)
         pandas.DataFrame(start).to_csv(waiting / START, index=False)
-        dataclasses.replace(recording, truth=None).write(waiting / NETCDF)
+        # The source of a simulated recording names its seed, from which anyone can simulate the truth.
+        source = f"filtergym record {recording.environment} --blind, {recording.name}"
+        dataclasses.replace(recording, truth=None, source=source).write(waiting / NETCDF)
 
 
 def _numbered(name: str, values: numpy.ndarray) -> Iterator[tuple[str, numpy.ndarray]]:

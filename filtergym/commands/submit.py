@@ -88,12 +88,27 @@ def verify_file(
         Path | None,
         typer.Option(help="Write the source code of the submission, to read it, and run nothing."),
     ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            help="Seed of the fresh episodes, to repeat a verification that printed it; default: 128 random bits."
+        ),
+    ] = None,
+    same_seeds: Annotated[
+        bool,
+        typer.Option(
+            "--same-seeds",
+            help="Run only the protocol's own episodes, whose seeds are public: a competitor that carries their truth "
+            "passes.",
+        ),
+    ] = False,
     trust: Trust = False,
     jobs: Jobs = 1,
 ) -> None:
-    """Run what somebody has handed in again, and say whether its numbers hold.
+    """Run a submission again on its own and on fresh episodes, and decide whether its numbers hold.
 
-    Costs repeat but for rounding, whatever the processor; times are not compared. What holds source code needs --trust.
+    On the same episodes costs repeat but for rounding, whatever the processor; on fresh ones their intervals have to
+    agree. Times are not compared. A submission that holds source code needs --trust.
 
     Example: filtergym verify bptt.json
     """
@@ -106,19 +121,42 @@ def verify_file(
         return
     with Workers(jobs) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
-        found = verify(file, trust, workers, lambda done: bar.update(line, advance=done))
+        found = verify(file, trust, workers, lambda done: bar.update(line, advance=done), seed, same_seeds)
     own = found.submission
-    columns = {"it says": own.results}
+    columns = {"submitted": own.results}
     if not found.deviation.holds:
         columns["here"] = found.again
+    if found.fresh is not None:
+        columns["fresh"] = found.fresh.figures
     console.print(_results_table(f"{own.card.title}, by {own.card.author}", columns))
     console.print(f"SHA-256 {found.digest}", soft_wrap=True)
     versions = f"made by filtergym {own.filtergym}, verified by {__version__}"
+    for one in found.suspicions:
+        console.print(
+            f"suspicious: in scenario {one.scenario!r} the cost is {-100.0 * one.difference:.3g} % below that of "
+            f"{one.reference!r}, which knows {one.knows}",
+            soft_wrap=True,
+        )
+    if found.fresh is not None:
+        trusted = " --trust" if isinstance(own.competitor, Source) else ""
+        console.print(
+            f"to repeat it: filtergym verify {file} --seed {found.fresh.seed}{trusted}", soft_wrap=True
+        )
     if not found.deviation.holds:
         raise ValueError(f"the numbers of {file} do not hold: {found.deviation.sentence} ({versions})")
+    if found.fresh is not None and not found.fresh_deviation.holds:
+        raise ValueError(
+            f"the numbers of {file} do not hold on fresh episodes of seed {found.fresh.seed}: "
+            f"{found.fresh_deviation.sentence} ({versions})"
+        )
+    fresh = (
+        "the episodes are those of the file, and stored answers would hold, too"
+        if found.fresh is None
+        else f"on fresh ones they differ by {found.fresh_deviation.size:.2g} of what chance explains"
+    )
     console.print(
-        f"the numbers hold: they differ by {found.deviation.size * TOLERANCE:.1e} at most, and rounding explains "
-        f"{TOLERANCE:.0e}; {versions}",
+        f"the numbers hold: on the same episodes they differ by {found.deviation.size * TOLERANCE:.1e} at most, and "
+        f"rounding explains {TOLERANCE:.0e}; {fresh}; {versions}",
         soft_wrap=True,
     )
 

@@ -4,7 +4,7 @@ For every track i it publishes the initial estimate on ``track_i/initial`` and e
 both geometry_msgs/PoseWithCovarianceStamped, and waits for nav_msgs/Odometry of the same time on ``track_i/estimate``.
 A scan that missed the target is a measurement of infinite covariance. Velocities are in the frame of the track.
 
-filtergym evaluate filtergym/ManeuveringTarget-v0 --episodes 8 --policy "exec:python3 ros2_bridge.py" --time-limit 60
+filtergym evaluate filtergym/ManeuveringTarget-v0 --episodes 8 --policy "exec:/usr/bin/python3 ros2_bridge.py" --time-limit 60
 """
 
 from __future__ import annotations
