@@ -73,6 +73,18 @@ class VectorFunction:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
 
+    @property
+    def reads(self) -> tuple[frozenset[int], ...]:
+        """Of every number of the value the places of the numbers that it depends on."""
+        found: list[frozenset[int]] = []
+        for name, arguments, _ in self._value.steps:
+            if name == "input":
+                found.append(frozenset([arguments[1]]))
+            else:
+                before = () if name == "constant" else arguments
+                found.append(frozenset().union(*(found[place] for place in before)))
+        return tuple(found[result.node] for result in self._value.results)
+
     def value(self, x: Any, xp: Any) -> Any:
         """Value at vectors.
 

@@ -12,6 +12,7 @@ import numpy
 
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..data.recorded_tables import UNEVEN, Columns
+from .equations import find_invalid_noise
 
 if TYPE_CHECKING:
     from .equations import StateSpaceDefinition
@@ -91,8 +92,27 @@ def _read(
         measurements["interval"] = numpy.diff(time, prepend=start)
     if inputs:
         measurements["inputs"] = numpy.stack([_hold(name, columns[name], rows) for name in inputs], axis=1)
+    _check_noise(definition, measurements, rows, usual)
     initial = {"mean": definition.mean, "covariance": definition.covariance}
     return TrackLog(measurements, initial, rows, parameters, start, time, notes, typical)
+
+
+def _check_noise(
+    definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
+) -> None:
+    """Raise ValueError for a row that makes R of a sensor no covariance, such as an accuracy of zero."""
+    count = len(rows)
+    interval = made.get("interval", numpy.full(count, usual))
+    inputs = made.get("inputs", numpy.zeros((count, 0)))
+    found = find_invalid_noise(definition, made["available"].T, interval, inputs.T)
+    if found is not None:
+        said = ", ".join(
+            f"{name} is {value:g}" for name, value in zip(definition.inputs, inputs[found.place], strict=True)
+        )
+        raise ValueError(
+            f"R of {found.sensor} must be positive definite, and in row {rows[found.place]}, where {said}, it is "
+            f"{found.R}: leave the cells of a sensor empty where its noise is not known"
+        )
 
 
 def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
