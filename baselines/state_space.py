@@ -216,8 +216,8 @@ def _update(
 
 
 class ExtendedSmoother(Extended):
-    """The Kalman filter as written, smoothed with all later measurements (Rauch, Tung and Striebel 1965). What came late
-    is where it belongs.
+    """The Kalman filter as written, smoothed with all later measurements (Rauch, Tung and Striebel 1965). A late
+    measurement is smoothed where it belongs.
 
     Args:
         task: the problem.

@@ -88,8 +88,8 @@ def state_space(
         diffusion: spectral density of the noise of that derivative, ``(n, n)``; or several by their sources.
         integration_steps: of the Runge-Kutta method between two measurements, of a drift that is not linear.
         h: as f what is measured, m numbers, ``h(x)`` or ``h(x, u)``; or a matrix ``(m, n)``.
-        R: covariance of the measurement noise, ``(m, m)``, positive definite; or a function that returns it, of the state
-            and of ``dt`` and ``u``, as many of them as it names, such as ``R(x)`` or ``R(u)``.
+        R: covariance of the measurement noise, ``(m, m)``, positive definite; or a function that returns it,
+            of the state and of ``dt`` and ``u``, as many of them as it names, such as ``R(x)`` or ``R(u)``.
         sensors: by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``.

@@ -95,5 +95,7 @@ class LogFormat:
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
     empty where they may not."""
+    noise_hint: str = ""
+    """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""

@@ -3,7 +3,8 @@ r"""Equations of a state-space model, and what they give on the arrays of a task
     x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R(x(k), dt, u))
 
 dt is the interval between the measurements k - 1 and k, and u the input that acted in it, constant. A model may do
-without either, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known with white noise of covariance N only, what is known of the state after it is
+without either, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known with white noise of
+covariance N only, what is known of the state after it is
 
     P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
 

@@ -47,6 +47,7 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
         _start,
         predict=functools.partial(_predict, definition) if one else None,
         predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
+        noise_hint="a sensor takes it from a column that is an input, inputs=['accuracy'] and R=lambda u: u[0] ** 2",
     )
 
 

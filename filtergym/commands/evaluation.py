@@ -15,6 +15,7 @@ from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.flights import names_flights, read_flights
+from ..envs.data.plausibility import LOUD
 from ..envs.data.recording import Recording
 from ..envs.data.recording_files import is_recording
 from ..envs.engine.backend import make_model
@@ -412,7 +413,7 @@ def write(
         for sentence in reason_sentences(outcome.records, phrases, name):
             print_sentence(sentence)
     for note in [*notes_of(outcome.dataset), *missing_rows(outcome.records)]:
-        print_sentence(note)
+        print_sentence(note, bold=len(note) if note.startswith(LOUD) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
         console.print(f"{what} in {outputs.folder}")
