@@ -162,8 +162,9 @@ def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], tr
 
 
 class Extended(Filter[StateSpace, Measurement, Track]):
-    """The Kalman filter as written, extended where the model is not linear, as an estimator. What comes late is
-    taken in where it belongs.
+    """The Kalman filter as written, extended where the model is not linear, as an estimator.
+
+    A late measurement is taken in where it belongs.
 
     Args:
         task: the problem.

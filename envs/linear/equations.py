@@ -223,7 +223,7 @@ class Measurement(NamedTuple):
     """What the sensors say."""
 
     values: Array
-    """``(m, N)``; zero where nothing was received, where an estimator gets NaN."""
+    """What the sensors measured, ``(m, N)``; any number where nothing was received."""
     available: Array
     """1 where a value was received, 0 where not, ``(m, N)``."""
     interval: Array | None = None
@@ -234,7 +234,7 @@ class Measurement(NamedTuple):
     """What comes now and is of ``lateness`` measurements ago, ``(m, N)``, zero where nothing does; None where nothing
     comes late."""
     late_available: Array | None = None
-    """1 where such a value has come, 0 where not, ``(m, N)``; likewise None."""
+    """1 where such a value has come, 0 where not, ``(m, N)``; None where nothing comes late."""
 
 
 class Passage(NamedTuple):

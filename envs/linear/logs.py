@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import LogFormat, PlainRows, Predicted, TrackLog, TrackStart
 from ..data.recorded_tables import UNEVEN, Columns
 from .equations import find_invalid_noise
 
@@ -41,12 +41,20 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
     one = len(definition.filters) == 1
     columns = {name.lower(): unit for name, unit in definition.measured.items()}
     acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
+    interval = None if definition.world[0].timed else float(defaults.get("sampling_interval", 1.0))
     return LogFormat(
         {**columns, **acting},
         functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,
         predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
+        plain_rows=PlainRows(
+            tuple(definition.measured),
+            tuple(definition.inputs),
+            definition.mean,
+            definition.covariance,
+            interval,
+        ),
         noise_hint="a sensor takes it from a column that is an input, inputs=['accuracy'] and R=lambda u: u[0] ** 2",
     )
 
