@@ -22,6 +22,7 @@ class StateSpaceInput(LiveInput):
     """
 
     def __init__(self, task: "StateSpace", initial: Any, measurement: Any, tracks: int) -> None:
+        self.definition = task.definition
         self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
@@ -66,7 +67,7 @@ class StateSpaceInput(LiveInput):
         """Return a measurement; raise ValueError where its inputs make R of a sensor no covariance."""
         measurement = made[0]
         inputs = measurement.inputs if self.inputs else numpy.zeros((0, self.tracks))
-        found = find_invalid_noise(self.task.definition, measurement.available, interval, inputs)
+        found = find_invalid_noise(self.definition, measurement.available, interval, inputs)
         if found is not None:
             said = ", ".join(f"{name}={inputs[j, found.place]:g}" for j, name in enumerate(self.inputs))
             raise ValueError(

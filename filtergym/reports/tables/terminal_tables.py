@@ -194,7 +194,8 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
     for title in ["cost"] if compared else ["cost vs paper, %", "means,\n%"]:
         del columns[title]
     notes = [
-        f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off "
+        f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance says; "
+        f"{INCONSISTENT} marks one that is off "
         "by more than a factor of two.",
     ]
     if not any(r.metric == "lost_tracks" for r in records):
