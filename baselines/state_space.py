@@ -3,7 +3,7 @@ filter that is told the true model.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from ..envs.linear.equations import Equations
 from ..envs.linear.state_space import Measurement, StateSpace, Truth
 from ..envs.linear.state_space_banks import HypothesisBank, Mixture
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
-from ..filters import kalman, unscented
+from ..filters import kalman, smoothing, unscented
 from ..filters.array_namespace import namespace, select_nested
 from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
@@ -163,8 +163,9 @@ def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], tr
 
 
 class Extended(Filter[StateSpace, Measurement, Track]):
-    """The Kalman filter as written, extended where the model is not linear, as an estimator. What comes late is
-    taken in where it belongs.
+    """The Kalman filter as written, extended where the model is not linear, as an estimator.
+
+    A late measurement is taken in where it belongs.
 
     Args:
         task: the problem.
@@ -180,11 +181,15 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         self.equations = task.believed[0]
         self.factor = process_noise
         self.of_sources, of_sensors = _split(task, noises)
-        self.R = self.equations.sensor_noise(measurement_noise, of_sensors)
+        self.sensor_factors = measurement_noise, of_sensors
 
     def process_noise(self, mean: Array, measurement: Measurement) -> Array:
         """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
+
+    def sensor_noise(self, mean: Array, measurement: Measurement) -> Array:
+        """R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
+        return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
@@ -200,7 +205,8 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         measurement = one.measurement
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
-        result = _update(self.equations, mean, carried + Q, self.R, measurement, self.xp)
+        R = self.sensor_noise(mean, measurement)
+        result = _update(self.equations, mean, carried + Q, R, measurement, self.xp)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 
@@ -209,6 +215,70 @@ def _update(
 ) -> kalman.Update:
     received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
     return update_with_gain(mean, P, received, equations.gain(P, received))
+
+
+class ExtendedSmoother(Extended):
+    """The Kalman filter as written, smoothed with all later measurements (Rauch, Tung and Striebel 1965). A late
+    measurement is smoothed where it belongs.
+
+    Args:
+        task: the problem.
+        process_noise: factor on Q.
+        measurement_noise: factor on R.
+        lag: how many later measurements each estimate uses; default: all of them.
+        **noises: as of :class:`Extended`.
+    """
+
+    kind = "smoother"
+
+    def __init__(
+        self,
+        task: StateSpace,
+        process_noise: Any = 1.0,
+        measurement_noise: Any = 1.0,
+        lag: int | None = None,
+        **noises: Any,
+    ) -> None:
+        super().__init__(task, process_noise, measurement_noise, **noises)
+        self.lag = lag
+
+    def smooth(self, measurements: Sequence[Measurement], states: Sequence[Any]) -> tuple[Array, Array]:
+        """Smooth the whole track, or with the lag."""
+        if isinstance(states[0], Buffered):
+            measurements = _put_in_order(measurements, self.task.parameters.lateness, self.xp)
+            states = [states[0].now]
+            for measurement in measurements:
+                states.append(self.take(states[-1], Past(measurement, None, None)))
+        filtered = smoothing.Estimate(*smoothing.stack_scans([state[:2] for state in states]))
+        before = smoothing.drop_last(filtered.mean)
+        motion = smoothing.over_time(self._motion, before, smoothing.stack_scans(measurements))
+        smoothed = smoothing.smooth(filtered, motion, self.lag)
+        return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
+
+    def _motion(self, mean: Array, measurement: Measurement) -> smoothing.Motion:
+        """How the state moves from a mean ``(n, N)`` to a measurement."""
+        equations, each = self.equations, 0.0 * mean[0]
+        predicted = equations.move(mean, measurement)
+        noise = equations.input_noise(mean, measurement) + self.process_noise(predicted, measurement)
+        return smoothing.Motion(
+            equations.transition_matrix(mean, measurement) + each, noise + each, predicted
+        )
+
+
+def _put_in_order(measurements: Sequence[Measurement], lateness: int, xp: Any) -> list[Measurement]:
+    """Measurements with what came late among those that it belongs to."""
+    found = []
+    for k, own in enumerate(measurements):
+        plain = own._replace(values=_numbers(own, xp), late=None, late_available=None)
+        if k + lateness < len(measurements):
+            later = measurements[k + lateness]
+            assert later.late_available is not None
+            plain = plain._replace(
+                values=xp.where(later.late_available > 0.0, later.late, plain.values),
+                available=xp.maximum(own.available, later.late_available),
+            )
+        found.append(plain)
+    return found
 
 
 class Unscented(Extended):
@@ -240,7 +310,7 @@ class Unscented(Extended):
         )
         if own.periods:
             z, h, points = own.unwrap(z, mean, P, measurement)
-        R = own.measured_noise(self.R, mean, measurement)
+        R = own.measured_noise(self.sensor_noise(mean, measurement), mean, measurement)
         gates = own.within_gates if own.gated else None
         result = unscented_update(mean, P, z, h, R, measurement.available, gates, points)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
@@ -312,7 +382,7 @@ class KnownModel:
         for j, equations in enumerate(world.equations if world.switches else world.equations[:1]):
             mean, carried = equations.carry(state.mean, state.covariance, measurement)
             P = carried + truth.process_noise * equations.process_noise(mean, measurement)
-            R = truth.measurement_noise * equations.R[:, :, None]
+            R = equations.sensor_noise(mean, measurement, truth.measurement_noise)
             result = _update(equations, mean, P, R, measurement, xp)
             held = truth.hypothesis == float(j)
             chosen = (
@@ -380,6 +450,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
         environment=task.id,
         policies=policies,
         estimators=estimators,
+        smoothers={"kalman-smoother": ExtendedSmoother},
         references={"known-model": KnownModel},
         score_paper=paper,
         score_reference="known-model",

@@ -87,6 +87,18 @@ class VectorFunction:
             same &= (numpy.abs(value - value[:, :1] - moved) <= 1e-9 * (1.0 + numpy.abs(moved))).all(axis=1)
         return frozenset(numpy.flatnonzero(same).tolist())
 
+    @property
+    def reads(self) -> tuple[frozenset[int], ...]:
+        """Of every number of the value the places of the numbers that it depends on."""
+        found: list[frozenset[int]] = []
+        for name, arguments, _ in self._value.steps:
+            if name == "input":
+                found.append(frozenset([arguments[1]]))
+            else:
+                before = () if name == "constant" else arguments
+                found.append(frozenset().union(*(found[place] for place in before)))
+        return tuple(found[result.node] for result in self._value.results)
+
     def value(self, x: Any, xp: Any) -> Any:
         """Value at vectors.
 

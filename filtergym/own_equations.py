@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from .compiler import namespace
 from .compiler.namespace import NotTraceable
 from .compiler.vector_functions import VectorFunction
 from .envs.contract.parameters import read_numbers
-from .envs.linear.equations import StateSpaceModel, process_noise
+from .envs.linear.equations import StateSpaceModel, process_noise, sensor_noise, usual_sensor_noise
 from .envs.linear.inputs import Input
 from .own_drifts import Discretised, discretise_drift
 
@@ -19,6 +20,18 @@ Function = Callable[..., Any] | Sequence[Sequence[float]] | numpy.ndarray
 :func:`.own_models.state_space`."""
 FURTHER = ("dt", "u")
 """What f may take after the state, by these names."""
+FAR = 3.0
+"""Deviations of the inputs from their means up to which R must be a covariance."""
+
+
+class NoiseBlock(NamedTuple):
+    """The noise of some of the numbers that are measured, independent of that of all others."""
+
+    what: str
+    """Its name, in errors."""
+    R: Any
+    """A number, a matrix ``(size, size)``, or a function that returns either."""
+    size: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +57,7 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
     """Trace a model.
 
     Args:
-        given: f and Q, or drift and diffusion; h and R.
+        given: f and Q, or drift and diffusion; h and R; with sensors the blocks of R.
         around: what they have to fit; the covariance of a timed model is checked at its usual interval.
 
     Raises:
@@ -53,12 +66,106 @@ def make_model(given: Mapping[str, Any], around: Surroundings) -> StateSpaceMode
     n = len(around.mean)
     h = trace_measurement("h", given["h"], n, len(around.inputs))
     motion = _continuous(given, around) if given.get("drift") is not None else _discrete(given, around)
-    R = check_covariance("R", given["R"], h.size, definite=True)
+    blocks = given["R"] if given.get("sensors") else [NoiseBlock("R", given["R"], h.size)]
+    R = _sensor_noise(blocks, around, isinstance(motion.Q, VectorFunction))
     model = StateSpaceModel(
         motion.f, h, motion.Q, R, motion.G, _of_inputs(given["h"], h, around), motion.sources
     )
     check_covariance("Q", process_noise(model, around.mean, around.interval, around.usual_inputs), n)
+    _check_sensor_noise(model, blocks, around)
     return model
+
+
+def _sensor_noise(
+    blocks: Sequence[NoiseBlock], around: Surroundings, timed: bool
+) -> numpy.ndarray | VectorFunction:
+    """R of blocks: a matrix where all of them are, else a function of the state, the interval and the inputs.
+
+    Raises:
+        ValueError: for a block that is no covariance, cannot be traced, or takes an argument that does not exist.
+    """
+    n, further, size = len(around.mean), int(timed), sum(block.size for block in blocks)
+    ends = numpy.cumsum([0, *(block.size for block in blocks)]).tolist()
+    takes = [_noise_arguments(block, around, timed) for block in blocks]
+    if not any(map(callable, (block.R for block in blocks))):
+        R = numpy.zeros((size, size))
+        for first, block in zip(ends, blocks, strict=False):
+            own = slice(first, first + block.size)
+            given = read_numbers(block.what, block.R)
+            given = given if given.ndim else given.reshape(1, 1)
+            R[own, own] = check_covariance(block.what, given, block.size, definite=True)
+        return R
+
+    def entries(v: Any) -> list[Any]:
+        given = {"x": v[:n], "dt": v[n] if timed else None, "u": v[n + further :]}
+        rows: list[list[Any]] = [[0.0] * size for _ in range(size)]
+        for first, block, names in zip(ends, blocks, takes, strict=False):
+            found = _matrix(block.R(*(given[name] for name in names)) if callable(block.R) else block.R)
+            if found.shape != (block.size, block.size):
+                raise ValueError(
+                    f"{block.what} must return a matrix ({block.size}, {block.size}), got the shape {found.shape}"
+                )
+            for i in range(block.size):
+                rows[first + i][first : first + block.size] = [found[i, j] for j in range(block.size)]
+        return [entry for row in rows for entry in row]
+
+    return trace("R", entries, 0, size * size, n + further + len(around.inputs))
+
+
+def _matrix(R: Any) -> Any:
+    """A covariance, or the variance of one number, as a traced matrix."""
+    if isinstance(R, list | tuple):
+        R = namespace.stack([namespace.asarray(row) for row in R])
+    found = namespace.asarray(R)
+    return found if found.shape else namespace.reshape(found, (1, 1))
+
+
+def _noise_arguments(block: NoiseBlock, around: Surroundings, timed: bool) -> tuple[str, ...]:
+    """What the function of a block takes, in its order: x, dt and u; empty for a matrix.
+
+    Raises:
+        ValueError: for an argument that the model does not have.
+    """
+    if not callable(block.R):
+        return ()
+    names = arguments(block.R) or ("x",)
+    takes = tuple(name if name in FURTHER else "x" for name in names)
+    if len({*takes}) < len(takes):
+        raise ValueError(
+            f"{block.what} may take the state, dt and u, each once, such as R(x), R(u) or R(x, dt, u), got the "
+            f"arguments {', '.join(names)}"
+        )
+    if "dt" in takes and not timed:
+        raise ValueError(f"{block.what} takes dt, and the model is not timed: write f(x, dt) and Q(dt)")
+    if "u" in takes and not around.inputs:
+        raise ValueError(
+            f"{block.what} takes u, and there are no inputs: name them, such as inputs=['accuracy']"
+        )
+    return takes
+
+
+def _check_sensor_noise(model: StateSpaceModel, blocks: Sequence[NoiseBlock], around: Surroundings) -> None:
+    """Raise ValueError for a function R that is no covariance at the initial mean and the inputs of a simulation."""
+    if not isinstance(model.R, VectorFunction):
+        return
+    deviations = numpy.array([one.deviation for one in around.inputs.values()])
+    inputs = around.usual_inputs[:, None] + deviations[:, None] * numpy.linspace(-FAR, FAR, 7)
+    R = sensor_noise(model, around.mean, numpy.full(inputs.shape[1], around.interval), inputs)
+    usual = usual_sensor_noise(model, around.mean, around.interval, around.inputs)
+    first = 0
+    for block in blocks:
+        own = slice(first, first + block.size)
+        first += block.size
+        try:
+            for k in range(inputs.shape[1]):
+                check_covariance(block.what, R[own, own, k], block.size)
+            check_covariance(block.what, usual[own, own], block.size, definite=True)
+        except ValueError as error:
+            raise ValueError(
+                f"{error} at the initial mean and inputs up to {FAR:g} deviations from their means: write a function "
+                "that cannot be negative, such as u[0] ** 2, or give the usual inputs, such as "
+                "inputs={'accuracy': Input(mean=3.0, deviation=0.5)}"
+            ) from error
 
 
 class _Motion(NamedTuple):
@@ -191,13 +298,17 @@ def _of_inputs(h: Function, traced: VectorFunction, around: Surroundings) -> Vec
 
 def further_arguments(function: Any) -> tuple[str, ...]:
     """Which of :data:`FURTHER` a function takes after the state."""
+    return tuple(name for name in FURTHER if name in arguments(function)[1:])
+
+
+def arguments(function: Any) -> tuple[str, ...]:
+    """Names of the arguments of a function; empty for what is none, or does not show them."""
     if not callable(function):
         return ()
     try:
-        names = list(inspect.signature(function).parameters)[1:]
+        return tuple(inspect.signature(function).parameters)
     except (TypeError, ValueError):
         return ()
-    return tuple(name for name in FURTHER if name in names)
 
 
 def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.ndarray:

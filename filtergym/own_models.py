@@ -1,6 +1,7 @@
 """An environment from a state-space model in a few lines."""
 
 import dataclasses
+import itertools
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -28,6 +29,7 @@ from .own_angles import find_periods, warn_of_turns
 from .own_equations import (
     Function,
     Surroundings,
+    arguments,
     check_array,
     check_covariance,
     further_arguments,
@@ -90,7 +92,8 @@ def state_space(
         diffusion: spectral density of the noise of that derivative, ``(n, n)``; or several by their sources.
         integration_steps: of the Runge-Kutta method between two measurements, of a drift that is not linear.
         h: as f what is measured, m numbers, ``h(x)`` or ``h(x, u)``; or a matrix ``(m, n)``.
-        R: covariance of the measurement noise, ``(m, m)``, positive definite.
+        R: covariance of the measurement noise, ``(m, m)``, positive definite; or a function that returns it,
+            of the state and of ``dt`` and ``u``, as many of them as it names, such as ``R(x)`` or ``R(u)``.
         sensors: by their names, in place of h, R and ``measured``.
         names: of the components; default: ``x1``, ``x2`` and so on.
         units: of the components; default: ``1``, of an angle its unit.
@@ -149,9 +152,14 @@ def state_space(
     acted = [
         call for one in given for call in (one[motion], one["h"], *(s.h for s in one["sensors"].values()))
     ]
-    if inputs and not any("u" in further_arguments(call) for call in acted):
+    noises = [R for one in given for R in (one["R"], *(s.R for s in one["sensors"].values()))]
+    taken = [
+        *(name for call in acted for name in further_arguments(call)),
+        *itertools.chain(*map(arguments, noises)),
+    ]
+    if inputs and "u" not in taken:
         raise ValueError(
-            f"there are inputs, {', '.join(inputs)}, and neither {motion} nor h takes u: write "
+            f"there are inputs, {', '.join(inputs)}, and neither {motion}, h nor R takes u: write "
             f"{'drift(x, u)' if f is None else 'f(x, u) or f(x, dt, u)'}"
         )
     world = tuple(make_model(_stack(one, n, len(inputs)), around) for one in given)
@@ -282,7 +290,7 @@ def _check_sources(filters: Sequence[StateSpaceModel], sensors: Iterable[str]) -
 
 
 def _stack(given: dict[str, Any], size: int, inputs: int) -> dict[str, Any]:
-    """Put h and R of all sensors in the place of these."""
+    """Put h and the noises of all sensors in the place of h and R."""
     if not given["sensors"]:
         return given
     h, R = stack_sensors(given["sensors"], size, inputs)

@@ -9,7 +9,7 @@ from .envs.contract.parameters import quote_shortened
 from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.linear.sensors import Channel, Sensor
 from .filters.angles import PERIODS
-from .own_equations import Function, check_array, check_covariance, further_arguments, trace_measurement
+from .own_equations import Function, NoiseBlock, check_array, further_arguments, trace_measurement
 
 RESERVED = (RECORDING, "values", "available")
 """Names that mean something else in a table or a measurement."""
@@ -33,22 +33,16 @@ def replace_sensors(sensors: Mapping[str, Sensor] | None, given: Any) -> dict[st
     return {**(sensors or {}), **given}
 
 
-def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, numpy.ndarray]:
-    """Return h and R of all sensors together, of a state of n numbers and p inputs.
+def stack_sensors(sensors: Mapping[str, Sensor], size: int, inputs: int) -> tuple[Function, list[NoiseBlock]]:
+    """Return h of all sensors together and their noises, of a state of n numbers and p inputs.
 
     Raises:
         ValueError: for what does not fit.
     """
-    noises, traced = [], []
+    R, traced = [], []
     for name, one in sensors.items():
         traced.append(trace_measurement(f"h of the sensor {name!r}", one.h, size, inputs))
-        R = numpy.asarray(one.R, dtype=float)
-        given = R[None, None] if R.ndim == 0 else R
-        noises.append(check_covariance(f"R of the sensor {name!r}", given, traced[-1].size, definite=True))
-    places = numpy.cumsum([0, *map(len, noises)])
-    R = numpy.zeros((places[-1], places[-1]))
-    for first, noise in zip(places, noises, strict=False):
-        R[first : first + len(noise), first : first + len(noise)] = noise
+        R.append(NoiseBlock(f"R of the sensor {name!r}", one.R, traced[-1].size))
     matrices = [one.matrix for one in traced if one.matrix is not None and not numpy.any(one.offset)]
     if len(matrices) == len(traced):
         return numpy.concatenate(matrices), R

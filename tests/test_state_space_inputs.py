@@ -239,7 +239,7 @@ def test_a_filter_with_inputs_is_exported(make, tmp_path):
     ("wrong", "sentence"),
     [
         ({"inputs": ()}, "f takes u, and there are no inputs"),
-        ({"f": lambda x, dt: [x[0], x[1]]}, "neither f nor h takes u: write"),
+        ({"f": lambda x, dt: [x[0], x[1]]}, "neither f, h nor R takes u: write"),
         ({"inputs": ["current", "voltage"]}, "none of them a time or an input"),
         ({"inputs": ["current", "values"]}, "names may not be recording, values, available"),
         ({"inputs": "current"}, "inputs must be names, or a mapping"),

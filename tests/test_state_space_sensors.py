@@ -148,7 +148,8 @@ def test_filters_agree(make):
 def test_a_sensor_has_a_factor_on_its_noise(make):
     task = make_model(make(), backend="numpy").task
     factors = np.array([1.0, 4.0, 9.0])
-    scaled = Extended(task, 1.0, 2.0, gps_noise=0.25, compass_noise=factors).R
+    filter = Extended(task, 1.0, 2.0, gps_noise=0.25, compass_noise=factors)
+    scaled = filter.sensor_noise(np.zeros((3, 1)), None)
     np.testing.assert_allclose(scaled[:2, :2, 1], 0.5 * R[:2, :2], rtol=1e-15)
     np.testing.assert_allclose(scaled[2, 2], 1.0, rtol=1e-15)
     np.testing.assert_allclose(scaled[3, 3], 0.5 * factors, rtol=1e-15)

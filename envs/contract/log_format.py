@@ -72,6 +72,23 @@ class Predicted(NamedTuple):
     """Of coordinates whose errors are one length, such as a position."""
 
 
+class PlainRows(NamedTuple):
+    """How the rows of a table are measurements as they stand, where no more is done to them: the ``Measurement`` has
+    ``values`` and ``available``, and perhaps ``interval`` and ``inputs``.
+    """
+
+    received: tuple[str, ...]
+    """Columns of the numbers of ``values``; an empty cell was not received."""
+    held: tuple[str, ...]
+    """Columns of the numbers of ``inputs``; where a cell is empty the last one holds on, and before all the first."""
+    mean: numpy.ndarray
+    """Initial estimate of every track, ``(C,)``, one interval before the first row."""
+    covariance: numpy.ndarray
+    """``(C, C)``."""
+    interval: float | None
+    """Time between rows, s; None where they may come at any time: the median then lies before the first."""
+
+
 @dataclass(frozen=True)
 class LogFormat:
     """The tables of real measurements that an environment reads."""
@@ -95,5 +112,9 @@ class LogFormat:
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
     empty where they may not."""
+    plain_rows: PlainRows | None = None
+    """How the rows are measurements as they stand; None where more is done to them."""
+    noise_hint: str = ""
+    """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""

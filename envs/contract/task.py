@@ -379,8 +379,12 @@ def field_texts(cls: type) -> dict[str, str]:
 
 
 def field_words(cls: type) -> dict[str, str]:
-    """The same without shapes such as ``(2, N)``, which are those of many tracks."""
-    return {
-        name: re.sub(r"(, |^)``\([^`]*\)``\.?", "", text).replace("`", "")
-        for name, text in field_texts(cls).items()
-    }
+    """The same of a single track in which the field exists: without shapes such as ``(2, N)``, and without a clause on
+    where it is None.
+    """
+    found = {}
+    for name, text in field_texts(cls).items():
+        words = re.sub(r"(, |^)``\([^`]*\)``\.?", "", text)
+        words = re.sub(r"(^|[;.] ?)[^;.]*\bNone where [^;.]*", "", words)
+        found[name] = words.lstrip(" ,;").replace("`", "")
+    return found

@@ -8,6 +8,7 @@ or left out, because a sensor may have said it.
 import difflib
 import itertools
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,26 @@ SPEED_UNITS = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e
 """Numbers of a unit in one m/s."""
 DEVIATIONS = ("sigma", "std", "stddev", "deviation", "variance", "var", "accuracy", "uncertainty", "rms")
 """Words in the names of columns that say how large errors are."""
+NOISE_WORDS = (
+    *DEVIATIONS,
+    "sd",
+    "cov",
+    "covariance",
+    "dop",
+    "hdop",
+    "vdop",
+    "pdop",
+    "gdop",
+    "hacc",
+    "vacc",
+    "sacc",
+    "noise",
+)
+"""Words in the names of columns that state noise in any form."""
+NOISE_PARTS = ("sigma", "stddev", "deviation", "variance", "accuracy", "uncertainty", "hdop", "vdop", "pdop")
+"""The longest of them, which may also be a part of a word, as in ``horizontalAccuracy``."""
+LOUD = "WARNING: "
+"""How a note begins that no user may miss."""
 WIDE_BEARINGS = 0.5
 """Range of bearings from which on those within 2 pi may be radians."""
 
@@ -227,12 +248,13 @@ def scatter_of(time: numpy.ndarray, values: numpy.ndarray) -> float:
     return max(scatter, 1e-9 * float(numpy.abs(values).max(initial=0.0)), 1e-6)
 
 
-def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str]:
-    """Return the notes on columns of a table that nobody reads.
+def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint: str = "") -> list[str]:
+    """Return the notes on columns of a table that nobody reads, the loud ones first.
 
     Args:
         names: of the columns, in lower case.
         known: names that are read.
+        noise_hint: how a column of noise is read, at the end of the sentence.
 
     Raises:
         ValueError: for a name that is nearly a known one, or says how large errors are: who wrote it wants it read.
@@ -242,13 +264,33 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str
     for name in ignored:
         close = [k for k in difflib.get_close_matches(name, known, n=3, cutoff=0.75) if k not in given]
         deviations = [k for k in known if "sigma" in k and k not in given]
-        if not close and any(word in DEVIATIONS for word in name.replace("-", "_").split("_")):
+        if not close and any(word in DEVIATIONS for word in _words(name)):
             close = deviations
         if close:
             raise ValueError(
                 f"it has the column {name}, which is not read: did you mean {' or '.join(close)}? else leave it out"
             )
-    return [f"not read: column{'s' * (len(ignored) > 1)} {', '.join(ignored)}"] if ignored else []
+    noisy = [name for name in ignored if _is_noise(name)]
+    others = [name for name in ignored if name not in noisy]
+    notes = []
+    if noisy:
+        notes.append(
+            f"{LOUD}column{'s' * (len(noisy) > 1)} {', '.join(noisy)} not read, and the name is one of noise: "
+            f"every filter takes the noise of its measurements from elsewhere{noise_hint and f'; {noise_hint}'}"
+        )
+    if others:
+        notes.append(f"not read: column{'s' * (len(others) > 1)} {', '.join(others)}")
+    return notes
+
+
+def _words(name: str) -> list[str]:
+    """Words of the name of a column."""
+    return re.split(r"[^a-z0-9]+", name)
+
+
+def _is_noise(name: str) -> bool:
+    """Whether the name of a column is one of noise."""
+    return any(word in NOISE_WORDS for word in _words(name)) or any(part in name for part in NOISE_PARTS)
 
 
 # --- recordings

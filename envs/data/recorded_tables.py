@@ -27,7 +27,7 @@ from .flight_tables import (
     read_table,
     seconds,
 )
-from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
+from .plausibility import LOUD, check_degrees, check_interval, limit_notes, unknown_column_notes
 from .recorded_world import measure_once
 from .recording import Recording, side_by_side
 from .truth_files import match_truth, offset_note, read_truth
@@ -308,7 +308,7 @@ def read_columns(
     cls: type[Task],
     keywords: Mapping[str, Any],
     truth: TruthFile | None = None,
-    rename: Mapping[str, str] | None = None,
+    rename: Mapping[str, str | Sequence[str]] | None = None,
 ) -> Recording:
     """Read a table of what sensors said.
 
@@ -317,7 +317,7 @@ def read_columns(
         cls: the environment.
         keywords: parameters of it.
         truth: in a file of its own.
-        rename: what some columns of the file are, in the environment's names.
+        rename: what some columns of the file are, in the environment's names; one column may be several.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
@@ -332,14 +332,19 @@ def read_columns(
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     # All that begin with truth_, because components follow from the parameters.
-    renamed = {old.lower(): new.lower() for old, new in (rename or {}).items()}
-    read, names, notes = read_table(path, ColumnNames({*known, *renamed}, TRUTH))
-    in_file = names = [name.lower() for name in names]
+    renamed = [
+        (old.lower(), each.lower())
+        for old, new in (rename or {}).items()
+        for each in ([new] if isinstance(new, str) else new)
+    ]
+    read, names, notes = read_table(path, ColumnNames({*known, *(old for old, _ in renamed)}, TRUTH))
+    pairs = [(name.lower(), name.lower()) for name in names]
     if renamed:
-        read, names = _rename(read, names, renamed, ColumnNames(known, TRUTH))
+        read, pairs = _rename(read, [name for name, _ in pairs], renamed, ColumnNames(known, TRUTH))
+    names = [name for _, name in pairs]
     if log_format.plane:
         read, names = _rename_aliases(read, names)
-    original = {new: old for old, new in zip(in_file, names, strict=True) if new != old}
+    original = {new: old for (old, _), new in zip(pairs, names, strict=True) if new != old}
     time_name = next((name for name in TIME if name in read), None)
     if not names:
         raise ValueError("it is empty: a recording needs a line of columns, and rows below it")
@@ -417,32 +422,38 @@ def _add_truth(
 
 
 def _rename(
-    read: "pandas.DataFrame", names: list[str], renamed: Mapping[str, str], known: ColumnNames
-) -> tuple["pandas.DataFrame", list[str]]:
+    read: "pandas.DataFrame", names: list[str], renamed: Sequence[tuple[str, str]], known: ColumnNames
+) -> tuple["pandas.DataFrame", list[tuple[str, str]]]:
     """Call columns as a user says.
 
     Args:
         read: columns.
         names: of all columns of the file.
-        renamed: what some of them are.
+        renamed: pairs of a column of the file and of what it is; one column may be in several pairs.
         known: names that are read.
+
+    Returns:
+        The columns by what they are, and for all columns of the file its name there and what it is.
 
     Raises:
         ValueError: for what the file has not, what nobody reads, or what is there twice then.
     """
-    for old, new in renamed.items():
+    for old, new in renamed:
         if old not in names:
             raise ValueError(f"it has no column {old}, which was to be {new}; it has {list_names(names)}")
         if new not in known:
             raise ValueError(
                 f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}"
             )
-    called = [renamed.get(name, name) for name in names]
-    twice = next((name for name in renamed.values() if called.count(name) > 1), None)
+    meanings = {name: [new for old, new in renamed if old == name] or [name] for name in names}
+    pairs = [(name, new) for name in names for new in meanings[name]]
+    called = [new for _, new in pairs]
+    twice = next((new for _, new in renamed if called.count(new) > 1), None)
     if twice is not None:
         raise ValueError(f"two columns would be {twice}: leave one of them out")
-    there = [name for name in read if name in renamed or name in known]
-    return read[there].rename(columns=dict(renamed)), called
+    there = [(old, new) for old, new in pairs if old in read and (old != new or new in known)]
+    found = read[[old for old, _ in there]].set_axis([new for _, new in there], axis=1)
+    return found, pairs
 
 
 def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str]) -> str:
@@ -517,7 +528,8 @@ def _side_by_side(
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
     components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
-    notes = [*said, *unknown_column_notes(names, read)]
+    notes = [*said, *unknown_column_notes(names, read, log_format.noise_hint)]
+    notes.sort(key=lambda note: not note.startswith(LOUD))
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
     if any(true) and unknown:
         notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")

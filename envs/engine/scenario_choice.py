@@ -112,7 +112,7 @@ def read_recording(
     speeds: tuple[float, float] = (1.0, 1000.0),
     truth: Any = None,
     truth_offset: float = 0.0,
-    rename: Mapping[str, str] | None = None,
+    rename: Mapping[str, str | Sequence[str]] | None = None,
     **keywords: Any,
 ) -> Recording:
     """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
@@ -128,7 +128,8 @@ def read_recording(
         truth: path of the truth in a file of its own, a table or a log of a receiver, matched by time; a note says how
             much of the recording has one. For tables.
         truth_offset: s, added to the times of that file.
-        rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``.
+        rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``; one
+            column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:
@@ -171,7 +172,7 @@ def _read_recording(
     speeds: tuple[float, float],
     keywords: Mapping[str, Any],
     truth: TruthFile | None,
-    rename: Mapping[str, str] | None,
+    rename: Mapping[str, str | Sequence[str]] | None,
 ) -> Recording:
     """Read one file."""
     if not file.exists():

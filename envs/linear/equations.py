@@ -1,9 +1,10 @@
 r"""Equations of a state-space model, and what they give on the arrays of a task.
 
-    x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R)
+    x(k) = f(x(k-1), dt, u) + w,  w ~ N(0, Q(dt))          z(k) = h(x(k), u) + v,  v ~ N(0, R(x(k), dt, u))
 
 dt is the interval between the measurements k - 1 and k, and u the input that acted in it, constant. A model may do
-without either. Where u is known with white noise of covariance N only, what is known of the state after it is
+without either, and R may be a matrix. A filter evaluates R at the predicted state. Where u is known with white noise of
+covariance N only, what is known of the state after it is
 
     P' = F P F^T + G N G^T + Q,  F = df/dx,  G = df/du          at the estimate before
 
@@ -12,6 +13,7 @@ input, too, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: that this err
 same one, G N D^T, is left out.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -43,8 +45,8 @@ class StateSpaceModel:
     h: VectorFunction
     Q: numpy.ndarray | VectorFunction
     """``(n, n)``; or a function to the n^2 numbers of it, row by row: then the model is timed."""
-    R: numpy.ndarray
-    """``(m, m)``."""
+    R: numpy.ndarray | VectorFunction
+    """``(m, m)``; or a function to the m^2 numbers of it, row by row."""
     G: VectorFunction | None = None
     """f as a function of the inputs, and then of all else; None where no input has noise."""
     D: VectorFunction | None = None
@@ -142,11 +144,94 @@ def _nonlinear(function: VectorFunction, periods: Mapping[int, float]) -> dict[i
     return {row: period for row, period in periods.items() if row not in function.linear_rows}
 
 
+def sensor_noise(
+    model: StateSpaceModel, x: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
+) -> numpy.ndarray:
+    """R of a model at K measurements, ``(m, m, K)``.
+
+    Args:
+        model: the equations.
+        x: state, ``(n,)``.
+        interval: s, ``(K,)``.
+        inputs: ``(p, K)``.
+    """
+    m, K = model.h.size, len(interval)
+    if not isinstance(model.R, VectorFunction):
+        return numpy.broadcast_to(model.R[:, :, None], (m, m, K))
+    rows = [numpy.broadcast_to(x[:, None], (len(x), K)), *([interval[None]] * model.timed), inputs]
+    return numpy.reshape(model.R.value(numpy.concatenate(rows), numpy), (m, m, K))
+
+
+def usual_sensor_noise(
+    model: StateSpaceModel, mean: numpy.ndarray, interval: float, inputs: Mapping[str, Input]
+) -> numpy.ndarray:
+    """R of a model at the initial mean, averaged over the inputs of a simulation, ``(m, m)``.
+
+    The average is that of 2 p sigma points, which is exact where R is quadratic in the inputs: the R of a deviation
+    that is an input is the sum of its squared mean and its variance.
+
+    Args:
+        model: the equations.
+        mean: of the initial state, ``(n,)``.
+        interval: s.
+        inputs: p of them.
+    """
+    p = max(len(inputs), 1)
+    centre = numpy.array([one.mean for one in inputs.values()])[:, None]
+    offsets = math.sqrt(p) * numpy.diag([one.deviation for one in inputs.values()])
+    points = (
+        numpy.concatenate([centre + offsets, centre - offsets], axis=1) if inputs else numpy.zeros((0, 1))
+    )
+    return sensor_noise(model, mean, numpy.full(points.shape[1], interval), points).mean(axis=-1)
+
+
+class InvalidNoise(NamedTuple):
+    """A measurement whose R is no covariance."""
+
+    place: int
+    """Number of the measurement."""
+    sensor: str
+    R: list[list[float]]
+    """Of this sensor."""
+
+
+def find_invalid_noise(
+    definition: StateSpaceDefinition, available: numpy.ndarray, interval: numpy.ndarray, inputs: numpy.ndarray
+) -> InvalidNoise | None:
+    """Find a measurement, of K, with a sensor whose R is not positive definite under a model of the filters; None where
+    there is none. A sensor whose R depends on the state is left out.
+
+    Args:
+        definition: the models.
+        available: above zero where a number was received, ``(m, K)``.
+        interval: s, ``(K,)``.
+        inputs: ``(p, K)``.
+    """
+    n = len(definition.mean)
+    for model in definition.filters:
+        if not isinstance(model.R, VectorFunction):
+            continue
+        R = numpy.moveaxis(sensor_noise(model, definition.mean, interval, inputs), -1, 0)
+        of_state = numpy.reshape([min(read, default=n) < n for read in model.R.reads], R.shape[1:])
+        for channel in definition.channels:
+            own = R[:, channel.places, channel.places]
+            if of_state[channel.places, channel.places].any():
+                continue
+            there = (available[channel.places] > 0.0).any(axis=0)
+            finite = numpy.isfinite(own).all(axis=(1, 2))
+            least = numpy.linalg.eigvalsh(numpy.where(finite[:, None, None], own, 0.0))[:, 0]
+            wrong = there & ~(finite & (least > 0.0))
+            if wrong.any():
+                place = int(wrong.argmax())
+                return InvalidNoise(place, channel.name, own[place].tolist())
+    return None
+
+
 class Measurement(NamedTuple):
     """What the sensors say."""
 
     values: Array
-    """``(m, N)``; zero where nothing was received, where an estimator gets NaN."""
+    """What the sensors measured, ``(m, N)``; any number where nothing was received."""
     available: Array
     """1 where a value was received, 0 where not, ``(m, N)``."""
     interval: Array | None = None
@@ -157,7 +242,7 @@ class Measurement(NamedTuple):
     """What comes now and is of ``lateness`` measurements ago, ``(m, N)``, zero where nothing does; None where nothing
     comes late."""
     late_available: Array | None = None
-    """1 where such a value has come, 0 where not, ``(m, N)``; likewise None."""
+    """1 where such a value has come, 0 where not, ``(m, N)``; None where nothing comes late."""
 
 
 class Passage(NamedTuple):
@@ -183,7 +268,7 @@ class Equations:
 
     def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
-        self.R = task.constant(model.R)
+        self._R = self._constant(task, model.R)
         self._Q = self._constant(task, model.Q)
         self._sources = {name: self._constant(task, own) for name, own in model.sources.items()}
         self._F, self._H = (
@@ -197,8 +282,8 @@ class Equations:
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
     @staticmethod
-    def _constant(task: "StateSpace", Q: numpy.ndarray | VectorFunction) -> Array | None:
-        return None if isinstance(Q, VectorFunction) else task.constant(Q)
+    def _constant(task: "StateSpace", noise: numpy.ndarray | VectorFunction) -> Array | None:
+        return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:
         """State without noise at the next measurement, ``(n, ...)``.
@@ -233,14 +318,15 @@ class Equations:
         return sum(parts[1:], parts[0])
 
     def _noise(
-        self, Q: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
+        self, noise: numpy.ndarray | VectorFunction, constant: Array | None, x: Array, passed: Passed
     ) -> Array:
+        """Covariance of a noise, a square matrix for each lane."""
         if constant is not None:
             return constant[:, :, None]
-        assert isinstance(Q, VectorFunction)
-        n = self.model.f.size
-        entries = Q.value(self._with_passed(x, passed), self.xp)
-        return self.xp.reshape(entries, (n, n, *x.shape[1:]))
+        assert isinstance(noise, VectorFunction)
+        size = math.isqrt(noise.size)
+        entries = noise.value(self._with_passed(x, passed), self.xp)
+        return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
         """What noise of the inputs adds to the covariance, ``(n, n, N)``.
@@ -267,14 +353,18 @@ class Equations:
         )
         return product(scaled, transpose(J))
 
-    def sensor_noise(self, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None) -> Array:
+    def sensor_noise(
+        self, x: Array, passed: Passed, factor: Any = 1.0, of_sensors: Mapping[str, Any] | None = None
+    ) -> Array:
         """R times factors, ``(m, m, N)`` or ``(m, m, 1)``.
 
         Args:
+            x: state at the measurement, ``(n, N)``.
+            passed: what went on until then.
             factor: a number, or ``(N,)``.
             of_sensors: further ones of some sensors, by their names.
         """
-        R = factor * self.R[:, :, None]
+        R = factor * self._noise(self.model.R, self._R, x, passed)
         if not of_sensors:
             return R
         rows, none = [], 0.0 * sum(of_sensors.values())  # of their shape

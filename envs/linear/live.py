@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy
 
 from ..contract.live_input import LiveInput, Memory
+from .equations import find_invalid_noise
 
 if TYPE_CHECKING:
     from .state_space import StateSpace
@@ -21,6 +22,7 @@ class StateSpaceInput(LiveInput):
     """
 
     def __init__(self, task: "StateSpace", initial: Any, measurement: Any, tracks: int) -> None:
+        self.definition = task.definition
         self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
@@ -51,7 +53,7 @@ class StateSpaceInput(LiveInput):
             memory = {**memory, "inputs": self._hold(memory["inputs"], values)}
             values["inputs"] = memory["inputs"]
         if self.measurement.interval is not None:
-            return super().measure(memory, time, {**values, "interval": interval})
+            return self._checked(super().measure(memory, time, {**values, "interval": interval}), interval)
         wrong = numpy.abs(interval - own) > UNEVEN * own
         if wrong.any():
             raise ValueError(
@@ -59,7 +61,20 @@ class StateSpaceInput(LiveInput):
                 f"{float(interval[wrong][0]):g} s: call update once in every interval, without values where nothing "
                 "came, or write f(x, dt) and Q(dt)"
             )
-        return super().measure(memory, time, values)
+        return self._checked(super().measure(memory, time, values), interval)
+
+    def _checked(self, made: tuple[Any, Memory], interval: numpy.ndarray) -> tuple[Any, Memory]:
+        """Return a measurement; raise ValueError where its inputs make R of a sensor no covariance."""
+        measurement = made[0]
+        inputs = measurement.inputs if self.inputs else numpy.zeros((0, self.tracks))
+        found = find_invalid_noise(self.definition, measurement.available, interval, inputs)
+        if found is not None:
+            said = ", ".join(f"{name}={inputs[j, found.place]:g}" for j, name in enumerate(self.inputs))
+            raise ValueError(
+                f"R of {found.sensor} must be positive definite, and with {said} it is {found.R}: leave the sensor out "
+                "where its noise is not known"
+            )
+        return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Values with what the sensors say in one array, ``(m, N)``.

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import LogFormat, PlainRows, Predicted, TrackLog, TrackStart
 from ..data.recorded_tables import UNEVEN, Columns
+from .equations import find_invalid_noise
 
 if TYPE_CHECKING:
     from .equations import StateSpaceDefinition
@@ -40,12 +41,21 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
     one = len(definition.filters) == 1
     columns = {name.lower(): unit for name, unit in definition.measured.items()}
     acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
+    interval = None if definition.world[0].timed else float(defaults.get("sampling_interval", 1.0))
     return LogFormat(
         {**columns, **acting},
         functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,
         predicted=tuple(Predicted(name, unit, name) for name, unit in definition.measured.items()),
+        plain_rows=PlainRows(
+            tuple(definition.measured),
+            tuple(definition.inputs),
+            definition.mean,
+            definition.covariance,
+            interval,
+        ),
+        noise_hint="a sensor takes it from a column that is an input, inputs=['accuracy'] and R=lambda u: u[0] ** 2",
     )
 
 
@@ -91,8 +101,27 @@ def _read(
         measurements["interval"] = numpy.diff(time, prepend=start)
     if inputs:
         measurements["inputs"] = numpy.stack([_hold(name, columns[name], rows) for name in inputs], axis=1)
+    _check_noise(definition, measurements, rows, usual)
     initial = {"mean": definition.mean, "covariance": definition.covariance}
     return TrackLog(measurements, initial, rows, parameters, start, time, notes, typical)
+
+
+def _check_noise(
+    definition: "StateSpaceDefinition", made: Mapping[str, numpy.ndarray], rows: numpy.ndarray, usual: float
+) -> None:
+    """Raise ValueError for a row that makes R of a sensor no covariance, such as an accuracy of zero."""
+    count = len(rows)
+    interval = made.get("interval", numpy.full(count, usual))
+    inputs = made.get("inputs", numpy.zeros((count, 0)))
+    found = find_invalid_noise(definition, made["available"].T, interval, inputs.T)
+    if found is not None:
+        said = ", ".join(
+            f"{name} is {value:g}" for name, value in zip(definition.inputs, inputs[found.place], strict=True)
+        )
+        raise ValueError(
+            f"R of {found.sensor} must be positive definite, and in row {rows[found.place]}, where {said}, it is "
+            f"{found.R}: leave the cells of a sensor empty where its noise is not known"
+        )
 
 
 def _hold(name: str, given: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:

@@ -41,7 +41,8 @@ class Sensor:
     h: Any
     """What it measures: a function of the state ``(n,)`` that returns a list of numbers, or a matrix ``(m, n)``."""
     R: Any
-    """Covariance of its noise, ``(m, m)``, or the variance where it measures one number."""
+    """Covariance of its noise, ``(m, m)``, or the variance where it measures one number; or a function that returns
+    either, of the state and of ``dt`` and ``u``, as many of them as it names: ``R(x)``, ``R(u)``, ``R(x, dt, u)``."""
     interval: float | None = None
     """Between its measurements in a simulation, s: it speaks at the first measurement at which it is due. None: at
     every measurement."""

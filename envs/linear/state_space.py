@@ -27,7 +27,7 @@ from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
 from ..contract.task import Component, PaperPolicy, Scenario, Task
 from ..contract.world import World
-from .equations import Equations, Measurement, Passage, StateSpaceDefinition
+from .equations import Equations, Measurement, Passage, StateSpaceDefinition, usual_sensor_noise
 from .inputs import InputCourses
 from .live import StateSpaceInput
 from .logs import state_space_log_format
@@ -97,9 +97,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         own = task.definition
         self.equations = [Equations(task, model) for model in own.world]
         self.sensor_roots = [self._root(model.R) for model in own.world]
-        self.process_roots = [
-            None if isinstance(model.Q, VectorFunction) else self._root(model.Q) for model in own.world
-        ]
+        self.process_roots = [self._root(model.Q) for model in own.world]
         self.courses = InputCourses(tuple(own.inputs.values()), task.xp)
         self.timed, self.jitters = own.world[0].timed, self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
@@ -114,7 +112,8 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
-        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
+        usual = usual_sensor_noise(own.world[0], own.mean, self.parameters.sampling_interval, own.inputs)
+        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(usual)))
         self.delayed = self.drawn + self.receptions.row_uniforms
         self.delays = self.parameters.late > 0.0
         self.row_uniforms = self.delayed + len(own.channels) * self.delays
@@ -122,7 +121,10 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         # An angle is no reading of a component that turns on beyond it.
         self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
 
-    def _root(self, covariance: numpy.ndarray) -> Array:
+    def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
+        """Root of a covariance that is the same for all measurements; None of any other."""
+        if isinstance(covariance, VectorFunction):
+            return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
@@ -166,7 +168,8 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
             root = semidefinite_root(equations.process_noise(state, passed)) if q is None else q[:, :, None]
             state = state + apply(root, process)
             moved.append(state)
-            measured.append(equations.measure(state, passed) + apply(r[:, :, None], sensors))
+            root = semidefinite_root(equations.sensor_noise(state, passed)) if r is None else r[:, :, None]
+            measured.append(equations.measure(state, passed) + apply(root, sensors))
         state, values = (self._chosen(parts, hypothesis) for parts in (moved, measured))
         here = None
         if self.loses:
@@ -262,9 +265,12 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         return sum(terms[1:], terms[0])
 
     def reading_deviations(self, measurement: Measurement) -> Array:
-        """Those of the R that the filters believe."""
-        sigma = self.task.constant(numpy.sqrt(numpy.diag(self.task.definition.filters[0].R)))
-        return sigma[:, None] + 0.0 * measurement.values
+        """Those of the R that the filters believe, at the initial mean where it depends on the state."""
+        values = measurement.values
+        mean = self.task.constant(self.task.definition.mean)
+        x = self.xp.stack([mean[i] + 0.0 * values[0] for i in range(self.states)])
+        R = self.task.believed[0].sensor_noise(x, measurement)
+        return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
     def component_readings(self, measurement: Measurement) -> Array | None:
         """Readings of components that are measured as they are; None where none is."""

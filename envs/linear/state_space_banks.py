@@ -76,7 +76,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Track]):
         super().__init__(task, control)
         self.equations: Equations = task.believed[0]
         own = self.equations.model
-        self.states, self.sensors = own.f.size, len(own.R)
+        self.states, self.sensors = own.f.size, own.h.size
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -122,9 +122,9 @@ class KalmanBank(Bank[StateSpace, Measurement, Track]):
         """Covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.equations.process_noise(mean, measurement)
 
-    def sensor_noise(self, action: Array) -> Array:
-        """Likewise of the measurement."""
-        return self.equations.R[:, :, None]
+    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+        """Covariance of the measurement noise at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
+        return self.equations.sensor_noise(mean, measurement)
 
     def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict, and compare under the noises of the last action."""
@@ -151,7 +151,8 @@ class KalmanBank(Bank[StateSpace, Measurement, Track]):
 
     def received(self, state: Track, measurement: Measurement, action: Array) -> Received:
         """What was received, under the noises of an action."""
-        return self.equations.receive(measurement, state.mean, self.sensor_noise(action))
+        R = self.sensor_noise(state.mean, measurement, action)
+        return self.equations.receive(measurement, state.mean, R)
 
     def records(self, state: Track, measurement: Measurement) -> dict[str, Array]:
         """How likely the measurement was; NaN where nothing was received."""
@@ -176,9 +177,9 @@ class NoiseBank(KalmanBank):
         """Scaled Q."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
-    def sensor_noise(self, action: Array) -> Array:
+    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
         """Scaled R."""
-        return self._scale(action, 1) * self.equations.R[:, :, None]
+        return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
     def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
         """Update with the noises that the action asks for."""
@@ -278,13 +279,13 @@ class KalmanNetBank(KalmanBank):
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
-    def sensor_noise(self, action: Array) -> Array:
+    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
         """R under the action."""
-        return self._scaled(self.equations.R, NOISE_RANGE, self._part(action, 1))
+        R = self.equations.sensor_noise(mean, measurement)
+        return self._scaled(R, NOISE_RANGE, self._part(action, 1))
 
     def _scaled(self, matrix: Array, factor: float, exponents: Array) -> Array:
         scale = self.xp.exp(math.log(factor) * exponents)
-        matrix = matrix[:, :, None] if matrix.ndim == 2 else matrix
         return outer(scale, scale) * matrix
 
     def predict(self, state: Track, measurement: Measurement) -> Track:
@@ -358,7 +359,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
     ) -> None:
         super().__init__(task, control)
         self.count, self.factor, self.of_sources = len(task.believed), process_noise, of_sources
-        self.R = [one.sensor_noise(measurement_noise, of_sensors) for one in task.believed]
+        self.sensor_factors = measurement_noise, of_sensors
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -369,7 +370,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
     def blocks(self) -> Sequence[Block]:
         """Probabilities and likelihoods of the hypotheses, what was received, and the last action."""
         xp, modes = self.xp, self.task.modes
-        parts = tuple(map(str, range(1, len(self.task.definition.filters[0].R) + 1)))
+        parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
             Block("nis", lambda f, _: f.nis, "normalised innovation squared", modes, LOG1P),
             Block(
@@ -428,7 +429,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         for j, equations in enumerate(self.task.believed):
             mean, carried = equations.carry(means[:, j], covariances[:, :, j], measurement)
             P = carried + self.factor * equations.process_noise(mean, measurement, self.of_sources)
-            received = equations.receive(measurement, mean, self.R[j])
+            R = equations.sensor_noise(mean, measurement, *self.sensor_factors)
+            received = equations.receive(measurement, mean, R)
             updates.append(update_with_gain(mean, P, received, equations.gain(P, received)))
         return state._replace(
             means=xp.stack([u.mean for u in updates], axis=1),

@@ -113,7 +113,8 @@ def front(points: Sequence[Point]) -> list[str]:
     chosen = []
     for cost in {point.cost for point in found}:
         equal = [point for point in found if point.cost == cost]
-        longest = EQUAL_TIMES * min(point.time.nanoseconds for point in equal)
+        quickest = min(point.time.nanoseconds for point in equal)
+        longest = max(quickest, EQUAL_TIMES * quickest)  # a difference of two clocks may be below zero
         chosen.append(min((p for p in equal if p.time.nanoseconds <= longest), key=lambda p: p.name))
     return [point.name for point in sorted(chosen, key=lambda point: point.time.nanoseconds)]
 

@@ -15,6 +15,7 @@ from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.flights import names_flights, read_flights
+from ..envs.data.plausibility import LOUD
 from ..envs.data.recording import Recording
 from ..envs.data.recording_files import is_recording
 from ..envs.engine.backend import make_model
@@ -268,21 +269,18 @@ class Outcome(NamedTuple):
             compared = results_tables(self.records, problem.knows, width)
             paper = self.dataset.attrs["paper"]
             if paper not in {record.policy for record in self.records}:
-                compared[-1].caption = f"{_without_costs(paper)}\n{compared[-1].caption}"
+                compared[-1].caption = f"{_without_comparison(paper)}\n{compared[-1].caption}"
             tables += compared
         if self.dataset.attrs["recorded"]:
             tables += recording_tables(self.records, differences, self.has_truth, width)
         return tables
 
 
-def _without_costs(paper: str) -> str:
-    """Say why no competitor has a cost, and what to do, where the paper's algorithm of this name did not take part."""
+def _without_comparison(paper: str) -> str:
+    """Explain why costs are compared with none, where the paper's algorithm of this name did not take part."""
     if not paper:
-        return "No cost is shown: the environment names no paper's algorithm to compare it with."
-    return (
-        f"No cost is shown: it is compared with that of the paper's algorithm, which did not take part; add --policy "
-        f"{paper}."
-    )
+        return "Costs are not compared: the environment names no paper's algorithm."
+    return f"Costs are compared with that of {paper} where it takes part: add --policy {paper}."
 
 
 def run(
@@ -412,7 +410,7 @@ def write(
         for sentence in reason_sentences(outcome.records, phrases, name):
             print_sentence(sentence)
     for note in [*notes_of(outcome.dataset), *missing_rows(outcome.records)]:
-        print_sentence(note)
+        print_sentence(note, bold=len(note) if note.startswith(LOUD) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
         console.print(f"{what} in {outputs.folder}")

@@ -141,7 +141,9 @@ TruthOption = Annotated[
 RenameOption = Annotated[
     str | None,
     typer.Option(
-        "--rename", help="What columns of a table are, where they have other names: 't=time,pos=x'."
+        "--rename",
+        help="What columns of a table are, where they have other names: 't=time,pos=x'. One column may be several: "
+        "'accuracy=sigma_x,accuracy=sigma_y'.",
     ),
 ]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
@@ -280,16 +282,18 @@ def check_no_recording_options(truth: Any, rename: str | None) -> None:
             raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
 
 
-def renamed(text: str | None) -> dict[str, str]:
-    """Names of columns by what they are called in a file, of an option such as ``t=time,pos=x``.
+def renamed(text: str | None) -> dict[str, list[str]]:
+    """What columns of a file are by their names there, of an option such as ``t=time,pos=x``.
 
     Raises:
         ValueError: for what is none.
     """
     pairs = [part.split("=") for part in text.split(",")] if text else []
-    names = {pair[0].strip(): pair[-1].strip() for pair in pairs}
-    if len(names) != len(pairs) or not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
+    if not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
         raise ValueError(f"--rename takes NAME=MEANING,NAME=MEANING, such as 't=time,pos=x', got {text!r}")
+    names: dict[str, list[str]] = {}
+    for old, new in pairs:
+        names.setdefault(old.strip(), []).append(new.strip())
     return names
 
 

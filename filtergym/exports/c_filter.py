@@ -179,11 +179,14 @@ class FilterText:
 
     def _taken(self) -> str:
         """Statement that returns whether there was a measurement."""
-        own = self.name.upper()
-        if "available" not in self.structs["measurement"].places.values():
+        own, zero = self.name.upper(), literal(0.0, self.scalar)
+        there = [
+            p for p in self.structs["measurement"].places.values() if re.fullmatch(r"available(\[\d+\])*", p)
+        ]
+        if not there:
             return f"return {own}_TAKEN;"
-        zero = literal(0.0, self.scalar)
-        return f"return measurement->available > {zero} ? {own}_TAKEN : {own}_MISSED;"
+        received = " || ".join(f"measurement->{place} > {zero}" for place in there)
+        return f"return {received} ? {own}_TAKEN : {own}_MISSED;"
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -215,12 +218,19 @@ class FilterText:
         listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
         remembered = f"{self.scalar.name} network[{self.memory}]; /* what the network remembers */"
         memory = [remembered] if self.memory else []
+        timed = "interval" in structs["measurement"].places.values()
+        predicts = (
+            "predicts over its interval"
+            if timed
+            else "predicts from the one before (a call for every measurement, also where nothing was received)"
+        )
+        refused = "its interval is negative or no number" if timed else "never, without an interval"
         functions = {
             "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
             "update": (
-                "Takes in a measurement: predicts to its time, and updates. What was not received is said by the "
-                "measurement itself, as in the environment. Returns what became of it; the state stays as it was where "
-                "a measurement is rejected or refused, and the estimate is then of no use.",
+                f"Takes in a measurement: {predicts}, and updates. The members of the measurement state what was "
+                "received, as in the environment. Returns what became of it; the state stays as it was where a "
+                "measurement is rejected or refused, and the estimate is then of no use.",
                 ("state", "measurement", "estimate"),
             ),
         }
@@ -242,8 +252,8 @@ class FilterText:
         statuses = ("TAKEN", "MISSED", "REJECTED", "REFUSED")
         text.append(
             comment(
-                "What became of a measurement: taken in; none was received; rejected, since the estimate would be no "
-                "number; refused, since its interval is negative or none."
+                "What became of a measurement: taken in; missed, nothing was received; rejected, the estimate would be "
+                f"no number; refused, {refused}."
             )
             + "\nenum { "
             + ", ".join(f"{own.upper()}_{name} = {i}" for i, name in enumerate(statuses))

@@ -1,7 +1,7 @@
 """Programs of C around an exported filter, with fields for what differs from filter to filter."""
 
 MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
-   A row whose initial columns are filled begins a new track. Where the first line is a hello of filtergym, such as
+   {begins} Where the first line is a hello of filtergym, such as
    `filtergym evaluate --policy exec:./run` writes it, the program speaks that protocol: a line of its own, and then
    frames of doubles, for any number of tracks. */
 #include <math.h>
@@ -11,13 +11,15 @@ MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and w
 
 #include "rows.h"
 
-#define COLUMNS {count}
+#define COLUMNS {count} /* of the table */
+#define INITIAL {initial}
+#define MEASUREMENT {measurement}
 #define ANSWER ({C} + {C} * {C})
 #define FEEDBACK {feedback} /* numbers beside the estimate that steer the simulated world */
 static const char columns[] =
     {columns};
 
-static char line[1024 + 32 * COLUMNS + sizeof columns];
+static char line[1024 + 32 * (COLUMNS + INITIAL + MEASUREMENT) + sizeof columns];
 
 /* The numbers of a line; an empty one is NaN. Returns how many there are. */
 static int numbers(const char *text, double *row) {{
@@ -46,7 +48,7 @@ static void hold_missing(double *row, double *last) {{
     static const int available[] = {{{available}-1}};
     int i, missing = 0;
     for (i = 0; available[i] >= 0; ++i) missing |= !(row[available[i]] > 0.0);
-    for (i = 0; i < COLUMNS - {initial}; ++i)
+    for (i = 0; i < MEASUREMENT; ++i)
         if (row[i] == row[i])
             last[i] = row[i];
         else if (missing)
@@ -62,8 +64,8 @@ static int serve(void) {{
     double *rows, *last;
     long t;
     int i, j;
-    if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != {initial} ||
-        number_of("\\"measurement\\": ") != COLUMNS - {initial} || number_of("\\"answer\\": ") != ANSWER ||
+    if (number_of("\\"filtergym\\": ") != 1 || number_of("\\"initial\\": ") != INITIAL ||
+        number_of("\\"measurement\\": ") != MEASUREMENT || number_of("\\"answer\\": ") != ANSWER ||
         tracks < 1) {{
         puts("{{\\"error\\": \\"this filter was exported from another environment or scenario\\"}}");
         return 2;
@@ -71,24 +73,24 @@ static int serve(void) {{
     while (strchr(line, '\\n') == NULL && fgets(line, (int)sizeof line, stdin) != NULL) {{
     }}
     states = malloc((size_t)tracks * sizeof *states);
-    rows = malloc((size_t)tracks * (COLUMNS + ANSWER + FEEDBACK) * sizeof *rows);
-    last = calloc((size_t)tracks * (COLUMNS - {initial}), sizeof *last);
+    rows = malloc((size_t)tracks * (INITIAL + MEASUREMENT + ANSWER + FEEDBACK) * sizeof *rows);
+    last = calloc((size_t)tracks * MEASUREMENT, sizeof *last);
     if (states == NULL || rows == NULL || last == NULL) return 2;
     printf("{{\\"filtergym\\": 1, \\"format\\": \\"float64\\"%s}}\\n", steers ? ", \\"feedback\\": true" : "");
     fflush(stdout);
-    if (fread(rows, {initial} * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
+    if (fread(rows, INITIAL * sizeof *rows, (size_t)tracks, stdin) != (size_t)tracks) return 0;
     for (t = 0; t < tracks; ++t) {{
         {own}_initial initial;
-        set_initial(&initial, rows + t * {initial});
+        set_initial(&initial, rows + t * INITIAL);
         {own}_start(&states[t], &initial);
     }}
-    while (fread(rows, (COLUMNS - {initial}) * sizeof *rows, (size_t)tracks, stdin) == (size_t)tracks) {{
-        double *answer = rows + tracks * (COLUMNS - {initial});
+    while (fread(rows, MEASUREMENT * sizeof *rows, (size_t)tracks, stdin) == (size_t)tracks) {{
+        double *answer = rows + tracks * MEASUREMENT;
         for (t = 0; t < tracks; ++t) {{
             {own}_measurement measurement;
             {own}_estimate estimate;
-            hold_missing(rows + t * (COLUMNS - {initial}), last + t * (COLUMNS - {initial}));
-            set_measurement(&measurement, rows + t * (COLUMNS - {initial}));
+            hold_missing(rows + t * MEASUREMENT, last + t * MEASUREMENT);
+            set_measurement(&measurement, rows + t * MEASUREMENT);
             if ({own}_update(&states[t], &measurement, &estimate) >= {upper}_REJECTED) {{
                 for (i = 0; i < width; ++i) *answer++ = (double)NAN;
                 continue;
@@ -107,6 +109,7 @@ static int serve(void) {{
     return 0;
 }}
 
+{layout}
 int main(int argc, char **argv) {{
     static {own}_state state;
     static double row[COLUMNS];
@@ -133,9 +136,9 @@ int main(int argc, char **argv) {{
             fprintf(stderr, "line %ld must have %d numbers\\n", number, COLUMNS);
             return 2;
         }}
-        if (row[0] == row[0]) {{
+        if (begins(row)) {{
             {own}_initial initial;
-            set_initial(&initial, row);
+            set_initial(&initial, initial_of(row));
             {own}_start(&state, &initial);
             ++track;
             measurement = 0;
@@ -144,7 +147,7 @@ int main(int argc, char **argv) {{
             fprintf(stderr, "line 2 must begin a track\\n");
             return 2;
         }}
-        set_measurement(&measurement_now, row + {initial});
+        set_measurement(&measurement_now, measurement_of(row));
         {own}_update(&state, &measurement_now, &estimate);
         printf("%ld,%ld", track, ++measurement);{told}
         for (i = 0; i < {C}; ++i) printf(",%.{digits}g", (double)estimate.mean{mean});
@@ -156,6 +159,37 @@ int main(int argc, char **argv) {{
 }}
 """
 """Reads a table of measurements and writes one of estimates."""
+INITIAL_IN_ROW = """/* Whether a row begins a track, the initial estimate that it has, and its measurement. */
+static int begins(const double *row) {{ return row[0] == row[0]; }}
+static const double *initial_of(const double *row) {{ return row; }}
+static const double *measurement_of(const double *row) {{ return row + INITIAL; }}
+"""
+"""Layout of the rows of a table with the initial estimate in the row that begins a track, and every number of a
+measurement."""
+INITIAL_OF_MODEL = """static const double initial_estimate[INITIAL] = {{{estimate}}};
+
+/* Whether a row begins a track, the initial estimate of all tracks, and the measurement of a row. */
+static int begins(const double *row) {{
+    static double before;
+    static int any = 0;
+    const int begun = !any || row[0] != before;
+    any = 1;
+    before = row[0];
+    return begun;
+}}
+
+static const double *initial_of(const double *row) {{
+    (void)row;
+    return initial_estimate;
+}}
+
+static const double *measurement_of(const double *row) {{
+    static double given[MEASUREMENT];
+    {fill}
+    return given;
+}}
+"""
+"""Layout of the rows of a table with the columns of a log, where the model has the initial estimate."""
 POSITIONS = {
     ("latitude", "longitude", "altitude"): "if (!(fabs(a) <= 90.0 && fabs(b) <= 360.0)) return 0;\n"
     "    project(a, b, number(row, place[5]), p);",
@@ -344,6 +378,209 @@ int main(int argc, char **argv) {{
 }}
 """
 """Reads a log as it was read when the filter was advised, and writes an estimate for each row."""
+PLAIN_LOG = """/* Reads a log (CSV, a file or standard input) as `filtergym evaluate --recording` reads it, and
+   writes an estimate for each row. The track starts with the initial estimate of the model one interval before the
+   first row. An empty cell was not received; of an input the last number holds on. Rows of one time are joined. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "rows.h"
+
+#define INTERVAL {interval} /* s; zero: rows come at any time */
+#define FIRST {first} /* interval before the first row, s; zero: the median of all, or INTERVAL */
+#define RECEIVED {received}
+#define COLUMNS {count} /* what is received, and then the inputs */
+#define LONGEST 1048576
+
+static const char *const times[] = {{{times}}};
+static const char *const names[COLUMNS] = {{{names}}};
+static const double initial_estimate[] = {{{estimate}}};
+static int place[COLUMNS], time_place = -1;
+static char line[LONGEST], delimiter = ',';
+
+static int fail(const char *words, const char *name, long number) {{
+    fprintf(stderr, "%s %s (line %ld)\\n", words, name, number);
+    return 2;
+}}
+
+/* Where a column of a row begins; NULL where it has no such column. */
+static const char *begin_of(const char *row, int column) {{
+    for (; column > 0 && row != NULL; --column) {{
+        row = strchr(row, delimiter);
+        if (row != NULL) ++row;
+    }}
+    return row;
+}}
+
+/* Copies a cell of a row without spaces and quotes, with a point for a decimal comma; returns whether it is filled. */
+static int cell(const char *row, int column, char *text, size_t size) {{
+    size_t length = 0;
+    row = begin_of(row, column);
+    if (row == NULL) return 0;
+    for (; *row != delimiter && *row != '\\0' && *row != '\\n' && *row != '\\r' && length + 1 < size; ++row)
+        if (*row != ' ' && *row != '"') text[length++] = *row == ',' ? '.' : *row;
+    text[length] = '\\0';
+    return length > 0;
+}}
+
+/* Number in a cell, NaN in an empty one; returns whether it is either. */
+static int number(const char *row, int column, double *value) {{
+    char text[400], *end;
+    *value = (double)NAN;
+    if (!cell(row, column, text, sizeof text)) return 1;
+    *value = strtod(text, &end);
+    return *end == '\\0';
+}}
+
+/* Finds the columns in the first line; names are read without regard to case. */
+static int find_columns(char *row) {{
+    char text[400];
+    int column, k;
+    size_t i;
+    if (strncmp(row, "\\xEF\\xBB\\xBF", 3) == 0) memset(row, ' ', 3);
+    if (strchr(row, ',') == NULL) delimiter = strchr(row, ';') != NULL ? ';' : '\\t';
+    for (k = 0; k < COLUMNS; ++k) place[k] = -1;
+    for (column = 0; begin_of(row, column) != NULL; ++column) {{
+        if (!cell(row, column, text, sizeof text)) continue;
+        for (i = 0; text[i] != '\\0'; ++i)
+            if (text[i] >= 'A' && text[i] <= 'Z') text[i] = (char)(text[i] - 'A' + 'a');
+        if (strcmp(text, "recording") == 0) return fail("several tracks are not read: leave out the column", text, 1);
+        for (i = 0; i < sizeof times / sizeof *times; ++i)
+            if (strcmp(text, times[i]) == 0 && time_place < 0) time_place = column;
+        for (k = 0; k < COLUMNS; ++k)
+            if (strcmp(text, names[k]) == 0) place[k] = column;
+    }}
+    if (time_place < 0) return fail("it lacks the column", times[0], 1);
+    for (k = 0; k < COLUMNS; ++k)
+        if (place[k] < 0) return fail("it lacks the column", names[k], 1);
+    return 0;
+}}
+
+static int ascending(const void *a, const void *b) {{
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}}
+
+/* Median of the intervals between rows, to six digits. */
+static double usual_interval(const double *at, long count) {{
+    double *steps = malloc((size_t)count * sizeof *steps), median;
+    char text[40];
+    long k;
+    if (steps == NULL) return (double)NAN;
+    for (k = 1; k < count; ++k) steps[k - 1] = at[k] - at[k - 1];
+    qsort(steps, (size_t)(count - 1), sizeof *steps, ascending);
+    median = 0.5 * (steps[(count - 1) / 2] + steps[(count - 2) / 2]);
+    free(steps);
+    sprintf(text, "%.6g", median);
+    return strtod(text, NULL);
+}}
+
+static {own}_state state;
+
+static int step(double interval, const double *row, const double *held, {own}_estimate *estimate) {{
+    {own}_measurement m;
+    double given[{measurement}];
+    (void)interval;
+    (void)held;
+    {fill}
+    set_measurement(&m, given);
+    return {own}_update(&state, &m, estimate);
+}}
+
+int main(int argc, char **argv) {{
+    static const char *const words[4] = {{"taken", "missed", "rejected", "refused"}};
+    static double held[COLUMNS + 1], nothing[COLUMNS], joined[COLUMNS];
+    double *rows = NULL, *at = NULL, *written = NULL, first_time = 0.0, unit = 1.0, before;
+    long count = 0, room = 0, line_number = 1, k;
+    int i, differ = 0, wrong;
+    {own}_initial initial;
+    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
+    if (file == NULL) return fail("cannot read", argv[1], 0);
+    if (fgets(line, LONGEST, file) == NULL) return fail("it is", "empty", 1);
+    if ((wrong = find_columns(line)) != 0) return wrong;
+    while (fgets(line, LONGEST, file) != NULL) {{
+        double as_written, now;
+        ++line_number;
+        if (line[strspn(line, "\\r\\n")] == '\\0') continue;
+        if (!number(line, time_place, &as_written) || !(as_written - as_written == 0.0))
+            return fail("a number of seconds must be in the column", times[0], line_number);
+        if (count == 0)
+            for (first_time = as_written; unit < 1e9 && first_time > 1e11 * unit;) unit *= 1e3;
+        now = unit > 1.0 ? (as_written - first_time) / unit : as_written;
+        if (count > 0 && now < at[count - 1]) return fail("rows must be sorted by", times[0], line_number);
+        if (count == room) {{
+            room = 2 * room + 1024;
+            rows = realloc(rows, (size_t)room * COLUMNS * sizeof *rows);
+            at = realloc(at, (size_t)room * sizeof *at);
+            written = realloc(written, (size_t)room * sizeof *written);
+            if (rows == NULL || at == NULL || written == NULL) return fail("no memory for", "the rows", line_number);
+        }}
+        for (i = 0; i < COLUMNS; ++i)
+            if (!number(line, place[i], rows + count * COLUMNS + i) || isinf(rows[count * COLUMNS + i]))
+                return fail("a finite number must be in the column", names[i], line_number);
+        if (count > 0 && now == at[count - 1]) {{
+            for (i = 0; i < COLUMNS; ++i) {{
+                const double value = rows[count * COLUMNS + i];
+                if (value == value && joined[i] == joined[i]) differ |= value != joined[i];
+                if (value == value && !(joined[i] == joined[i])) joined[i] = value;
+            }}
+            continue;
+        }}
+        /* Rows of one time supply each other; where two of them differ in a number, the first alone counts. */
+        if (count > 0 && !differ) memcpy(rows + (count - 1) * COLUMNS, joined, sizeof joined);
+        memcpy(joined, rows + count * COLUMNS, sizeof joined);
+        differ = 0;
+        at[count] = now;
+        written[count++] = as_written;
+    }}
+    if (count < 2) return fail("there must be several", "rows", line_number);
+    if (!differ) memcpy(rows + (count - 1) * COLUMNS, joined, sizeof joined);
+    for (i = 0; i < COLUMNS; ++i) nothing[i] = (double)NAN;
+    for (i = RECEIVED; i < COLUMNS; ++i) {{
+        for (k = 0; k < count && !(rows[k * COLUMNS + i] == rows[k * COLUMNS + i]); ++k) continue;
+        if (k == count) return fail("no row has a number of", names[i], line_number);
+        held[i - RECEIVED] = rows[k * COLUMNS + i];
+    }}
+    set_initial(&initial, initial_estimate);
+    {own}_start(&state, &initial);
+    before = at[0] - (FIRST > 0.0 ? FIRST : INTERVAL > 0.0 ? INTERVAL : usual_interval(at, count));
+    puts({header});
+    for (k = 0; k < count; ++k) {{
+        const double *row = rows + k * COLUMNS;
+        {own}_estimate estimate;
+        double interval = at[k] - before;
+        int status;
+        if (INTERVAL > 0.0 && k > 0) {{
+            const double steps = floor(interval / INTERVAL + 0.5);
+            double missed;
+            if (!(fabs(interval - steps * INTERVAL) <= 0.01 * INTERVAL) || steps > 1000.0)
+                return fail("rows must be whole intervals apart, by", times[0], k + 2);
+            for (missed = 1.0; missed < steps; missed += 1.0) (void)step(INTERVAL, nothing, held, &estimate);
+        }}
+        for (i = RECEIVED; i < COLUMNS; ++i)
+            if (row[i] == row[i]) held[i - RECEIVED] = row[i];
+        status = step(interval, row, held, &estimate);
+        before = at[k];
+        printf("%.17g,%s", written[k], words[status]);
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", (double)estimate.mean{mean});
+            else
+                printf(",");
+        for (i = 0; i < {C}; ++i)
+            if (status < 2)
+                printf(",%.{digits}g", sqrt((double)estimate.covariance{covariance}));
+            else
+                printf(",");
+        putchar('\\n');
+    }}
+    if (file != stdin) fclose(file);
+    return 0;
+}}
+"""
+"""Reads a log whose rows are measurements as they stand, and writes an estimate for each row."""
 TEST = """/* Compares the filter with what the competitor itself estimated, and says how long an update takes. */
 #include <math.h>
 #include <stdio.h>

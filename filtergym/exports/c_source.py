@@ -8,7 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy
@@ -24,9 +24,11 @@ from ..compiler.c_text import (
     identifier,
     literal,
 )
+from ..envs.contract.log_format import PlainRows
+from ..envs.data.recorded_tables import TIME
 from ..evaluation.storage.files import whole_files
 from .c_filter import FilterText
-from .c_programs import LOG, MAIN, POSITIONS, PROJECT, TEST
+from .c_programs import INITIAL_IN_ROW, INITIAL_OF_MODEL, LOG, MAIN, PLAIN_LOG, POSITIONS, PROJECT, TEST
 from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
@@ -51,16 +53,29 @@ VECTORS = 2, 50
 class Writer(FilterText):
     """The files of a filter: itself, and the programs around it.
 
-    Arguments are those of :class:`.FilterText`.
+    Args:
+        name: as of :class:`.FilterText`, also the next three.
+        traced: its programs.
+        scalar: kind of numbers.
+        components: what is estimated.
+        rows: how rows of a log are its measurements as they stand; None where more is done to them.
+        columns: names in the log of the columns that have others there.
 
     Attributes:
         limit: largest difference with which the test passes, standard deviations.
     """
 
     def __init__(
-        self, name: str, traced: TracedFilter, scalar: Scalar, components: Sequence[tuple[str, str]]
+        self,
+        name: str,
+        traced: TracedFilter,
+        scalar: Scalar,
+        components: Sequence[tuple[str, str]],
+        rows: PlainRows | None = None,
+        columns: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(name, traced, scalar, components)
+        self.plain_rows, self.log_columns = rows, columns or {}
         self.limit = WORST[scalar.name]
 
     def rows(self) -> str:
@@ -88,7 +103,8 @@ class Writer(FilterText):
     def main(self) -> str:
         """Text of a program that reads a table of measurements and writes one of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
-        given = [*self.columns("initial"), *self.columns("measurement")]
+        initial, measurement = self.columns("initial"), self.columns("measurement")
+        given = self.table_columns()
         names = [identifier(name) for name, _ in self.components]
         told = [member.name for member in self.traced.estimate if member.name in LIKELIHOODS]
         header = [
@@ -102,8 +118,13 @@ class Writer(FilterText):
             own=self.name,
             columns=_string(",".join(given)),
             header=_string(",".join(header)),
-            initial=len(self.columns("initial")),
+            initial=len(initial),
+            measurement=len(measurement),
             count=len(given),
+            begins="A row whose initial columns are filled begins a new track."
+            if self.plain_rows is None
+            else "A row with another number of a recording begins a new track.",
+            layout=self._layout(),
             C=C,
             digits=digits,
             upper=self.name.upper(),
@@ -118,6 +139,96 @@ class Writer(FilterText):
             feedback=sum(member.name == FEEDBACK for member in self.traced.estimate),
             steer=STEER if any(member.name == FEEDBACK for member in self.traced.estimate) else "",
             told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
+        )
+
+    def table_columns(self) -> list[str]:
+        """Names of the columns of the table that main.c reads."""
+        rows = self.plain_rows
+        if rows is None:
+            return [*self.columns("initial"), *self.columns("measurement")]
+        own = [name for name in self.columns("measurement") if self._source(name) == ("other", 0)]
+        timed = ["interval"] * (rows.interval is None)
+        return [*map(identifier, ["recording", *timed, *rows.received, *rows.held]), *own]
+
+    def _source(self, name: str) -> tuple[str, int]:
+        """What a number of a measurement follows from in a plain row: its kind and its place among those."""
+        kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
+        kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
+        return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
+
+    def _fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
+        """Statements that make a measurement ``given`` of a plain row.
+
+        Args:
+            received: expression of the first number that is received; the others follow it.
+            held: likewise of the inputs.
+            interval: expression of the interval.
+            others: expressions of all else, in its order; default: zero.
+        """
+        lines, rest = [], iter(others)
+        for row, name in enumerate(self.columns("measurement")):
+            kind, place = self._source(name)
+            cell = f"{received}[{place}]"
+            value = {
+                "received": f"{cell} == {cell} ? {cell} : 0.0",
+                "there": f"{cell} == {cell} ? 1.0 : 0.0",
+                "held": f"{held}[{place}]",
+                "interval": interval,
+            }.get(kind) or next(rest, "0.0")
+            lines.append(f"given[{row}] = {value};")
+        return "\n    ".join(lines)
+
+    def _estimate(self, rows: PlainRows) -> list[float]:
+        """Initial estimate of all tracks, in the order of the rows of its struct."""
+        return [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
+
+    def _layout(self) -> str:
+        """Functions of main.c that say where in a row everything is."""
+        rows = self.plain_rows
+        if rows is None:
+            return INITIAL_IN_ROW.format()
+        first = 1 + (rows.interval is None)
+        count, held = first + len(rows.received), first + len(rows.received) + len(rows.held)
+        others = [f"row[{place}]" for place in range(held, len(self.table_columns()))]
+        hold = [
+            f"if (row[{place}] == row[{place}]) last[{place - count}] = row[{place}];"
+            for place in range(count, held)
+        ]
+        fill = self._fill(f"(row + {first})", "last", "row[1]", others)
+        if hold:
+            fill = "\n    ".join([f"static double last[{len(hold)}];", *hold, fill])
+        return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self._estimate(rows))), fill=fill)
+
+    def plain_log_program(self, interval: float | None = None) -> str:
+        """Text of a program that reads a log whose rows are measurements as they stand; empty where they are not.
+
+        Args:
+            interval: between rows that a user has set, s.
+        """
+        rows = self.plain_rows
+        if rows is None:
+            return ""
+        C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
+        shown = [identifier(name) for name, _ in self.components]
+        header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
+        times = dict.fromkeys([self.log_columns.get("time", "time"), *TIME])
+        names = [self.log_columns.get(name.lower(), name) for name in (*rows.received, *rows.held)]
+        return PLAIN_LOG.format(
+            own=self.name,
+            interval=literal(0.0 if rows.interval is None else interval or rows.interval),
+            first=literal(interval or 0.0),
+            received=len(rows.received),
+            count=len(names),
+            measurement=len(self.columns("measurement")),
+            times=", ".join(_quote(name.lower()) for name in times),
+            names=", ".join(_quote(name.lower().replace(" ", "")) for name in names),
+            estimate=", ".join(map(literal, self._estimate(rows))),
+            fill=self._fill("row", "held", "interval"),
+            header=_string(",".join(header)),
+            C=C,
+            digits=digits,
+            mean="" if C == 1 else "[i]",
+            covariance="" if C == 1 else "[i][i]",
         )
 
     def log_program(self, log: LogSetup) -> str:
@@ -205,13 +316,44 @@ class Writer(FilterText):
 
     def table(self, replayed: Replay) -> str:
         """Text of a table of measurements, as main.c reads it."""
-        lines = [",".join([*self.columns("initial"), *self.columns("measurement")])]
+        lines = [",".join(self.table_columns())]
+        if self.plain_rows is not None:
+            for episode in range(replayed.initial.shape[1]):
+                rows = replayed.measurements[:, :, episode].tolist()
+                lines += [",".join([str(episode + 1), *self._plain_row(row)]) for row in rows]
+            return "\n".join([*lines, ""])
         blank = "," * len(self.columns("initial"))
         for episode, initial in enumerate(replayed.initial.T.tolist()):
             rows = [",".join(map(repr, row)) for row in replayed.measurements[:, :, episode].tolist()]
             lines.append(",".join([*map(repr, initial), rows[0]]))
             lines += [blank + row for row in rows[1:]]
         return "\n".join([*lines, ""])
+
+    def _plain_row(self, row: Sequence[float]) -> list[str]:
+        """Cells of a measurement in a table with the columns of a log, without its first one."""
+        found: dict[str, list[str]] = {"interval": [], "received": [], "held": [], "other": []}
+        there = [
+            value > 0.0
+            for value, name in zip(row, self.columns("measurement"), strict=True)
+            if self._source(name)[0] == "there"
+        ]
+        for value, name in zip(row, self.columns("measurement"), strict=True):
+            kind, place = self._source(name)
+            if kind != "there":
+                found[kind].append("" if kind == "received" and not there[place] else repr(value))
+        return [cell for cells in found.values() for cell in cells]
+
+
+def _quote(text: str) -> str:
+    """A literal of C of any words: what is no letter, digit or plain sign is written in octal."""
+    return (
+        '"'
+        + "".join(
+            chr(byte) if (chr(byte).isalnum() and byte < 128) or chr(byte) in " _-./()[]" else f"\\{byte:03o}"
+            for byte in text.encode()
+        )
+        + '"'
+    )
 
 
 def _string(text: str) -> str:
@@ -242,7 +384,15 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
             f"more than {WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
             + ("export it in double" if scalar is FLOAT else "please report it")
         )
-    writer = Writer(request.name, traced, scalar, replayed.components)
+    log_format = request.problem.task.log_format
+    writer = Writer(
+        request.name,
+        traced,
+        scalar,
+        replayed.components,
+        log_format.plain_rows if log_format else None,
+        {**getattr(request.scenario, "columns", {}), **(request.log.columns if request.log else {})},
+    )
     writer.about = _about(request, writer, precision, command)
     figures = Figures(*writer.sizes, difference, writer.replaced, writer.network_operations)
     large = figures.operations > MOST_OPTIMISED
@@ -253,10 +403,17 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
     folder.mkdir(parents=True, exist_ok=True)
     with whole_files(folder) as waiting:
         texts = files_of(writer, replayed, _notes(figures, replayed, precision))
-        program = "" if request.log is None else writer.log_program(request.log)
+        program = _log_program(request, writer)
         for file, text in {**texts, **({"log.c": program} if program else {})}.items():
             (waiting / file).write_text(text, encoding="ascii")
     return figures
+
+
+def _log_program(request: ExportRequest, writer: Writer) -> str:
+    """Text of a program that reads a log of the user; empty where there is none."""
+    if writer.plain_rows is not None:
+        return writer.plain_log_program(request.keywords.get("sampling_interval"))
+    return "" if request.log is None else writer.log_program(request.log)
 
 
 def price_of(request: ExportRequest) -> dict[str, int] | None:
@@ -303,7 +460,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
                 "Estimates from a log of your own:",
                 f"    cc -std=c99 -O2 log.c {own}.c -lm -o log && ./log mine.csv",
             ]
-            if request.log is not None and writer.log_program(request.log)
+            if _log_program(request, writer)
             else []
         ),
         "",

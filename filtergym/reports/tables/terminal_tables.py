@@ -175,6 +175,7 @@ COST_NOTE = (
     "mean costs, which few lost tracks may rule. A track is lost where an episode's mean cost is beyond the bound of "
     "the environment."
 )
+MEAN_COST_NOTE = "cost is the mean cost of a measurement."
 RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 
 
@@ -184,12 +185,17 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
         "cost vs paper, %": lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
         ),
+        "cost": lambda name: with_interval(found.get((name, "cost", "", "all"))),
         "lost\ntracks, %": lambda name: against_paper(found, name)[0],
         "means,\n%": lambda name: against_paper(found, name)[1],
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
     }
+    compared = any(r.metric == HEADLINE and r.value is not None for r in records)
+    for title in ["cost"] if compared else ["cost vs paper, %", "means,\n%"]:
+        del columns[title]
     notes = [
-        f"{COST_NOTE} ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off "
+        f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance says; "
+        f"{INCONSISTENT} marks one that is off "
         "by more than a factor of two.",
     ]
     if not any(r.metric == "lost_tracks" for r in records):
