@@ -9,6 +9,7 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.registration import USER_TASKS
+from filtergym.evaluation.running.times import Point, ProcessorTime, front
 from own_models import make_models, simulate
 
 import filtergym
@@ -358,3 +359,12 @@ def test_without_the_papers_algorithm_costs_are_shown_as_they_are(make, command)
     [row] = [line.split() for line in shown.splitlines() if line.startswith("extended")][:1]
     run = filtergym.evaluate(cls.id, ["extended"], episodes=8, horizon=20)
     assert float(row[2]) == pytest.approx(float(run["cost"].mean()), rel=0.01)
+
+
+def test_a_time_below_zero_ends_no_table():
+    # A short recording: the time of the world alone, which is subtracted, may have been measured longer.
+    points = [
+        Point("a", "policy", ProcessorTime(-3.0, True), 1.0),
+        Point("b", "policy", ProcessorTime(-1.0, True), 1.0),
+    ]
+    assert front(points) == ["a"]
