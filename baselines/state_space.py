@@ -232,22 +232,20 @@ class Unscented(Extended):
         )
         spread = spread + self.equations.input_noise(state.mean, measurement)
         Q = self.process_noise(mean, measurement)
-        own = self.equations
-        z, near = _numbers(measurement, self.xp), own.measure(mean, measurement)
-
-        def h(x: Array) -> Array:
-            return own.measure(x, measurement)
-
-        def h_near(x: Array) -> Array:
-            """Measurements of sigma points, angles near that of the mean."""
-            return near[:, None] + own.subtract(h(x), near[:, None])
-
+        own, z = self.equations, _numbers(measurement, self.xp)
         if own.wraps:
+            near = own.measure(mean, measurement)
             z = near + own.subtract(z, near)
         R = own.measured_noise(self.R, mean, measurement)
-        gates = own.within_gates if own.gated else None
         result = unscented_update(
-            mean, spread + Q, z, h_near if own.wraps else h, R, measurement.available, gates
+            mean,
+            spread + Q,
+            z,
+            lambda points: own.measure_points(points, mean, measurement),
+            R,
+            measurement.available,
+            own.within_gates if own.gated else None,
+            own.subtract,
         )
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 

@@ -38,6 +38,7 @@ class VectorFunction:
 
     Attributes:
         size: m.
+        inputs: n.
         given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
@@ -49,7 +50,7 @@ class VectorFunction:
 
     def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
         graph = Graph()
-        self._inputs, self.given = size, given
+        self.inputs, self.given = size, given
         with namespace.tracing(graph):
             rows = [graph.input(0, row) for row in range(size + given)]
             x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)
@@ -90,7 +91,7 @@ class VectorFunction:
 
         Arguments are those of :meth:`value`.
         """
-        entries, n = _compute(self._jacobian, x, xp), self._inputs
+        entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 
 

@@ -21,13 +21,16 @@ import numpy
 from ...compiler.vector_functions import VectorFunction
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
-from ...filters.small_matrices import product, transpose
+from ...filters.small_matrices import apply, product, transpose
 from ..contract.observation import Array
 from .inputs import Input
 from .sensors import Channel
 
 if TYPE_CHECKING:
     from .state_space import StateSpace
+
+SAMPLES = 8
+"""Random states of each magnitude at which a Jacobian is compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +137,24 @@ def process_noise(
     return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
+def linear_entries(function: VectorFunction) -> numpy.ndarray:
+    """Which entries of a Jacobian are the same at all states, of booleans ``(m, n)``: in these the function is linear.
+
+    They are found by random states of four magnitudes: ``arctan2(sin(a), cos(a))`` is linear in a up to whole turns.
+    """
+    n, given = function.inputs, function.given
+    generator = numpy.random.default_rng(0)
+    states = generator.standard_normal((n, 4 * SAMPLES)) * numpy.repeat(10.0 ** numpy.arange(4), SAMPLES)
+    others = numpy.repeat(generator.random((given, 1)), states.shape[1], axis=1)
+    with numpy.errstate(all="ignore"):
+        J = function.jacobian(numpy.concatenate([states, others]), numpy)
+        known = numpy.isfinite(J)
+        lowest = numpy.where(known, J, numpy.inf).min(axis=2)
+        highest = numpy.where(known, J, -numpy.inf).max(axis=2)
+        found: numpy.ndarray = highest - lowest <= 1e-9 * numpy.maximum(abs(lowest), abs(highest))
+    return found & known.any(axis=2)
+
+
 class Measurement(NamedTuple):
     """What the sensors say."""
 
@@ -181,6 +202,8 @@ class Equations:
         )
         self.channels = task.definition.channels
         self.wraps = any(channel.period for channel in self.channels)
+        linear = linear_entries(model.h) if self.wraps else numpy.zeros((1, 1), dtype=bool)
+        self._linear = task.constant(1.0 * linear)[:, :, None] if linear.any() else None
         self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
@@ -284,21 +307,49 @@ class Equations:
         """What h takes: the state, with the inputs as its last rows where it knows them."""
         return self._with_passed(x, Passage(None, passed.inputs)) if self.model.h.given else x
 
-    def subtract(self, z: Array, predicted: Array) -> Array:
-        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
+    def subtract(self, z: Array, predicted: Array, expected: Array | None = None) -> Array:
+        """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round.
+
+        Args:
+            z: ``(m, ...)``.
+            predicted: ``(m, ...)``.
+            expected: the difference to which that of angles is near, ``(m, ...)``. None: zero.
+        """
         nu = z - predicted
         if not self.wraps:
             return nu
+        apart = nu if expected is None else nu - expected
         rows = []
         for channel in self.channels:
             for place in channel.numbers:
                 turns = (
                     0.0
                     if channel.period is None
-                    else channel.period * self.xp.round(nu[place] / channel.period)
+                    else channel.period * self.xp.round(apart[place] / channel.period)
                 )
                 rows.append(nu[place] - turns)
         return self.xp.stack(rows)
+
+    def measure_points(self, points: Array, mean: Array, passed: Passed) -> Array:
+        """Measurements of sigma points without noise, ``(m, 2n + 1, N)``, angles continuous from that of the mean.
+
+        An angle is linear in some states, such as a heading, and the rest of it is a direction. Its linear part goes
+        as far as the point does, over several turns, too. Seen from one place, a straight path from the mean to the
+        point covers less than half a turn: the rest of the difference is the nearer way round.
+
+        Args:
+            points: ``(n, 2n + 1, N)``.
+            mean: of the state, ``(n, N)``.
+            passed: what went on until then.
+        """
+        measured = self.measure(points, passed)
+        if not self.wraps:
+            return measured
+        near, expected = self.measure(mean, passed)[:, None], None
+        if self._linear is not None:
+            slopes = self.xp.where(self._linear > 0.0, self.measurement_matrix(mean, passed), 0.0)
+            expected = apply(slopes[:, :, None], points - mean[:, None])
+        return near + self.subtract(measured, near, expected)
 
     def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.
