@@ -456,7 +456,7 @@ def test_another_interval_than_the_models_is_refused(make):
         ({"f": lambda x: [x[0]]}, "f must return 2 numbers, got 1"),
         ({"f": lambda x: [x[0] if x[0] > 0.0 else x[1], x[1]]}, "f cannot be traced"),
         ({"f": lambda x: x[0]}, "f must return a vector"),
-        ({"h": lambda x: np.array([x[0], x[1]])}, "h cannot be traced"),
+        ({"h": lambda x: np.array([x[0], x[1]], dtype=float)}, "h cannot be traced .*without dtype"),
         ({"Q": [[1.0, 0.0], [0.5, 1.0]]}, "Q must be symmetric"),
         ({"Q": -np.eye(2)}, "Q must be symmetric and without negative eigenvalues"),
         ({"R": [[0.0]]}, "R must be symmetric and positive definite"),

@@ -29,6 +29,8 @@ from .sensors import Channel
 if TYPE_CHECKING:
     from .state_space import StateSpace
 
+PIECES = 16
+"""Of the path to a sigma point, along which an angle is followed."""
 SAMPLES = 8
 """Random states of each magnitude at which a Jacobian is compared."""
 
@@ -202,8 +204,11 @@ class Equations:
         )
         self.channels = task.definition.channels
         self.wraps = any(channel.period for channel in self.channels)
-        linear = linear_entries(model.h) if self.wraps else numpy.zeros((1, 1), dtype=bool)
-        self._linear = task.constant(1.0 * linear)[:, :, None] if linear.any() else None
+        if self.wraps:
+            linear = linear_entries(model.h)
+            self._linear = task.constant(1.0 * linear)[:, :, None]
+            angles = [place for channel in self.channels if channel.period for place in channel.numbers]
+            self._pieces = 1 if linear[angles].all() else PIECES
         self.gated = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
@@ -333,9 +338,9 @@ class Equations:
     def measure_points(self, points: Array, mean: Array, passed: Passed) -> Array:
         """Measurements of sigma points without noise, ``(m, 2n + 1, N)``, angles continuous from that of the mean.
 
-        An angle is linear in some states, such as a heading, and the rest of it is a direction. Its linear part goes
-        as far as the point does, over several turns, too. Seen from one place, a straight path from the mean to the
-        point covers less than half a turn: the rest of the difference is the nearer way round.
+        Its part that is linear in the state, such as a heading, changes by its slope, over any number of turns. The
+        change of all else is the sum over pieces of the straight path from the mean to the point: on a piece it is
+        less than half a turn, unless an angle with a lever arm has a spread of tens of radians.
 
         Args:
             points: ``(n, 2n + 1, N)``.
@@ -345,11 +350,17 @@ class Equations:
         measured = self.measure(points, passed)
         if not self.wraps:
             return measured
-        near, expected = self.measure(mean, passed)[:, None], None
-        if self._linear is not None:
-            slopes = self.xp.where(self._linear > 0.0, self.measurement_matrix(mean, passed), 0.0)
-            expected = apply(slopes[:, :, None], points - mean[:, None])
-        return near + self.subtract(measured, near, expected)
+        offsets = points - mean[:, None]
+        near = before = self.measure(mean, passed)[:, None]
+        slopes = self.xp.where(self._linear > 0.0, self.measurement_matrix(mean, passed), 0.0)
+        expected = total = apply(slopes[:, :, None], offsets)
+        if self._pieces > 1:
+            total = 0.0 * total
+            for k in range(1, self._pieces + 1):
+                here = self.measure(mean[:, None] + (k / self._pieces) * offsets, passed)
+                total = total + self.subtract(here, before, expected / self._pieces)
+                before = here
+        return near + self.subtract(measured, near, total)
 
     def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.
