@@ -94,9 +94,9 @@ DIRECTIONS = {
 @pytest.mark.parametrize("n", [3, 9])
 @pytest.mark.parametrize("kind", DIRECTIONS)
 def test_a_direction_is_taken_in_without_too_much_confidence(make, kind, n):
-    """No Gaussian is the posterior of a position after one bearing at a wide spread. What must hold of 400 drawn truths:
-    every covariance is definite, and the mean of NEES per state is at most 2, where the extended filter has up to 1e3.
-    At a small spread it is 1, within four deviations of its own error.
+    """No Gaussian is the posterior of a position after one bearing at a wide spread. What must hold for 400 drawn
+    truths: every covariance is definite, and the mean of NEES per state is at most 2, where the extended filter has up
+    to 1e3. At a small spread it is 1, within four deviations of its own error.
     """
     sensors = {
         "bearing": Sensor(DIRECTIONS[kind], NOISE**2, wraps="rad"),
@@ -115,7 +115,7 @@ def test_a_direction_is_taken_in_without_too_much_confidence(make, kind, n):
         bearing=z,
     )
     error, covariance = (found.mean - truth).T, np.moveaxis(found.covariance, -1, 0)
-    if "bearing" not in kind[-7:] or kind == "relative bearing":
+    if kind in ("relative bearing", "lever arm"):
         error[:, 2] = wrapped(error[:, 2])
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     nees = (

@@ -12,7 +12,9 @@ input, too, R becomes ``R + D N D^T`` with ``D = dh/du``. Reading: that this err
 same one, G N D^T, is left out.
 """
 
-from collections.abc import Mapping
+import math
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +24,7 @@ from ...compiler.vector_functions import VectorFunction
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import apply, product, transpose
+from ...filters.unscented import sigma_points
 from ..contract.observation import Array
 from .inputs import Input
 from .sensors import Channel
@@ -53,6 +56,8 @@ class StateSpaceModel:
     """h likewise; None also where it knows no inputs."""
     sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
     """What Q is the sum of, by the names of the noises; empty where they have none."""
+    warned: dict[str, str] = field(default_factory=dict)
+    """Warnings of values that are not finite, by the functions that they name."""
 
     @property
     def timed(self) -> bool:
@@ -70,8 +75,9 @@ class StateSpaceModel:
             return False
         x = mean[:, None] + numpy.linspace(-1.0, 2.0, 3 * len(mean)).reshape(len(mean), 3)
         given = numpy.concatenate([x, numpy.zeros((1, 3)), inputs[:, None] + numpy.zeros((1, 3))])
-        moved = self.f.value(given, numpy)
-        return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.Q.value(given, numpy).any()
+        with numpy.errstate(all="ignore"):  # some states may be out of the functions' range
+            moved = self.f.value(given, numpy)
+            return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.Q.value(given, numpy).any()
 
     @property
     def is_linear(self) -> bool:
@@ -136,7 +142,8 @@ def process_noise(
     if not isinstance(model.Q, VectorFunction):
         return model.Q
     given = numpy.concatenate([x, [interval], inputs])
-    return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
+    with numpy.errstate(all="ignore"):  # the check of the covariance names what is not finite
+        return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
 def linear_entries(function: VectorFunction) -> numpy.ndarray:
@@ -196,6 +203,7 @@ class Equations:
 
     def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
+        self.components = [component.name for component in task.components]
         self.R = task.constant(model.R)
         self._Q = self._constant(task, model.Q)
         self._sources = {name: self._constant(task, own) for name, own in model.sources.items()}
@@ -223,7 +231,7 @@ class Equations:
             x: ``(n, ...)``.
             passed: what went on until then.
         """
-        return self._value(self.model.f, self._with_passed(x, passed))
+        return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
         """State with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
@@ -255,7 +263,7 @@ class Equations:
             return constant[:, :, None]
         assert isinstance(Q, VectorFunction)
         n = self.model.f.size
-        entries = Q.value(self._with_passed(x, passed), self.xp)
+        entries = self._value("Q", Q, self._with_passed(x, passed))
         return self.xp.reshape(entries, (n, n, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
@@ -306,7 +314,7 @@ class Equations:
             x: ``(n, ...)``.
             passed: what went on until then.
         """
-        return self._value(self.model.h, self._with_inputs(x, passed))
+        return self._value("h", self.model.h, self._with_inputs(x, passed))
 
     def _with_inputs(self, x: Array, passed: Passed) -> Array:
         """What h takes: the state, with the inputs as its last rows where it knows them."""
@@ -398,21 +406,78 @@ class Equations:
             rows += [within] * channel.size
         return xp.stack(rows)
 
-    def _value(self, function: VectorFunction, x: Array) -> Array:
-        flat = self.xp.reshape(x, (x.shape[0], -1))
-        return self.xp.reshape(function.value(flat, self.xp), (function.size, *x.shape[1:]))
+    def _value(self, name: str, function: VectorFunction, x: Array) -> Array:
+        values = self._warn(name, function.value, self.xp.reshape(x, (x.shape[0], -1)))
+        return self.xp.reshape(values, (function.size, *x.shape[1:]))
+
+    def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
+        """Values at vectors ``(n, N)``; in place of NumPy's warning, unless it is off, one that names the function."""
+        if self.xp is not numpy:
+            return compute(x, self.xp)
+        with numpy.errstate(all="ignore"):
+            values = compute(x, numpy)
+        if numpy.geterr()["invalid"] != "ignore" and name not in self.model.warned:
+            sentence = self._describe(name, values, x)
+            if sentence:
+                self.model.warned[name] = sentence
+                warnings.warn(sentence, RuntimeWarning, stacklevel=2)
+        return values
+
+    def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
+        """Name the function, or its sensor, and the first finite state of ``(n, N)`` where a value of ``(m, ..., N)`` is
+        not finite; empty where all are.
+        """
+        entries = values.reshape(len(values), -1, x.shape[1])
+        wrong = ~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0)
+        if not wrong.any():
+            return ""
+        lane = int(wrong.any(axis=0).argmax())
+        row = int(wrong[:, lane].argmax())
+        if name.endswith("h") and len(self.channels) > 1:
+            channel = next(one for one in self.channels if row in one.numbers)
+            name = f"{name} of the sensor {channel.name!r}"
+        value = next(value for value in entries[row, :, lane].tolist() if not math.isfinite(value))
+        state = ", ".join(
+            f"{component} = {value:.6g}"
+            for component, value in zip(self.components, x[:, lane].tolist(), strict=False)
+        )
+        return (
+            f"{name} gives {value:g} at {state}: keep arguments of logarithms, roots and quotients within "
+            "their range, such as by numpy.maximum"
+        )
+
+    def explain_loss(self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: Measurement) -> str:
+        """Name the function that is not finite near an estimate, where the next measurement is taken in.
+
+        Args:
+            mean: last valid one, ``(n, N)``.
+            covariance: ``(n, n, N)``.
+            measurement: the next one.
+
+        Returns:
+            A sentence; empty where f and h are finite.
+        """
+        with numpy.errstate(all="ignore"):
+            points = sigma_points(mean, covariance)
+            given = self._with_passed(points, measurement).reshape(-1, points[0].size)
+            moved = self.model.f.value(given, numpy)
+            found = self._describe("f", moved, given)
+            if found:
+                return found
+            given = self._with_inputs(moved.reshape(points.shape), measurement).reshape(-1, points[0].size)
+            return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
         """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
         if self._F is not None:
             return self._F[:, :, None]
-        return self.model.f.jacobian(self._with_passed(x, passed), self.xp)
+        return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
         """Jacobian of h, likewise."""
         if self._H is not None:
             return self._H[:, :, None]
-        return self.model.h.jacobian(self._with_inputs(x, passed), self.xp)
+        return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
         """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""
