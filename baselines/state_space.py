@@ -211,7 +211,11 @@ def _update(
 
 
 class Unscented(Extended):
-    """The unscented Kalman filter; arguments as of :class:`Extended`."""
+    """The unscented Kalman filter; arguments as of :class:`Extended`.
+
+    An angle that is measured may have any spread. Where no Gaussian is the posterior, as after one bearing of a wide
+    position, what holds is that the covariance is definite and the mean of NEES at most twice the number of states.
+    """
 
     def __init__(
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any

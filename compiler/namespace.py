@@ -88,6 +88,8 @@ class Traced:
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
         """Array of objects, on which NumPy's own arithmetic makes expressions, too."""
+        from . import numpy_functions  # noqa: F401  (gives the objects the methods that NumPy calls)
+
         objects = numpy.empty(self.shape, dtype=object)
         for place in numpy.ndindex(self.shape):
             objects[place] = Traced(self.nodes[place], self.dtype)

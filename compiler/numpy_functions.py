@@ -6,6 +6,7 @@ is left of the functions of arrays, such as ``cross`` and ``einsum``, NumPy comp
 arithmetic is traced.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -81,7 +82,7 @@ def interpolate(
         raise _refusal(numpy.interp, {"period": period})
     places = numpy.asarray(places, dtype=float)
     found: Any = namespace.asarray(values[0] if left is None else left)
-    for i, (one, other) in enumerate(zip(places[:-1], places[1:], strict=True)):
+    for i, (one, other) in enumerate(itertools.pairwise(places)):
         slope = (values[i + 1] - values[i]) / (other - one)
         found = namespace.where(x >= one, slope * (x - one) + values[i], found)
     found = namespace.where(x >= places[-1], values[-1], found)
@@ -247,10 +248,10 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
 INVERSES = (numpy.linalg.inv, numpy.linalg.solve, numpy.linalg.det, numpy.linalg.pinv, numpy.linalg.lstsq)
 """Functions whose pivots depend on numbers."""
 OTHERWISE = "write it with arithmetic, numpy.sum and numpy.where"
-METHODS = [name for name, function in vars(numpy).items() if function in (f for f in UFUNCS if f.nin < 3)]
-for _name in METHODS:
-    if not hasattr(Traced, _name):  # what NumPy calls on the entries of an array of objects
-        setattr(Traced, _name, lambda *values, _function=getattr(numpy, _name): UFUNCS[_function](*values))
+"""What to do in place of any other function."""
+for _function, _own in UFUNCS.items():
+    if not hasattr(Traced, _function.__name__):  # what NumPy calls on the entries of an array of objects
+        setattr(Traced, _function.__name__, _own)
 
 
 def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:

@@ -424,7 +424,7 @@ class Equations:
         return values
 
     def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
-        """Name the function, or its sensor, and the first finite state of ``(n, N)`` where a value of ``(m, ..., N)`` is
+        """Name the function, or its sensor, and the first finite state of ``(n, N)`` where a value ``(m, ..., N)`` is
         not finite; empty where all are.
         """
         entries = values.reshape(len(values), -1, x.shape[1])
