@@ -584,11 +584,14 @@ def test_a_function_beyond_its_range_is_named_with_the_state(make):
     }
     with pytest.warns(RuntimeWarning, match=r"h of the sensor 'depth' gives nan at level = -[\d.]+, rate = "):
         cls = make(**falls, sensors=sensors)
-    live = filtergym.online(cls.id, "unscented")
-    live.start(mean=falls["mean"], covariance=falls["covariance"])
-    lost = [live.update(gauge=-0.2).lost for _ in range(4)]
-    assert lost[0] == ""
-    assert re.match(r"the estimate is not finite: h of the sensor 'depth' gives nan at level = -", lost[-1])
+    for name in ("unscented", "kalman"):
+        live = filtergym.online(cls.id, name)
+        live.start(mean=falls["mean"], covariance=falls["covariance"])
+        lost = [live.update(gauge=-0.2).lost for _ in range(4)]
+        assert lost[0] == ""
+        assert re.match(
+            r"the estimate is not finite: h of the sensor 'depth' gives nan at level = -", lost[-1]
+        )
     root = {**falls, "f": lambda x: [x[0] - 0.3, np.sqrt(x[1] - 1.0)], "h": [[1, 0]], "R": [[1.0]]}
     with (
         pytest.raises(ValueError, match=r"must be finite: f gives nan at level = 1, rate = 0: keep"),

@@ -89,6 +89,7 @@ class OnlineFilter:
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
+        self._valid: Estimate | None = None  # the last one that no track has lost
         """Without the filter's, which the stepper holds."""
 
     def __repr__(self) -> str:
@@ -278,12 +279,18 @@ class OnlineFilter:
         """Advance to a time and take in what came."""
         measurement, memory = self.input.measure(self._running().input, at, values)
         found = self._estimate(at, self._advance(measurement, memory))
-        return replace(found, lost=self._explain(found, measurement)) if numpy.any(found.lost) else found
+        if any(found.lost):
+            return replace(found, lost=self._explain(found, measurement))
+        self._valid = found
+        return found
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
         """Reasons why tracks are lost, with what the task finds near their last valid estimates."""
-        n = len(found.mean)
-        mean, covariance = found.mean.reshape(n, -1), found.covariance.reshape(n, n, -1)
+        near = found if self._policy is None else self._valid
+        if near is None:
+            return found.lost
+        n = len(near.mean)
+        mean, covariance = near.mean.reshape(n, -1), near.covariance.reshape(n, n, -1)
         words: list[str] = numpy.atleast_1d(found.lost).tolist()
         for i, fault in enumerate(words):
             one = slice(i, i + 1)
