@@ -4,7 +4,6 @@ filter that is told the true model.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy
@@ -282,7 +281,11 @@ def _put_in_order(measurements: Sequence[Measurement], lateness: int, xp: Any) -
 
 
 class Unscented(Extended):
-    """The unscented Kalman filter; arguments as of :class:`Extended`."""
+    """The unscented Kalman filter; arguments as of :class:`Extended`.
+
+    An angle that is measured may have any spread. Where no Gaussian is the posterior, as after one bearing of a wide
+    position, what holds is that the covariance is definite and the mean of NEES at most twice the number of states.
+    """
 
     def __init__(
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
@@ -298,21 +301,22 @@ class Unscented(Extended):
     def take(self, state: Track, one: Past) -> Track:
         """Predict to a measurement and take it in by sigma points."""
         measurement = one.measurement
-        motion, points = self.equations.unwrapped_motion(state.mean, state.covariance, measurement)
+        own = self.equations
+        motion, points = own.continuous_motion(state.mean, state.covariance, measurement)
         mean, spread = unscented.transform(state.mean, state.covariance, motion, points)
-        spread = spread + self.equations.input_noise(state.mean, measurement)
-        Q = self.process_noise(mean, measurement)
-        own, P = self.equations, spread + Q
-        z, h, points = (
+        P = spread + own.input_noise(state.mean, measurement) + self.process_noise(mean, measurement)
+        h, points = own.continuous_measurement(mean, P, measurement)
+        result = unscented_update(
+            mean,
+            P,
             _numbers(measurement, self.xp),
-            partial(own.measure, passed=measurement),
-            unscented.GAUSSIAN,
+            h,
+            own.measured_noise(self.sensor_noise(mean, measurement), mean, measurement),
+            measurement.available,
+            own.within_gates if own.gated else None,
+            points,
+            own.subtract,
         )
-        if own.periods:
-            z, h, points = own.unwrap(z, mean, P, measurement)
-        R = own.measured_noise(self.sensor_noise(mean, measurement), mean, measurement)
-        gates = own.within_gates if own.gated else None
-        result = unscented_update(mean, P, z, h, R, measurement.available, gates, points)
         return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
 
 

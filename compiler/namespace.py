@@ -43,13 +43,29 @@ def tracing(graph: Graph) -> Iterator[Graph]:
         except NotTraceable:
             raise
         except Exception as error:
+            if isinstance(error.__cause__, NotTraceable):  # NumPy says less of what it came from
+                raise error.__cause__ from error
             raise NotTraceable(f"{type(error).__name__}: {error}") from error
         finally:
             _OPEN.reset(token)
 
 
 def _refuse(self: Any, *_: Any) -> Any:
-    raise NotTraceable("a branch or a loop depends on the numbers of an array")
+    raise NotTraceable(
+        "a branch or a loop depends on the numbers of an array: numpy.where, numpy.maximum and numpy.minimum choose, "
+        "of numpy.stack in place of numpy.array"
+    )
+
+
+def _refuse_number(self: Any) -> Any:
+    raise NotTraceable(
+        "a number that varies is made a float: take NumPy's functions in place of math's, and a list, or numpy.array "
+        "of one without dtype, in place of an array whose entries are set"
+    )
+
+
+def _refuse_entry(self: Any, *_: Any) -> Any:
+    raise NotTraceable("an entry of the given array is set: return a list of the new numbers")
 
 
 class Traced:
@@ -62,14 +78,22 @@ class Traced:
 
     __slots__ = ("dtype", "nodes")
     device = None
-    __bool__ = __float__ = __int__ = __index__ = __complex__ = _refuse
+    __bool__ = __index__ = _refuse
+    __float__ = __int__ = __complex__ = _refuse_number
+    __setitem__ = _refuse_entry
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
         self.nodes = numpy.asarray(nodes)
         self.dtype = numpy.dtype(dtype)
 
-    def __array__(self, *_: Any, **__: Any) -> Any:
-        raise NotTraceable("an array is handed to a function of NumPy: call that of its namespace")
+    def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
+        """Array of objects, on which NumPy's own arithmetic makes expressions, too."""
+        from . import numpy_functions  # noqa: F401  (gives the objects the methods that NumPy calls)
+
+        objects = numpy.empty(self.shape, dtype=object)
+        for place in numpy.ndindex(self.shape):
+            objects[place] = Traced(self.nodes[place], self.dtype)
+        return objects if dtype is None else objects.astype(dtype)
 
     def __array_ufunc__(self, function: Any, method: str, *arguments: Any, **keywords: Any) -> "Traced":
         from .numpy_functions import call_ufunc
@@ -87,6 +111,7 @@ class Traced:
     shape = property(lambda self: self.nodes.shape)
     ndim = property(lambda self: self.nodes.ndim)
     size = property(lambda self: self.nodes.size)
+    real = property(lambda self: self)
     T = property(lambda self: Traced(self.nodes.T, self.dtype))
     mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))  # noqa: N815  (the standard's name)
 
@@ -161,9 +186,21 @@ class Traced:
 
         return mean(self, axis)
 
+    def dot(self, other: Any) -> "Traced":
+        """Product with a vector or a matrix."""
+        return matmul(self, other)
+
+    def ravel(self) -> "Traced":
+        """Return all entries in a row."""
+        return self.reshape(-1)
+
     def reshape(self, *shape: Any) -> "Traced":
         """Return the same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
+
+    def conjugate(self) -> "Traced":
+        """Return the array itself, which is real."""
+        return self
 
     def astype(self, dtype: Any) -> "Traced":
         """Return the entries as another type."""
@@ -180,7 +217,13 @@ def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None
         return values if dtype is None else astype(values, dtype)
     if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
         return stack([asarray(value, dtype) for value in values])
-    array = numpy.asarray(values, dtype=dtype)
+    array = numpy.asarray(values)
+    if array.dtype == object and builtins.all(
+        isinstance(entry, Traced | int | float | numpy.generic) for entry in array.flat
+    ):
+        entries = [asarray(entry, dtype) for entry in array.flat]
+        return reshape(stack(entries), array.shape) if entries else zeros(array.shape)
+    array = array if dtype is None else array.astype(dtype)
     if array.dtype.kind not in "fiub":
         raise NotTraceable(f"arrays of {array.dtype} cannot be traced")
     graph = _OPEN.get()

@@ -1,9 +1,12 @@
 """NumPy's own functions on traced arrays, so that what is written with NumPy can be traced, too.
 
 NumPy hands a function of its own over to the arrays that it is called with (its protocols ``__array_ufunc__`` and
-``__array_function__``). Those that the array API standard has are computed by :mod:`.namespace`; the others here.
+``__array_function__``). Those that the array API standard has are computed by :mod:`.namespace`, others here. What
+is left of the functions of arrays, such as ``cross`` and ``einsum``, NumPy computes itself on arrays of objects, whose
+arithmetic is traced.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -71,6 +74,55 @@ def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
     return [Traced(part, x.dtype) for part in numpy.split(x.nodes, sections, axis)]
 
 
+def interpolate(
+    x: Any, places: Any, values: Any, left: Any = None, right: Any = None, period: None = None
+) -> Traced:
+    """Linear interpolation between places that increase, and the end values beyond."""
+    if period is not None:
+        raise _refusal(numpy.interp, {"period": period})
+    places = numpy.asarray(places, dtype=float)
+    found: Any = namespace.asarray(values[0] if left is None else left)
+    for i, (one, other) in enumerate(itertools.pairwise(places)):
+        slope = (values[i + 1] - values[i]) / (other - one)
+        found = namespace.where(x >= one, slope * (x - one) + values[i], found)
+    found = namespace.where(x >= places[-1], values[-1], found)
+    if right is not None:
+        found = namespace.where(x > places[-1], right, found)
+    return namespace.where(namespace.isnan(x), x, found)
+
+
+def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Traced:
+    """Euclidean length, of all numbers or along an axis."""
+    if ord not in (None, 2) or (ord == 2 and x.ndim > 1 and not isinstance(axis, int)):
+        raise _refusal(numpy.linalg.norm, {"ord": ord})
+    return namespace.sqrt(namespace.sum(namespace.square(x), axis=axis, keepdims=keepdims))
+
+
+def dot(one: Any, other: Any) -> Traced:
+    """Product of vectors, matrices or numbers."""
+    one, other = namespace.asarray(one), namespace.asarray(other)
+    return namespace.matmul(one, other) if one.ndim and other.ndim else namespace.multiply(one, other)
+
+
+def select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Traced:
+    """Choose by the first condition that holds."""
+    found = default
+    for condition, choice in reversed([*zip(conditions, choices, strict=True)]):
+        found = namespace.where(condition, choice, found)
+    return namespace.asarray(found)
+
+
+def cube_root(x: Any) -> Traced:
+    """Cube root, of negative numbers, too."""
+    return namespace.multiply(namespace.sign(x), namespace.pow(namespace.abs(x), 1.0 / 3.0))
+
+
+def remainder_of_dividend(one: Any, other: Any) -> Traced:
+    """Remainder with the sign of the dividend."""
+    size = namespace.remainder(namespace.abs(one), namespace.abs(other))
+    return namespace.multiply(namespace.where(namespace.less(one, 0.0), -1.0, 1.0), size)
+
+
 _STANDARD = [
     "add",
     "subtract",
@@ -130,6 +182,14 @@ UFUNCS: Mapping[Any, Callable[..., Any]] = {
     numpy.bitwise_or: namespace.logical_or,
     numpy.invert: namespace.logical_not,
     numpy.logaddexp: log_add_exp,
+    numpy.float_power: namespace.pow,
+    numpy.positive: lambda x: namespace.asarray(x),
+    numpy.fabs: namespace.abs,
+    numpy.reciprocal: lambda x: namespace.divide(1.0, x),
+    numpy.cbrt: cube_root,
+    numpy.fmod: remainder_of_dividend,
+    **dict.fromkeys((numpy.degrees, numpy.rad2deg), lambda x: namespace.multiply(x, 180.0 / numpy.pi)),
+    **dict.fromkeys((numpy.radians, numpy.deg2rad), lambda x: namespace.multiply(x, numpy.pi / 180.0)),
 }
 """Functions of entries, by NumPy's objects."""
 REDUCTIONS: Mapping[Any, Callable[..., Any]] = {
@@ -179,8 +239,19 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.copy: copy_array,
     numpy.ndim: lambda x: x.ndim,
     numpy.nan_to_num: replace_not_finite,
+    numpy.interp: interpolate,
+    numpy.select: select,
+    numpy.linalg.norm: norm,
+    numpy.dot: dot,
 }
 """Functions of arrays, likewise."""
+INVERSES = (numpy.linalg.inv, numpy.linalg.solve, numpy.linalg.det, numpy.linalg.pinv, numpy.linalg.lstsq)
+"""Functions whose pivots depend on numbers."""
+OTHERWISE = "write it with arithmetic, numpy.sum and numpy.where"
+"""What to do in place of any other function."""
+for _function, _own in UFUNCS.items():
+    if not hasattr(Traced, _function.__name__):  # what NumPy calls on the entries of an array of objects
+        setattr(Traced, _function.__name__, _own)
 
 
 def call_ufunc(function: Any, method: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> Traced:
@@ -205,12 +276,37 @@ def call_function(function: Any, arguments: Sequence[Any], keywords: Mapping[str
     Raises:
         NotTraceable: for what cannot be traced.
     """
-    if function not in FUNCTIONS:
-        raise _refusal(function, keywords)
-    found: Traced = FUNCTIONS[function](*arguments, **keywords)
+    found: Traced = (
+        FUNCTIONS[function](*arguments, **keywords)
+        if function in FUNCTIONS
+        else _on_objects(function, arguments, keywords)
+    )
     return found
+
+
+def _on_objects(function: Any, arguments: Any, keywords: Mapping[str, Any]) -> Any:
+    """Let NumPy compute a function on arrays of objects, whose arithmetic makes expressions."""
+
+    def objects(given: Any) -> Any:
+        if isinstance(given, list | tuple):
+            return type(given)(map(objects, given))
+        return numpy.asarray(given) if isinstance(given, Traced) else given
+
+    try:
+        if function in INVERSES:
+            raise NotTraceable
+        found = function(*objects(arguments), **{name: objects(value) for name, value in keywords.items()})
+    except Exception as error:
+        raise _refusal(function, keywords) from error
+    is_traced = isinstance(found, numpy.ndarray) and found.dtype == object
+    return namespace.asarray(found) if is_traced else found
 
 
 def _refusal(function: Any, keywords: Mapping[str, Any]) -> NotTraceable:
     given = f" with {', '.join(keywords)}" if keywords else ""
-    return NotTraceable(f"numpy.{function.__name__}{given} cannot be traced")
+    name = function.__name__
+    for prefix, module in (("numpy.", numpy), ("numpy.linalg.", numpy.linalg)):
+        if getattr(module, name, None) is function:
+            name = prefix + name
+    other = "write out the formula of the small matrix" if function in INVERSES else OTHERWISE
+    return NotTraceable(f"{name}{given} cannot be traced: {other}")

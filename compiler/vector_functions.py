@@ -38,10 +38,12 @@ class VectorFunction:
 
     Attributes:
         size: m.
+        inputs: n.
         given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
-        linear_rows: places in the value that are linear in the n numbers.
+    linear: entries of the Jacobian that are the same everywhere, ``(m, n)``; of an angle that is wrapped, too: the
+            derivative of ``arctan2(sin(a), cos(a))`` is one.
 
     Raises:
         NotTraceable: if the function is no straight line of arithmetic.
@@ -50,7 +52,7 @@ class VectorFunction:
 
     def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
         graph = Graph()
-        self._inputs, self.given = size, given
+        self.inputs, self.given = size, given
         with namespace.tracing(graph):
             rows = [graph.input(0, row) for row in range(size + given)]
             x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)
@@ -73,19 +75,18 @@ class VectorFunction:
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
-        self.linear_rows = self._find_linear_rows() if size else frozenset()
+        self.linear = self._find_linear_entries() if size else numpy.zeros((self.size, 0), dtype=bool)
 
-    def _find_linear_rows(self) -> frozenset[int]:
-        """Rows with one Jacobian that also accounts for long ways, as the remainder of a division does not."""
-        rng = numpy.random.default_rng(0)
-        x = rng.normal(size=(self._inputs + self.given, 12)) * numpy.repeat([1.0, 10.0, 1e3], 4)
-        x[self._inputs :] = rng.uniform(0.1, 1.0, (self.given, 1))
+    def _find_linear_entries(self) -> numpy.ndarray:
+        """Entries of the Jacobian that are the same at random states of four magnitudes."""
+        rng, count = numpy.random.default_rng(0), 8
+        x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
+        given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)
         with numpy.errstate(all="ignore"):
-            value, jacobian = self.value(x, numpy), self.jacobian(x, numpy)
-            moved = numpy.einsum("mn,nk->mk", jacobian[..., 0], (x - x[:, :1])[: self._inputs])
-            same = (jacobian == jacobian[..., :1]).all(axis=(1, 2))
-            same &= (numpy.abs(value - value[:, :1] - moved) <= 1e-9 * (1.0 + numpy.abs(moved))).all(axis=1)
-        return frozenset(numpy.flatnonzero(same).tolist())
+            J = self.jacobian(numpy.concatenate([x, given]), numpy)
+            spread = numpy.nanmax(J, axis=2) - numpy.nanmin(J, axis=2)
+            found: numpy.ndarray = spread <= 1e-9 * numpy.abs(J).max(axis=2)
+        return found
 
     @property
     def reads(self) -> tuple[frozenset[int], ...]:
@@ -116,7 +117,7 @@ class VectorFunction:
 
         Arguments are those of :meth:`value`.
         """
-        entries, n = _compute(self._jacobian, x, xp), self._inputs
+        entries, n = _compute(self._jacobian, x, xp), self.inputs
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 
 

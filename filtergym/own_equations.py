@@ -315,7 +315,9 @@ def check_array(what: str, values: Any, shape: tuple[int | None, ...]) -> numpy.
     """Return finite numbers of a shape, None for any number, or raise ValueError."""
     array = read_numbers(what, values)
     fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
-    if not fits or not numpy.isfinite(array).all() or not array.size:
+    if fits and not numpy.isfinite(array).all():
+        raise ValueError(f"{what} must be finite, got {float(array[~numpy.isfinite(array)][0])}")
+    if not fits or not array.size:
         words = ", ".join("n" if size is None else str(size) for size in shape)
         raise ValueError(f"{what} must be finite numbers of shape ({words}), got the shape {array.shape}")
     return array

@@ -215,7 +215,12 @@ def state_space(
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
     cls.reward_unit = _RewardUnit(StateSpaceParameters(**parameters))
-    register_task(cls, state_space_baselines(cls))
+    try:
+        register_task(cls, state_space_baselines(cls))
+    except ValueError as error:
+        for reason in (reason for model in (*world, *filters) for reason in model.warned.values()):
+            raise ValueError(f"{error}: {reason}") from error
+        raise
     if module in sys.modules:
         setattr(sys.modules[module], name, cls)
     made: type[StateSpace] = cls

@@ -11,6 +11,7 @@ Arrays have the batch last; a matrix shared by the whole batch is ``(n, n)``.
 """
 
 import math
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -98,6 +99,7 @@ def unscented_update(
     available: Array,
     within_gates: Callable[[Array, Array], Array] | None = None,
     spread: Spread = GAUSSIAN,
+    subtract: Callable[[Array, Array], Array] = operator.sub,
 ) -> Update:
     """Measurement update by sigma points; Julier and Uhlmann, Unscented filtering and nonlinear estimation,
     Proceedings of the IEEE 92 (2004), 401-422.
@@ -112,12 +114,14 @@ def unscented_update(
         within_gates: from innovation ``(m, N)`` and its covariance to 1 for entries that are taken in, else 0,
             ``(m, N)``; the likelihood counts the others all the same. None: all are.
         spread: parameters of the transform.
+        subtract: from measurement and prediction ``(m, N)`` to the innovation; of angles the nearer way round, and then
+            h returns angles that are continuous from point to point.
     """
     xp = namespace(mean)
     n = mean.shape[0]
     R = R[..., None] if R.ndim == 2 else R
     joint, spread_out = transform(mean, covariance, lambda x: xp.concat([x, h(x)]), spread)
-    nu = available * (z - joint[n:])
+    nu = available * subtract(z, joint[n:])
     S = _independent(spread_out[n:, n:] + R, available)
     cross = available[:, None] * spread_out[n:, :n]
     gated, taken = S, nu

@@ -427,7 +427,14 @@ def test_what_is_no_timed_model_is_refused(make, wrong, sentence):
 
 @pytest.mark.parametrize(
     ("block", "id", "lines"),
-    [(3, "mine/Irregular-v0", 4), (4, "mine/Pendulum-v0", 0), (5, "mine/Cell-v0", 2), (6, "mine/Boat-v0", 1)],
+    [
+        (3, "mine/Irregular-v0", 4),
+        (4, "mine/Pendulum-v0", 0),
+        (5, "mine/Cell-v0", 2),
+        (6, "mine/Phone-v0", 2),
+        (7, "mine/Wheel-v0", 1),
+        (8, "mine/Boat-v0", 1),
+    ],
 )
 def test_the_pages_models_run(capsys, block, id, lines):
     try:
@@ -456,7 +463,7 @@ def test_another_interval_than_the_models_is_refused(make):
         ({"f": lambda x: [x[0]]}, "f must return 2 numbers, got 1"),
         ({"f": lambda x: [x[0] if x[0] > 0.0 else x[1], x[1]]}, "f cannot be traced"),
         ({"f": lambda x: x[0]}, "f must return a vector"),
-        ({"h": lambda x: np.array([x[0], x[1]])}, "h cannot be traced"),
+        ({"h": lambda x: np.array([x[0], x[1]], dtype=float)}, "h cannot be traced .*without dtype"),
         ({"Q": [[1.0, 0.0], [0.5, 1.0]]}, "Q must be symmetric"),
         ({"Q": -np.eye(2)}, "Q must be symmetric and without negative eigenvalues"),
         ({"R": [[0.0]]}, "R must be symmetric and positive definite"),
@@ -524,3 +531,77 @@ def test_the_page_runs(tmp_path, command, capsys, monkeypatch):
     finally:
         sys.modules.pop("tracker", None)
         forget("mine/Tracker-v0")
+
+
+# --- what is written with NumPy
+
+
+TABLE_OF = ([-1.0, 0.0, 0.5], [2.0, 3.0, 1.0])
+MATRIX = np.array([[1.0, 2.0, 0.0, -1.0], [0.5, 0.0, 3.0, 1.0], [0.0, 1.0, 1.0, 0.0], [2.0, 0.0, 0.0, 1.0]])
+WRITTEN = {
+    "degrees": lambda x: np.degrees(x),
+    "radians": lambda x: [np.radians(x[0]), np.deg2rad(x[1]), np.rad2deg(x[2])],
+    "array": lambda x: np.array([x[0] * x[1], np.sin(x[2]), 1.0]),
+    "array of rows": lambda x: np.array([[np.cos(x[0]), 1.0], [0.0, x[1]]]) @ x[:2],
+    "functions of an array": lambda x: np.sin(np.array([x[0], x[1]])) + np.hypot(np.array([x[2], x[3]]), 1.0),
+    "dot": lambda x: [np.dot(x[:2], x[2:]), np.dot(x, MATRIX[0]), np.dot([x[0], x[1]], [1.0, 2.0])],
+    "dot of a matrix": lambda x: np.dot(MATRIX, x) + MATRIX.dot(x) + x.dot(MATRIX),
+    "norm": lambda x: [np.linalg.norm(x[:2]), np.linalg.norm([x[0], 3.0]), np.linalg.norm(np.array([x[1], 1.0]))],
+    "norm of rows": lambda x: np.linalg.norm(np.reshape(x, (2, 2)), axis=0),
+    "cross": lambda x: np.cross(x[:3], [1.0, 2.0, 3.0]) + np.cross([x[0], x[1], x[2]], x[1:]),
+    "interp": lambda x: [np.interp(x[0], *TABLE_OF), np.interp(x[1], *TABLE_OF, left=5.0, right=x[3])],
+    "outer": lambda x: np.outer(x[:2], x[2:]).ravel(),
+    "einsum": lambda x: np.einsum("ij,j->i", MATRIX, x),
+    "inner": lambda x: [np.inner(x, x), np.vdot(x, x), np.trace(np.reshape(x, (2, 2)))],
+    "hstack": lambda x: np.hstack([x[:2], x[3]]) + np.vstack([x[:3], x[1:]])[0] + np.append(x[:2], 1.0),
+    "cumsum": lambda x: np.cumsum(x) + np.diff(np.append(x, 0.0)),
+    "select": lambda x: [np.select([x[0] > 0.5, x[0] > 0.0], [x[1], x[2]], x[3])],
+    "cbrt": lambda x: np.cbrt(x) + np.fmod(x, 0.3) + np.reciprocal(2.0 + x * x) + np.fabs(x),
+    "polyval": lambda x: [np.polyval([1.0, 2.0, 3.0], x[0])],
+    "clip": lambda x: np.clip(x, -0.5, 0.5) * np.sign(x) + np.matmul(MATRIX, x),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_is_written_with_numpy_has_its_values_and_derivatives(name):
+    """Also compiled; differences of 2e-6 have the derivative to 1e-7 of numbers up to 1e2."""
+    written = WRITTEN[name]
+    function = VectorFunction(written, 4)
+    x = np.random.default_rng(3).uniform(0.1, 1.0, (4, 8)) * np.resize([1.0, -1.0, 1.0], (4, 8))
+    value, jacobian = function.value(x, np), function.jacobian(x, np)
+    each = lambda points: np.stack([np.asarray(written(point), dtype=float) for point in points.T], axis=-1)  # noqa: E731
+    np.testing.assert_allclose(value, each(x), rtol=1e-14, atol=1e-14)
+    steps = 1e-6 * np.eye(4)[..., None]
+    slopes = np.stack([each(x + step) - each(x - step) for step in steps], axis=1) / 2e-6
+    np.testing.assert_allclose(jacobian, slopes, rtol=1e-6, atol=1e-6)
+    compiled = Function(
+        lambda x: (function.value(x, traced_namespace), function.jacobian(x, traced_namespace)), Graph()
+    )
+    for answer, expected in zip(compiled(x), (value, jacobian), strict=True):
+        np.testing.assert_allclose(answer, expected, rtol=1e-13, atol=1e-15)
+
+
+def test_a_function_beyond_its_range_is_named_with_the_state(make):
+    """Where the model is made, and where a filter in use loses its track."""
+    falls = {"f": lambda x: [x[0] - 0.3, 0.9 * x[1]], "Q": 0.01 * np.eye(2), "names": ["level", "rate"]}
+    falls |= {"mean": [1.0, 0.0], "covariance": 0.01 * np.eye(2), "h": None, "R": None}
+    sensors = {
+        "gauge": filtergym.Sensor([[1, 0]], 0.1),
+        "depth": filtergym.Sensor(lambda x: [np.log(x[0])], 0.04),
+    }
+    with pytest.warns(RuntimeWarning, match=r"h of the sensor 'depth' gives nan at level = -[\d.]+, rate = "):
+        cls = make(**falls, sensors=sensors)
+    for name in ("unscented", "kalman"):
+        live = filtergym.online(cls.id, name)
+        live.start(mean=falls["mean"], covariance=falls["covariance"])
+        lost = [live.update(gauge=-0.2).lost for _ in range(4)]
+        assert lost[0] == ""
+        assert re.match(
+            r"the estimate is not finite: h of the sensor 'depth' gives nan at level = -", lost[-1]
+        )
+    root = {**falls, "f": lambda x: [x[0] - 0.3, np.sqrt(x[1] - 1.0)], "h": [[1, 0]], "R": [[1.0]]}
+    with (
+        pytest.raises(ValueError, match=r"must be finite: f gives nan at level = 1, rate = 0: keep"),
+        pytest.warns(RuntimeWarning, match="f gives nan"),
+    ):
+        make(**root)

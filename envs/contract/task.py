@@ -280,6 +280,16 @@ class Task(ABC):
         """
         return None
 
+    def explain_loss(self, mean: Array, covariance: Array, measurement: Any) -> str:
+        """Say in a sentence why a filter lost an episode at a measurement; empty where the task cannot know.
+
+        Args:
+            mean: last valid estimate, ``(C, N)``.
+            covariance: of it, ``(C, C, N)``.
+            measurement: that the filter took in, of N lanes.
+        """
+        return ""
+
     @classmethod
     def scenario_of_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
         """Make a scenario in which every episode flies one of some flights; few tasks can.

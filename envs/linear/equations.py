@@ -14,6 +14,7 @@ same one, G N D^T, is left out.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,8 +26,8 @@ from ...compiler.vector_functions import VectorFunction
 from ...filters.angles import shorten, unwrap
 from ...filters.gaussian import log_density
 from ...filters.innovation_update import Received, kalman_gain, keep_received
-from ...filters.small_matrices import product, transpose
-from ...filters.unscented import GAUSSIAN, Spread, narrow
+from ...filters.small_matrices import apply, product, transpose
+from ...filters.unscented import GAUSSIAN, Spread, narrow, sigma_points
 from ..contract.observation import Array
 from .inputs import Input
 from .sensors import Channel
@@ -53,6 +54,8 @@ class StateSpaceModel:
     """h likewise; None also where it knows no inputs."""
     sources: Mapping[str, numpy.ndarray | VectorFunction] = field(default_factory=dict)
     """What Q is the sum of, by the names of the noises; empty where they have none."""
+    warned: dict[str, str] = field(default_factory=dict)
+    """Warnings of values that are not finite, by the functions that they name."""
 
     @property
     def timed(self) -> bool:
@@ -70,8 +73,9 @@ class StateSpaceModel:
             return False
         x = mean[:, None] + numpy.linspace(-1.0, 2.0, 3 * len(mean)).reshape(len(mean), 3)
         given = numpy.concatenate([x, numpy.zeros((1, 3)), inputs[:, None] + numpy.zeros((1, 3))])
-        moved = self.f.value(given, numpy)
-        return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.Q.value(given, numpy).any()
+        with numpy.errstate(all="ignore"):  # some states may be out of the functions' range
+            moved = self.f.value(given, numpy)
+            return numpy.allclose(moved, x, 1e-12, 1e-12) and not self.Q.value(given, numpy).any()
 
     @property
     def is_linear(self) -> bool:
@@ -136,12 +140,8 @@ def process_noise(
     if not isinstance(model.Q, VectorFunction):
         return model.Q
     given = numpy.concatenate([x, [interval], inputs])
-    return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
-
-
-def _nonlinear(function: VectorFunction, periods: Mapping[int, float]) -> dict[int, float]:
-    """Periods of the rows that are not linear in the state."""
-    return {row: period for row, period in periods.items() if row not in function.linear_rows}
+    with numpy.errstate(all="ignore"):  # the check of the covariance names what is not finite
+        return numpy.reshape(model.Q.value(given[:, None], numpy), (len(x), len(x)))
 
 
 def sensor_noise(
@@ -268,6 +268,7 @@ class Equations:
 
     def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
+        self.components = [component.name for component in task.components]
         self._R = self._constant(task, model.R)
         self._Q = self._constant(task, model.Q)
         self._sources = {name: self._constant(task, own) for name, own in model.sources.items()}
@@ -292,7 +293,7 @@ class Equations:
             x: ``(n, ...)``.
             passed: what went on until then.
         """
-        return self._value(self.model.f, self._with_passed(x, passed))
+        return self._value("f", self.model.f, self._with_passed(x, passed))
 
     def _with_passed(self, x: Array, passed: Passed) -> Array:
         """State with the interval and the inputs as its last rows, ``(n + 1 + p, ...)``."""
@@ -325,7 +326,8 @@ class Equations:
             return constant[:, :, None]
         assert isinstance(noise, VectorFunction)
         size = math.isqrt(noise.size)
-        entries = noise.value(self._with_passed(x, passed), self.xp)
+        name = "Q" if noise is not self.model.R else "R"
+        entries = self._value(name, noise, self._with_passed(x, passed))
         return self.xp.reshape(entries, (size, size, *x.shape[1:]))
 
     def input_noise(self, x: Array, passed: Passed) -> Array | float:
@@ -380,7 +382,7 @@ class Equations:
             x: ``(n, ...)``.
             passed: what went on until then.
         """
-        return self._value(self.model.h, self._with_inputs(x, passed))
+        return self._value("h", self.model.h, self._with_inputs(x, passed))
 
     def _with_inputs(self, x: Array, passed: Passed) -> Array:
         """What h takes: the state, with the inputs as its last rows where it knows them."""
@@ -390,31 +392,27 @@ class Equations:
         """Measurement less what was predicted of it, ``(m, ...)``: of angles the nearer way round."""
         return shorten(z - predicted, self.periods)
 
-    def unwrap(
-        self, z: Array, mean: Array, covariance: Array, passed: Passed
-    ) -> tuple[Array, Callable[[Array], Array], Spread]:
-        """Measurement, function and sigma points of a transform that sees angles without their turns.
+    def continuous_measurement(
+        self, mean: Array, covariance: Array, passed: Passed
+    ) -> tuple[Callable[[Array], Array], Spread]:
+        """Measurement function and sigma points of a transform in which angles are continuous.
 
-        A linear row has no turns to take off. Of another row each point keeps the turn nearest to the mean's, and the
-        points lie close enough for that turn to be the right one.
+        An angle changes by its slope along a state in which it is linear, over any number of turns, and otherwise by
+        less than half a turn: the points lie close enough for that.
 
         Args:
-            z: measurement, ``(m, N)``.
             mean: predicted state, ``(n, N)``.
             covariance: of it, ``(n, n, N)``.
             passed: what went on until then.
         """
-        near = self.measure(mean, passed)
-        measure, spread = self._unfold(
+        return self._unfold(
             partial(self.measure, passed=passed),
-            near,
-            _nonlinear(self.model.h, self.periods),
-            lambda: self.measurement_matrix(mean, passed),
+            (self.model.h, lambda: self.measurement_matrix(mean, passed), self.periods),
+            mean,
             covariance,
         )
-        return unwrap(z, near, self.periods), measure, spread
 
-    def unwrapped_motion(
+    def continuous_motion(
         self, mean: Array, covariance: Array, passed: Passed
     ) -> tuple[Callable[[Array], Array], Spread]:
         """Motion and sigma points of a transform in which angles of the state keep the turn nearest to the mean's.
@@ -426,27 +424,41 @@ class Equations:
         """
         return self._unfold(
             partial(self.move, passed=passed),
-            self.move(mean, passed),
-            _nonlinear(self.model.f, self.angles),
-            lambda: self.transition_matrix(mean, passed),
+            (self.model.f, lambda: self.transition_matrix(mean, passed), self.angles),
+            mean,
             covariance,
         )
 
     def _unfold(
         self,
         function: Callable[[Array], Array],
-        near: Array,
-        periods: Mapping[int, float],
-        jacobian: Callable[[], Array],
+        traced: tuple[VectorFunction, Callable[[], Array], Mapping[int, float]],
+        mean: Array,
         covariance: Array,
     ) -> tuple[Callable[[Array], Array], Spread]:
-        """Function whose rows with a period are near those of the mean, and points that are not half a turn away."""
+        """Function whose angles are continuous from the mean to each point, and points that are close enough for it.
+
+        Args:
+            function: from points ``(n, 2n + 1, N)``.
+            traced: the same of one point, what computes its Jacobian at the mean, and the periods of its angles.
+            mean: ``(n, N)``.
+            covariance: ``(n, n, N)``.
+        """
+        own, jacobian, periods = traced
         if not periods:
             return function, GAUSSIAN
-        J = jacobian()
-        turns = self.xp.stack([J[row] / period for row, period in periods.items()])
-        around = near[:, None]
-        return lambda x: unwrap(function(x), around, periods), narrow(turns, covariance, QUARTER)
+        J, linear = jacobian(), self.xp.asarray(own.linear.astype(float))[:, :, None]
+        slopes = self.xp.where(linear > 0.0, J, 0.0)
+        near = function(mean[:, None])
+
+        def continuous(x: Array) -> Array:
+            return unwrap(function(x), near + apply(slopes[:, :, None], x - mean[:, None]), periods)
+
+        bent = [row for row in periods if not own.linear[row].all()]
+        if not bent:
+            return continuous, GAUSSIAN
+        turns = self.xp.stack([(J[row] - slopes[row]) / periods[row] for row in bent])
+        return continuous, narrow(turns, covariance, QUARTER)
 
     def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.
@@ -484,21 +496,78 @@ class Equations:
             rows += [within] * channel.size
         return xp.stack(rows)
 
-    def _value(self, function: VectorFunction, x: Array) -> Array:
-        flat = self.xp.reshape(x, (x.shape[0], -1))
-        return self.xp.reshape(function.value(flat, self.xp), (function.size, *x.shape[1:]))
+    def _value(self, name: str, function: VectorFunction, x: Array) -> Array:
+        values = self._warn(name, function.value, self.xp.reshape(x, (x.shape[0], -1)))
+        return self.xp.reshape(values, (function.size, *x.shape[1:]))
+
+    def _warn(self, name: str, compute: Callable[[Array, Any], Array], x: Array) -> Array:
+        """Values at vectors ``(n, N)``; in place of NumPy's warning, unless it is off, one that names the function."""
+        if self.xp is not numpy:
+            return compute(x, self.xp)
+        with numpy.errstate(all="ignore"):
+            values = compute(x, numpy)
+        if numpy.geterr()["invalid"] != "ignore" and name not in self.model.warned:
+            sentence = self._describe(name, values, x)
+            if sentence:
+                self.model.warned[name] = sentence
+                warnings.warn(sentence, RuntimeWarning, stacklevel=2)
+        return values
+
+    def _describe(self, name: str, values: numpy.ndarray, x: numpy.ndarray) -> str:
+        """Name the function, or its sensor, and the first finite state of ``(n, N)`` where a value ``(m, ..., N)`` is
+        not finite; empty where all are.
+        """
+        entries = values.reshape(len(values), -1, x.shape[1])
+        wrong = ~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0)
+        if not wrong.any():
+            return ""
+        lane = int(wrong.any(axis=0).argmax())
+        row = int(wrong[:, lane].argmax())
+        if name.endswith("h") and len(self.channels) > 1:
+            channel = next(one for one in self.channels if row in one.numbers)
+            name = f"{name} of the sensor {channel.name!r}"
+        value = next(value for value in entries[row, :, lane].tolist() if not math.isfinite(value))
+        state = ", ".join(
+            f"{component} = {value:.6g}"
+            for component, value in zip(self.components, x[:, lane].tolist(), strict=False)
+        )
+        return (
+            f"{name} gives {value:g} at {state}: keep arguments of logarithms, roots and quotients within "
+            "their range, such as by numpy.maximum"
+        )
+
+    def explain_loss(self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: Measurement) -> str:
+        """Name the function that is not finite near an estimate, where the next measurement is taken in.
+
+        Args:
+            mean: last valid one, ``(n, N)``.
+            covariance: ``(n, n, N)``.
+            measurement: the next one.
+
+        Returns:
+            A sentence; empty where f and h are finite.
+        """
+        with numpy.errstate(all="ignore"):
+            points = sigma_points(mean, covariance)
+            given = self._with_passed(points, measurement).reshape(-1, points[0].size)
+            moved = self.model.f.value(given, numpy)
+            found = self._describe("f", moved, given)
+            if found:
+                return found
+            given = self._with_inputs(moved.reshape(points.shape), measurement).reshape(-1, points[0].size)
+            return self._describe("h", self.model.h.value(given, numpy), given)
 
     def transition_matrix(self, x: Array, passed: Passed) -> Array:
         """Jacobian of f, ``(n, n, N)``; the last axis is 1 where it is the same everywhere."""
         if self._F is not None:
             return self._F[:, :, None]
-        return self.model.f.jacobian(self._with_passed(x, passed), self.xp)
+        return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
         """Jacobian of h, likewise."""
         if self._H is not None:
             return self._H[:, :, None]
-        return self.model.h.jacobian(self._with_inputs(x, passed), self.xp)
+        return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))
 
     def carry(self, mean: Array, covariance: Array, passed: Passed) -> tuple[Array, Array]:
         """Mean and covariance at the next measurement, without process noise; ``passed`` as of :meth:`move`."""

@@ -364,6 +364,10 @@ class StateSpace(Task):
         self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
         self.transition = self.constant([list(row) for row in own.transition])
 
+    def explain_loss(self, mean: Array, covariance: Array, measurement: Measurement) -> str:
+        """Name the function of the filters' first model that is not finite near an estimate."""
+        return self.believed[0].explain_loss(mean, covariance, measurement)
+
     def _sampling_interval(self) -> float | None:
         """Return the time between measurements, s; None where it differs."""
         return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval

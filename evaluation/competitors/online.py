@@ -7,6 +7,7 @@ import copy
 import importlib.metadata
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
@@ -89,6 +90,7 @@ class OnlineFilter:
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
+        self._valid: Estimate | None = None  # the last one that no track has lost
         """Without the filter's, which the stepper holds."""
 
     def __repr__(self) -> str:
@@ -283,7 +285,26 @@ class OnlineFilter:
     def _step(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
         """Advance to a time and take in what came."""
         measurement, memory = self.input.measure(self._running().input, at, values)
-        return self._estimate(at, self._advance(measurement, memory))
+        found = self._estimate(at, self._advance(measurement, memory))
+        if any(found.lost):
+            return replace(found, lost=self._explain(found, measurement))
+        self._valid = found
+        return found
+
+    def _explain(self, found: Estimate, measurement: Any) -> Any:
+        """Reasons why tracks are lost, with what the task finds near their last valid estimates."""
+        near = found if self._policy is None else self._valid
+        if near is None:
+            return found.lost
+        n = len(near.mean)
+        mean, covariance = near.mean.reshape(n, -1), near.covariance.reshape(n, n, -1)
+        words: list[str] = numpy.atleast_1d(found.lost).tolist()
+        for i, fault in enumerate(words):
+            one = slice(i, i + 1)
+            given = map_arrays(lambda array, one=one: array[..., one], measurement)
+            reason = fault and self.task.explain_loss(mean[..., one], covariance[..., one], given)
+            words[i] = f"the estimate is not finite: {reason}" if reason else fault
+        return self._each(words)
 
     def _advance(self, measurement: Any, memory: Any) -> dict[str, numpy.ndarray]:
         """Take in a measurement of the task, and report on it in arrays ``(..., width)``."""
