@@ -111,6 +111,7 @@ check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy -p filtergym
 	MYPYPATH=docs/make $(BIN)/mypy docs/make
+	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(SITE)
 
 docs: $(VENV)/.dev  ## build the documentation into site/

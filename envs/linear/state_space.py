@@ -107,20 +107,21 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
                 f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
             )
         self.initial_root = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
-        n, m = len(own.mean), own.world[0].h.size
+        first = own.world[0]
+        n, m = len(own.mean), first.h.size
         self.states, self.noises = n, n + m
         self.initial_normals = n + self.courses.initial_normals
         self.normals = self.noises + self.courses.normals
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
-        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(own.world[0].R)))
+        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(first.R)))
         self.delayed = self.drawn + self.receptions.row_uniforms
         self.delays = self.parameters.late > 0.0
         self.row_uniforms = self.delayed + len(own.channels) * self.delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
-        self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
+        self.places = [None if j in turning else j for j in components_measured(first.h)]
 
     def _root(self, covariance: numpy.ndarray) -> Array:
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
