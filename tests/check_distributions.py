@@ -9,11 +9,11 @@ from pathlib import Path
 
 import gymnasium
 import numpy
+
+import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-
-import filtergym
 
 MOST_BYTES = 3_000_000
 """Of the wheel."""
@@ -36,7 +36,7 @@ def check_wheel(wheel: Path, source: Path) -> None:
 
 
 def check_source_distribution(archive: Path, source: Path) -> None:
-    """It holds every file of the repository but `.gitignore` and the links to rooms; outside a repository nothing is checked."""
+    """It holds every file of the repository but `.gitignore` and the links; outside a repository nothing is checked."""
     if not (source / ".git").exists():
         return
     listed = subprocess.run(
