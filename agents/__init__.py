@@ -5,7 +5,14 @@ Stable-Baselines3.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .adapter import to_sb3
+    from .gate import Gated, GatedMaker
+    from .learned_policy import LearnedPolicy
+    from .residual import ResidualPolicy
+    from .sb3_policy import Sb3Policy, load_sb3_policy
 
 _HOMES = {
     "to_sb3": "adapter",

@@ -19,8 +19,9 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import cast
 
 import gymnasium
 import numpy
@@ -122,7 +123,7 @@ class NetworkPolicy(torch.nn.Module):
     @property
     def layers(self) -> list[torch.nn.Linear]:
         """Layers in order, after the memory if there is one; tanh follows the last, the rectifier those before."""
-        return [*self.hidden, self.head]
+        return [*cast("Iterable[torch.nn.Linear]", self.hidden), self.head]
 
     @property
     def memory_size(self) -> int:
@@ -207,7 +208,7 @@ def descend_episodes(
     total, pending = 0.0, torch.zeros(())
     memory, start = None, numpy.ones(env.num_envs, dtype=bool)
 
-    def cut(gradient: torch.Tensor) -> torch.Tensor:
+    def cut(gradient: torch.Tensor, largest: float) -> torch.Tensor:
         size = gradient.norm(dim=1, keepdim=True) * (window * env.num_envs)
         return gradient * (largest / size.clamp_min(largest))
 
@@ -221,7 +222,7 @@ def descend_episodes(
             start = numpy.zeros(env.num_envs, dtype=bool)
             action = torch.where(torch.as_tensor(opened)[:, None], action, torch.as_tensor(chosen))
         if largest is not None:
-            action.register_hook(cut)
+            action.register_hook(functools.partial(cut, largest=largest))
         observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
         window = (decision - 1) % truncation + 1

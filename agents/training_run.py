@@ -337,7 +337,7 @@ def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
     """
     import yaml
 
-    file: Any = files(__package__).joinpath("hyperparameters", f"{FILES[algorithm]}.yml")
+    file: Any = files(__name__.rpartition(".")[0]).joinpath("hyperparameters", f"{FILES[algorithm]}.yml")
     table = yaml.safe_load(file.read_text(encoding="utf-8"))
     if "based_on" not in table:
         return dict(table.get(id, table["default"]))

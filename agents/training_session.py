@@ -19,7 +19,7 @@ from .validation import Validation
 def _curve(entry: ValidationEntry) -> dict[str, float]:
     """Numbers of a validation, as a log shows them over environment steps."""
     curve = {"validation/cost": entry["cost"]}
-    if "paper_cost" in entry:
+    if "paper_cost" in entry and "relative_cost_difference" in entry:
         curve["validation/paper_cost"] = entry["paper_cost"]
         curve["validation/cost_vs_paper"] = entry["relative_cost_difference"][0]
     return curve
@@ -187,10 +187,10 @@ class Bookkeeping:
             save_run(run, checkpoint / "run.json")
         save_run(run, self.folder / "run.json")
         line = f"{steps_done:,} steps: validation cost {entry['cost']:.4g}"
-        if self.validation.paper:
+        if "paper" in entry and "paper_cost" in entry and "relative_cost_difference" in entry:
             value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
             line += f", {entry['paper']} {entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
         if passed:
-            line += f"; better than {entry['paper']} for the first time, after {run.seconds:.1f} s"
+            line += f"; better than {self.validation.paper} for the first time, after {run.seconds:.1f} s"
         self.report(line)
         return self.validated(entry) or stopping

@@ -125,7 +125,8 @@ class Alarm:
         limit = math.log(self.decisions * evidence.shape[1] / self.false_alarms)
         # Never beyond the limit: what is over is forgotten as fast as it was found.
         sums = numpy.clip(numpy.where(start[:, None], 0.0, sums) + evidence, 0.0, limit)
-        return (sums >= limit).any(axis=1), Sums(sums, observation)
+        wrong: Any = (sums >= limit).any(axis=1)  # NumPy's declaration allows for a scalar
+        return wrong, Sums(sums, observation)
 
 
 class InnovationAlarm(Alarm):

@@ -444,7 +444,7 @@ class Steps(Sequence[Step]):
     @functools.cached_property
     def operations(self) -> frozenset[str]:
         """Operations that occur."""
-        return frozenset([self.names[kind] for kind in numpy.unique(self.kinds).tolist()])
+        return frozenset([self.names[int(kind)] for kind in numpy.unique(self.kinds)])
 
     def which(self, *operations: str) -> numpy.ndarray:
         """For each step whether it is one of some operations, ``(n,)``."""
@@ -468,7 +468,7 @@ class Steps(Sequence[Step]):
             if self._made is not None:
                 return self._made[place]
             given = self.arguments[self.begins[place] : self.begins[place + 1]].tolist()
-            return Step(self.names[self.kinds[place]], tuple(given), bool(self.logical[place]))
+            return Step(self.names[int(self.kinds[place])], tuple(given), bool(self.logical[place]))
         begins = self.begins[place.start or 0 : len(self.begins[:-1][: place.stop]) + 1]
         given = self.arguments[begins[0] : begins[-1]]
         return Steps(self.names, self.kinds[place], begins - begins[0], given, self.logical[place])

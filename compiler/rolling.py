@@ -99,7 +99,7 @@ class _Draft:
         self.operation, self.members, self.columns = operation, members, columns
         self.late, self.logical = late, logical
         self.count = len(columns[0])
-        self.table = (0, 0)
+        self.table: tuple[int, int] = (0, 0)
         self.group = 0
         self.loop = -1
         self.results: list[Operand] = []
@@ -207,7 +207,7 @@ class _Roller:
         )
         operands = (self.parts[heads] >= 0).sum(axis=1).tolist()
         for i, members in enumerate(groups):
-            name = self.steps.names[kinds[i]]
+            name = self.steps.names[int(kinds[i])]
             columns = [self.parts[members, k] for k in range(operands[i])]
             draft = _Draft(name, members, columns, bool(heads[i] >= self.pause), logical[i])
             if name == "take":

@@ -4,64 +4,10 @@
 Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
-import sys
-
-if (
-    sys.argv[:1] == ["-m"]  # while Python looks for the module that it was told to run: before its first line
-    and (sys.orig_argv[-len(sys.argv)] == "filtergym" or sys.orig_argv[-len(sys.argv)].endswith("mfiltergym"))
-    and not sys.flags.safe_path
-):
-    # The working directory, in which Python would look for every library that is still to come.
-    del sys.path[0]
-
 import importlib
-import os
-import time
 from typing import TYPE_CHECKING, Any
 
-_PATIENCE = 10.0
-"""s that a fork waits for imports of other threads."""
-
-
-def _is_importing() -> bool:
-    """Whether the thread that asks is importing itself."""
-    frame: Any = sys._getframe()
-    while frame is not None:
-        if frame.f_globals.get("__name__") == "importlib._bootstrap":
-            return True
-        frame = frame.f_back
-    return False
-
-
-def _half_imported() -> list[str]:
-    """Names of modules whose import has begun and not ended."""
-    modules = list(sys.modules.items())
-    return [n for n, m in modules if getattr(getattr(m, "__spec__", None), "_initializing", False)]
-
-
-def _await_imports() -> None:
-    """Let a fork wait until other threads have imported what they are importing: in the child they are not there, and
-    whoever imports the same would wait for them without end.
-    """
-    until = time.monotonic() + _PATIENCE
-    while not _is_importing() and _half_imported() and time.monotonic() < until:
-        time.sleep(0.002)
-
-
-def _forget_half_imported() -> None:
-    """Forget in a forked process what is half imported even so, and the locks of the import system, which a thread that
-    is not here holds for ever. Such a module is imported anew, or refused by a library that cannot be.
-    """
-    if not _is_importing():
-        getattr(importlib._bootstrap, "_module_locks", {}).clear()
-        for name in _half_imported():
-            del sys.modules[name]
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_await_imports, after_in_child=_forget_half_imported)
-
-from .envs.engine.catalogue import register  # noqa: E402  (its import may be forked, too)
+from .envs.engine.catalogue import register
 
 if TYPE_CHECKING:
     from .baselines.table import Baselines
@@ -99,17 +45,21 @@ __all__ = [
     "tidy_records",
 ]
 MODULES = {
-    "envs.contract.filter": ("Likelihood",),
-    "envs.data.flights": ("Flights", "read_flights"),
-    "envs.data.recording": ("Recording",),
-    "envs.engine.scenario_choice": ("read_recording",),
-    "envs.data.trajectory": ("Trajectory",),
-    "envs.linear.inputs": ("Input",),
-    "envs.linear.sensors": ("Sensor",),
-    "evaluation.competitors.kinds": ("FunctionPolicy",),
-    "live": ("online",),
-    "names": ("evaluate", "make_policy", "record", "tidy_records"),
-    "own_models": ("state_space",),
+    "Flights": "envs.data.flights",
+    "FunctionPolicy": "evaluation.competitors.kinds",
+    "Input": "envs.linear.inputs",
+    "Likelihood": "envs.contract.filter",
+    "Recording": "envs.data.recording",
+    "Sensor": "envs.linear.sensors",
+    "Trajectory": "envs.data.trajectory",
+    "evaluate": "names",
+    "make_policy": "names",
+    "online": "live",
+    "read_flights": "envs.data.flights",
+    "read_recording": "envs.engine.scenario_choice",
+    "record": "names",
+    "state_space": "own_models",
+    "tidy_records": "names",
 }
 """Where names of this package come from, when they are first used."""
 
@@ -144,8 +94,7 @@ def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> N
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: an evaluation brings xarray, and who registers the environments needs none of it.
-    for module, names in MODULES.items():
-        if name in names:
-            return getattr(importlib.import_module(f".{module}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # On first use: an evaluation brings xarray, which registering the environments does not need.
+    if name not in MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{MODULES[name]}", __name__), name)

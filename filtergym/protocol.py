@@ -32,7 +32,7 @@ from .evaluation.running.times import times_of_records
 from .evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, share_interval
 from .names import find_competitor
 
-FOLDER = files(__package__) / "protocols"
+FOLDER = files(__name__.rpartition(".")[0]) / "protocols"
 SUFFIX = ".toml"
 MOST_BYTES = 100_000
 """Of a file."""

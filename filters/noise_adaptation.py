@@ -183,8 +183,8 @@ def variational_bayes(
         The distribution, and the state of the last update.
     """
     shape = noise.shape + 0.5 * available
-    scale = noise.scale
-    for _ in range(iterations):
-        residual, updated, state = update(scale / shape)
+    residual, updated, state = update(noise.scale / shape)
+    for _ in range(iterations - 1):
         scale = noise.scale + 0.5 * available * (residual**2 + updated)
-    return InverseGamma(shape, scale), state
+        residual, updated, state = update(scale / shape)
+    return InverseGamma(shape, noise.scale + 0.5 * available * (residual**2 + updated)), state

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import gymnasium
 import numpy
+
+import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-
-import filtergym
 
 MOST_BYTES = 3_000_000
 """Of the wheel."""
@@ -21,9 +21,14 @@ ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents", "fi
 
 
 def check_wheel(wheel: Path, source: Path) -> None:
-    """It holds every file of the rooms, and nothing else but what describes it."""
+    """It holds every file of the rooms but the papers', and nothing else but what describes it."""
     files = [path for room in ROOMS for path in (source / room).rglob("*") if path.is_file()]
-    names = [path.relative_to(source).as_posix() for path in files if "__pycache__" not in path.parts]
+    left_out = {"__pycache__", "papers"}
+    names = [
+        path.relative_to(source).as_posix()
+        for path in files
+        if not left_out & {*path.parts[len(source.parts) :]}
+    ]
     wanted = {name if name.startswith("filtergym/") else f"filtergym/{name}" for name in names}
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert held == wanted, sorted(held ^ wanted)
@@ -31,7 +36,7 @@ def check_wheel(wheel: Path, source: Path) -> None:
 
 
 def check_source_distribution(archive: Path, source: Path) -> None:
-    """It holds every file of the repository but `.gitignore`; where this is no repository there is nothing to ask."""
+    """It holds every file of the repository but `.gitignore` and the links; outside a repository nothing is checked."""
     if not (source / ".git").exists():
         return
     listed = subprocess.run(
@@ -39,7 +44,8 @@ def check_source_distribution(archive: Path, source: Path) -> None:
     ).stdout
     with tarfile.open(archive) as opened:
         held = {name.partition("/")[2] for name in opened.getnames()}
-    assert not (missing := set(listed.split()) - held - {".gitignore"}), sorted(missing)
+    links = {f"filtergym/{room}" for room in ROOMS}
+    assert not (missing := set(listed.split()) - held - links - {".gitignore"}), sorted(missing)
 
 
 def check_installed() -> None:

@@ -1,8 +1,5 @@
-"""Threads and forks that share what cannot be shared get a sentence, or wait; none hangs."""
+"""Threads that share what cannot be shared get a sentence; none hangs."""
 
-import os
-import subprocess
-import sys
 import threading
 
 import gymnasium
@@ -12,28 +9,6 @@ import pytest
 import filtergym  # noqa: F401
 
 RADAR = "filtergym/ManeuveringTarget-v0"
-FORK = """
-import os, sys, threading, time
-import filtergym
-def load():
-    import filtergym.evaluation.running.evaluate
-thread = threading.Thread(target=load)
-thread.start()
-while not any(name.startswith("filtergym.evaluation") for name in list(sys.modules)):
-    time.sleep(0.001)
-child = os.fork()
-if not child:
-    import filtergym.evaluation.running.evaluate
-    os._exit(7)
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
-def test_a_fork_while_another_thread_imports_does_not_hang():
-    for _ in range(2):  # of three without the wait, two hung
-        done = subprocess.run([sys.executable, "-c", FORK], timeout=120, check=False, capture_output=True)
-        assert done.returncode == 7
 
 
 def test_another_thread_on_the_same_environments_is_refused(monkeypatch):

@@ -17,7 +17,7 @@ from filtergym.papers.reproduction import (
 )
 from matplotlib.figure import Figure
 
-from filtergym.papers import paper_module, papers
+from filtergym.reproductions import paper_module, papers
 
 
 def example() -> Reproduction:
@@ -37,8 +37,8 @@ def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
         paper_module("imm-alpha-gamma")
 
 
-def test_a_package_without_the_repository_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("filtergym.papers.__path__", [str(tmp_path)])
+def test_a_package_without_the_repository_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("filtergym.reproductions.PAPERS", "filtergym.no_papers")
     with pytest.raises(ValueError, match="are part of the repository, not of the package"):
         paper_module("imm-alpha-beta")
 

@@ -198,9 +198,10 @@ def _algorithm(run: TrainingRun) -> str:
 def validation_curve(run: TrainingRun) -> tuple[list[int], list[float]] | None:
     """Return environment steps and relative cost differences of a run's validations; None: it has none."""
     entries = run.validation
-    if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
+    relative = [entry.get("relative_cost_difference") for entry in entries]
+    differences = [float(f"{difference[0]:.4g}") for difference in relative if difference]
+    if not entries or len(differences) < len(entries):
         return None
-    differences = [float(f"{entry['relative_cost_difference'][0]:.4g}") for entry in entries]
     return [int(entry["steps"]) for entry in entries], differences
 
 

@@ -154,7 +154,7 @@ class LiveInput:
                 there = there.all(axis=tuple(range(len(shape))))
             if "available" in values:
                 there = there & (self.read(values, "available", self.measurement.available.shape[:-1]) > 0.0)
-            given |= {field: self.replace_missing(memory, received, there), "available": there}
+            given |= {field: self.replace_missing(memory, received, numpy.asarray(there)), "available": there}
         return self.fill(self.measurement, given, "at every measurement"), {
             **memory,
             "time": time,

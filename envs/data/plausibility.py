@@ -329,7 +329,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
         try:
             if usual is not None and rows > 1:
                 check_interval(float(numpy.median(numpy.diff(time))), 100.0 * usual)
-            if measured:
+            if seen is not None and measured:
                 there = numpy.isfinite(seen[measured, own]).all(axis=0)
                 position, deviation = seen[measured, own].T[there], _length(sigma[measured, own].T[there])
             known = len(measured) > 0 and there.sum() >= 3

@@ -314,7 +314,7 @@ def free_inertial(
 
 def free_windows(
     navigation: AidedInertial,
-    windows: Sequence[numpy.ndarray],
+    windows: Sequence[numpy.ndarray] | numpy.ndarray,
     beginnings: numpy.ndarray,
     site: tuple[float, float],
     lever: Sequence[float] = (0.0, 0.0, 0.0),

@@ -539,7 +539,7 @@ class _WindowError(Exception):
 
 def _missing_display() -> str:
     """Say what keeps matplotlib from opening a window, and what to do; empty where nothing is known to."""
-    from matplotlib.backends import BackendFilter, backend_registry
+    from matplotlib.backends.registry import BackendFilter, backend_registry
 
     try:
         # Without a display pyplot falls back to "agg" when imported, or refuses, whatever MPLBACKEND says.

@@ -26,7 +26,7 @@ from ..contract.parameters import quote_shortened
 if TYPE_CHECKING:
     from ..contract.task import Task
 
-ENVS = __package__.rpartition(".")[0]
+ENVS = __name__.rsplit(".", 2)[0]
 """The package whose folders are the environments, and the rooms that they stand on."""
 USER_TASKS: dict[str, "type[Task]"] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""

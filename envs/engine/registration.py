@@ -104,7 +104,7 @@ def _check_action(model: Model) -> None:
         raise nearest(
             f"control of paper_policy of {type(model.task).__name__}", paper.control, model.task.controls
         )
-    if paper.control == model.control and flat and len(paper.action) != space.shape[0]:
+    if paper.control == model.control and flat and (len(paper.action),) != space.shape:
         raise ValueError(
             f"{_name_of(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
         )

@@ -336,4 +336,8 @@ def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:
 
 def _copy_numbers(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
     """Copies of arrays of numbers in their places, in their own types."""
-    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
+
+    def copied(i: int) -> numpy.ndarray:
+        return memory[i].astype(DTYPES[kinds[i]], order="C")
+
+    return map_arrays(copied, template)

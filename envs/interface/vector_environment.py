@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -163,7 +164,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         unseeded = not self.fleet.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
-                self.fleet.seed(lane, gymnasium.utils.seeding.np_random(seeds[lane])[0])
+                self.fleet.seed(lane, seeding.np_random(seeds[lane])[0])
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -105,7 +105,8 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
                 f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
             )
         self.initial_root = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
-        n, m = len(own.mean), own.world[0].h.size
+        first = own.world[0]
+        n, m = len(own.mean), first.h.size
         self.states, self.noises = n, n + m
         self.initial_normals = n + self.courses.initial_normals
         self.normals = self.noises + self.courses.normals
@@ -119,7 +120,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.row_uniforms = self.delayed + len(own.channels) * self.delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
-        self.places = [None if j in turning else j for j in components_measured(own.world[0].h)]
+        self.places = [None if j in turning else j for j in components_measured(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
         """Root of a covariance that is the same for all measurements; None of any other."""

@@ -168,7 +168,7 @@ class KalmanBank(Bank[StateSpace, Measurement, Track]):
 class NoiseBank(KalmanBank):
     """Control ``noise``: the action scales Q and R."""
 
-    answers = ("process", "measurement")
+    answers: Sequence[str] = ("process", "measurement")
 
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])

@@ -265,7 +265,7 @@ NOISES = ("receiver", "coloured", "white")
 class NoiseBank(KalmanBucyBank):
     """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
 
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
+    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
     @property
     def reach(self) -> float:

@@ -35,8 +35,10 @@ GAINS = ("caution", "drift_gain", "coloured_gain")
 class KalmanNetBank(NoiseBank):
     """The augmented filter, whose noises and gain the action sets."""
 
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32)
-    reach = 1.0  # it learns through the filter, and does not explore
+    action_space: gymnasium.Space = gymnasium.spaces.Box(
+        -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
+    )
+    reach: float = 1.0  # it learns through the filter, and does not explore
 
     @property
     def blocks(self) -> Sequence[Block]:

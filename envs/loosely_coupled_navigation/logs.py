@@ -50,7 +50,7 @@ def read_log(columns: Columns) -> TrackLog:
     parameters = {"axes": len(ends), "sampling_interval": interval}
     fix = numpy.stack([columns[f"fix{end}"] for end in ends], axis=1)
     # A fix of some axes is none: the receiver's measurement is one.
-    available = numpy.isfinite(fix).all(axis=1)
+    available = numpy.asarray(numpy.isfinite(fix).all(axis=1))
     if not available[1:].any():
         raise ValueError("no row has a fix on every axis")
     check_extents(("ins", "fix"), ins, fix)

@@ -184,7 +184,7 @@ class RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
 class GainBank(RadarBank):
     """Control ``gain``: one filter, whose position gain the action sets."""
 
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     least_interval = LEAST_INTERVAL
 
     @property

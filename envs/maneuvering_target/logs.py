@@ -71,7 +71,7 @@ def read_log(columns: Columns) -> TrackLog:
             lacking = next(name for name in pair if not columns.has(name))
             raise ValueError(f"it lacks the column {lacking}, which belongs to {' and '.join(pair)}")
     position = _positions(columns)
-    there = numpy.isfinite(position).all(axis=1)
+    there = numpy.asarray(numpy.isfinite(position).all(axis=1))
     if numpy.isfinite(position[~there]).any():
         row = int(numpy.flatnonzero(numpy.isfinite(position).any(axis=1) & ~there)[0])
         raise ValueError(f"row {row} has one coordinate of two")
@@ -375,7 +375,7 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
     import pandas
 
     ends = pandas.Series(numpy.where(rows >= 0, rows, numpy.nan)).bfill().to_numpy().astype(int)
-    there = numpy.isfinite(moved).all(axis=1)
+    there = numpy.asarray(numpy.isfinite(moved).all(axis=1))
     if not there[ends].any():
         raise ValueError("the columns of the odometry are empty: fill them, or leave them out")
     shares = numpy.where(there[:, None], moved, 0.0)[ends] / numpy.bincount(ends)[ends][:, None]

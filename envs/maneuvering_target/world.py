@@ -90,7 +90,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         p = self.parameters
         self.bearing_sigma = math.radians(p.bearing_sigma)
         self.course = course_of(task)
-        self.scans = (RegularScans if p.regular else UnreliableScans)(task, self.course)
+        self.scans: RegularScans = (RegularScans if p.regular else UnreliableScans)(task, self.course)
         self.disturbances = Disturbances.of(task, DISTURBANCES)
         self.initial_normals, self.normals = (
             4 + self.disturbances.initial_normals,

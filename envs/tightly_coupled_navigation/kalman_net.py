@@ -45,7 +45,7 @@ class KalmanNetBank(RobustBank):
     """One filter, whose noises, gain and motion the action sets."""
 
     hypotheses = HYPOTHESES[SINGER:]
-    reach = 1.0  # it learns through the filter, and does not explore
+    reach: float = 1.0  # it learns through the filter, and does not explore
 
     def __init__(self, task: "TightlyCoupledNavigation", control: str) -> None:
         super().__init__(task, control)

@@ -325,7 +325,7 @@ class _KalmanBank(AutopilotBank):
 class GainBank(_KalmanBank):
     """Control ``gain``: the action scales the process noise."""
 
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     action_block = Block("action", lambda f, _: f.action, "last action", shown=ACTION)
     no_action = (0.0,)
 
@@ -379,7 +379,7 @@ class NoiseBank(_KalmanBank):
 class ModeBank(_KalmanBank):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
-    action_space = gymnasium.spaces.Discrete(len(MODES))
+    action_space: gymnasium.Space = gymnasium.spaces.Discrete(len(MODES))
     action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
     no_action = (1.0, 0.0, 0.0, 0.0)
 

@@ -311,6 +311,7 @@ class Estimator(Protocol):
             fourth entry may tell how well the measurement was predicted: its log-likelihood ``(N,)`` in nats, or a
             :class:`Likelihood`. Then the estimator is judged by it too, also on recordings without truth.
         """
+        ...
 
 
 class Smoother(Estimator, Protocol):
@@ -334,6 +335,7 @@ class Smoother(Estimator, Protocol):
         Returns:
             Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` at the measurements.
         """
+        ...
 
 
 class Reference(Protocol):
@@ -360,6 +362,7 @@ class Reference(Protocol):
 
     def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Array, Any]:
         """Estimate after a measurement; returns as of :meth:`Estimator.update`."""
+        ...
 
 
 class Bound(Protocol):
@@ -376,3 +379,4 @@ class Bound(Protocol):
 
     def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Any]:
         """Bound of the mean square of ``task.components``, ``(C, N)``, and the memory."""
+        ...

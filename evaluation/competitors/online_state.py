@@ -15,6 +15,7 @@ class Watch(Protocol):
 
     def describe(self) -> list[str]:
         """Return what is unusual, in words, for each track; empty where nothing is."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -393,7 +393,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     if not competitors:
         raise ValueError("name at least one policy")
     seeds = episode_seeds(split, seed, episodes)
-    kinds = {name: kind_of(maker) for name, maker in competitors.items()}
+    kinds: dict[str, Kind] = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.

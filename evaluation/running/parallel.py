@@ -277,8 +277,15 @@ class Workers:
 
     def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
         try:
-            import dask
-            from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+            # Of the extra `cluster`, which no check of types installs, as ray below.
+            import dask  # pyright: ignore[reportMissingImports]
+            from distributed import (  # pyright: ignore[reportMissingImports]
+                Client,
+                KilledWorker,
+                LocalCluster,
+                Security,
+                as_completed,
+            )
 
             # Certificates that this process tells its workers alone: whoever else connects is refused.
             begin = self._dask is None and self.cluster == "dask"
@@ -316,7 +323,7 @@ class Workers:
     def _over_ray(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to tell others
         try:
-            import ray
+            import ray  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise _missing(error) from error
         if not ray.is_initialized():

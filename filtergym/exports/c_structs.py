@@ -39,8 +39,8 @@ def structure(name: str, members: Sequence[Member]) -> Structure:
     taken: set[str] = set()
     for (words, shape), rows in groups.items():
         whole = len(rows) == int(numpy.prod(shape, dtype=int))
+        own = identifier(words, taken) if whole else ""
         if whole:
-            own = identifier(words, taken)
             taken.add(own)
             arrays.append((own, shape, members[rows[0]].words, rows))
         for row in rows:

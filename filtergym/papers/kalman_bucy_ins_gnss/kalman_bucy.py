@@ -48,7 +48,8 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
     rows = numpy.atleast_2d(numpy.asarray(C, float))
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"C must have {size} columns, got {C!r}")
-    return rows.T @ numpy.linalg.solve(intensity_matrix("Q", Q, len(rows), definite=True), rows)
+    weighted = numpy.linalg.solve(intensity_matrix("Q", Q, len(rows), definite=True), rows)
+    return numpy.asarray(rows.T @ weighted, float)
 
 
 def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) -> Matrix:
