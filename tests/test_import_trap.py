@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 import pytest
 import xarray
+
+import filtergym
+from filtergym import evaluate, make_policy, read_recording, record, tidy_records
 from filtergym.agents.learned_policy import PRETRAINED, read_arrays
 from filtergym.agents.training_run import load_run
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.summary import Summary
 from filtergym.evaluation.storage.store import Store, Work
-
-import filtergym
-from filtergym import evaluate, make_policy, read_recording, record, tidy_records
 from filtergym.names import competitor
 from filtergym.reports.tables.results import read_results
 

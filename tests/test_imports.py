@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.catalogue import folders
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy
 import pytest
+from matplotlib.figure import Figure
+
 from filtergym.papers.grid import Grid
 from filtergym.papers.quantities import Quantity, mean, means, quantity
 from filtergym.papers.reproduction import (
@@ -15,8 +17,6 @@ from filtergym.papers.reproduction import (
     its_command,
     verdict_of,
 )
-from matplotlib.figure import Figure
-
 from filtergym.reproductions import paper_module, papers
 
 

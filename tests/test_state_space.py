@@ -14,6 +14,10 @@ import gymnasium
 import numpy as np
 import pytest
 import scipy
+from gymnasium.utils.env_checker import check_env
+from own_models import forget, make_models, simulate
+
+import filtergym
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import import_problem
 from filtergym.compiler import namespace as traced_namespace
@@ -23,10 +27,6 @@ from filtergym.compiler.vector_functions import VectorFunction
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.linear.state_space import Measurement
-from gymnasium.utils.env_checker import check_env
-from own_models import forget, make_models, simulate
-
-import filtergym
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 

@@ -15,6 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy
 import xarray
+from pictures import draw_learning_curves
+from records import ResultRecord, round_number
+from scipy.special import stdtrit
+from sentence_numbers import Number
+
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name
@@ -29,13 +34,8 @@ from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
 from filtergym.evaluation.storage.dataset import groups_of, windows_of
 from filtergym.evaluation.storage.store import Store, Work
-from filtergym.papers.grid import Grid, markdown_table
-from pictures import draw_learning_curves
-from records import ResultRecord, round_number
-from scipy.special import stdtrit
-from sentence_numbers import Number
-
 from filtergym.names import find_competitor
+from filtergym.papers.grid import Grid, markdown_table
 from filtergym.reports.tables.terminal_tables import select_components, with_interval
 from filtergym.reports.tables.work import meaning_of, stem_of
 

@@ -8,8 +8,8 @@ import typer
 from ..evaluation.figures.print_layout import check_formats
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, writable_folder
-from ..reproductions import paper_module, papers
 from ..reports.tables.results import read_all_results
+from ..reproductions import paper_module, papers
 from .shown import REPORT, make_report, print_headline, print_outcome, report_maker
 from .terminal import Cluster, Formats, Jobs, console, one_of, progress_bar
 
