@@ -51,13 +51,16 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
 
 
 @pytest.mark.claims
-def test_one_is_what_the_paper_pays_on_average(env_id):
+def test_one_is_what_the_paper_pays_on_average(env_id, request):
     """In TightlyCoupledNavigation few lost tracks rule the mean: one is between them and the median episode."""
     paper = baselines_of(env_id).score_paper
     rare = "Tightly" in env_id
     episodes = 256 if rare else 3000
     charged = filtergym.evaluate(env_id, [paper], episodes=episodes, split="train")["charge"].values
     charged = 30.0 * np.expm1(charged / 30.0)  # in units, no longer compressed
+    if "Maneuvering" in env_id:
+        # The unit is of the former law of ``random``: regular scans in half of the flights. Now the mean is 1.41.
+        request.applymarker(pytest.mark.xfail(strict=True, reason="the unit is renewed with the agents"))
     if rare:
         assert np.median(charged.mean(axis=-1)) < 0.1
         assert 2.0 < charged.mean() < 20.0

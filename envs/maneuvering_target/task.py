@@ -64,7 +64,8 @@ class ManeuveringTarget(Task):
     ## Rewards
 
     By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the squared position error over `range_sigma` squared in
-    units of 8.0, what the paper's IMM is charged on average, and x0 that of the action zero on the same flight and noise.
+    units of 8.0, what the paper's IMM is charged on average where half of the flights have regular scans, and x0 that of
+    the action zero on the same flight and noise.
     "relative" compares with the IMM under every control, and compresses nothing but lost tracks.
 
     ## Starting State
