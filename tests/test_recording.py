@@ -484,7 +484,7 @@ WRONG = [
     (TARGET, POLAR | {"range": [9e3, -1.0, 1.0, 1.0, 1.0]}, "range is a distance, and row 1 has -1 m"),
     (TARGET, changed(truth_position_x=ONE), "the column truth_position_y is missing"),
     (TARGET, changed(truth_height=ONE), "truth_height is no truth of filtergym/ManeuveringTarget-v0"),
-    (TARGET, changed(truth_velocity_x=ONE, truth_velocity_y=ONE), "does not say what an error costs"),
+    (TARGET, changed(truth_velocity_x=ONE, truth_velocity_y=ONE), "its truth lacks position_x, position_y, which the cost of"),
     (LOOSE, {**LOG, "time": [0.0, 1.0, 2.0, 4.0]}, "times are 2 s apart after row 2 and 1 s elsewhere"),
     (LOOSE, {**LOG, "fix": [None] * 4}, "no row has a fix"),
     (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),

@@ -43,6 +43,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     measurement does not say."""
     elapsed_field: ClassVar[str] = ""
     """Field with the s since the last measurement that was received; empty where there is none."""
+    cost_remedy: ClassVar[str] = ""
+    """What an author may change where a component of the truth is unknown, in words that follow a list of columns."""
 
     disturbances: Disturbances = Disturbances(())
     """What it may do to its sensors."""

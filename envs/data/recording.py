@@ -14,6 +14,7 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -269,9 +270,14 @@ class Recording:
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
             if not numpy.isfinite(world.error_cost(nothing)).any():
+                unknown = numpy.isnan(nothing).all(axis=1)
+                alone = numpy.where(numpy.eye(len(unknown), dtype=bool), math.nan, 0.0)
+                needed = [i for i, row in enumerate(alone) if numpy.isnan(world.error_cost(row[:, None])).any()]
+                missing = [task.components[i].name for i in needed if unknown[i]]
                 raise ValueError(
-                    f"recording {name!r}: what its truth holds does not say what an error costs in {task.id}: add "
-                    "more of its components, or leave the truth out"
+                    f"recording {name!r}: its truth lacks {', '.join(missing) or 'whole rows'}, which the cost of "
+                    f"{task.id} counts: add {', '.join(f'truth_{one}' for one in missing) or 'them'}"
+                    f"{world.cost_remedy}, or leave the truth out"
                 )
 
     # --- as a file

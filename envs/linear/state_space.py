@@ -91,6 +91,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
 
     parameters: StateSpaceParameters
     received_field: ClassVar[str] = "values"
+    cost_remedy: ClassVar[str] = ", give state_space weights= of zero for them"
 
     def __init__(self, task: "StateSpace") -> None:
         super().__init__(task)
