@@ -25,6 +25,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
+
+import filtergym
+from filtergym import Sensor
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
 from filtergym.baselines.table import Variant
@@ -33,9 +36,6 @@ from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.data.recording import Recording
 from filtergym.envs.engine.catalogue import short_name
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
-
-import filtergym
-from filtergym import Sensor
 
 MODULE = Path(__file__).stem
 ALGORITHMS = {"kalman-net": (), "bptt": ("--control", "noise"), "ppo": ("--control", "noise")}
@@ -224,6 +224,10 @@ class WithNoises(Extended):
     def process_noise(self, mean: Any, measurement: Any) -> Any:
         """Its own, whatever the state."""
         return self.Q
+
+    def sensor_noise(self, mean: Any, measurement: Any) -> Any:
+        """Its own, whatever the state."""
+        return self.R
 
 
 def with_noises(Q: numpy.ndarray, R: numpy.ndarray) -> Any:

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import xarray
-from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
-from filtergym.filters import alpha_beta
 from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
+from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
+from filtergym.filters import alpha_beta
 from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -50,7 +50,7 @@ def test_consistency_is_what_it_says(dataset, found):
         assert found[name, "nees_inside"].value == pytest.approx(inside, abs=1e-4)
     nis, degrees = (dataset[name].sel(policy="imm").values for name in ("nis", "nis_degrees"))
     missed = degrees == 0.0  # scans that did not see the target
-    assert 0.02 < missed.mean() < 0.2
+    assert 0.1 < missed.mean() < 0.3
     np.testing.assert_array_equal(np.isnan(nis), missed)
     assert found["imm", "anis"].value == pytest.approx(np.nanmean(nis) / 2, rel=1e-9)
     nis = dataset["nis"].sel(policy="kalman-imm").values

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import scipy
-from filtergym.filters import discretisation
 from own_models import make_models, simulate
 
 from filtergym import Input
+from filtergym.filters import discretisation
 
 CASES = {
     "integrators": ([[0, 1, 0], [0, 0, 1], [0, 0, 0]], 0.0),
@@ -149,7 +149,7 @@ def test_a_linear_drift_moves_by_the_exponential(make):
     [
         ({"f": np.eye(2)}, "motion is said by f and Q, or by drift and diffusion, got f, drift, diffusion"),
         ({"drift": None, "diffusion": None}, "got neither"),
-        ({"drift": lambda x: [x[0]]}, "neither drift nor h takes u: write"),
+        ({"drift": lambda x: [x[0]]}, "neither drift, h nor R takes u: write"),
         ({"drift": lambda x, u: [x[0] * u[0]]}, "drift must return 2 numbers, got 1"),
         ({"drift": lambda x, dt, u: [x[0], u[0]]}, "drift takes the state, and u where there are inputs"),
         ({"diffusion": -np.eye(2)}, "diffusion must be symmetric"),

@@ -6,15 +6,15 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from models import make_model
+from scipy.stats import norm
+
+from filtergym import evaluate
 from filtergym.agents.gate import Gate, Gated, GatedMaker, PaperAction, excess_cost
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy
-from models import make_model
-from scipy.stats import norm
-
-from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -393,7 +393,8 @@ def test_what_was_around_an_agent_is_around_it_again(monkeypatch, tmp_path):
     export_run(tmp_path, agent)
     names = [str(tmp_path), str(tmp_path / "best" / "model.zip"), str(agent), "adaptive"]
     cost = evaluate(ID, names, episodes=16, split="validation", trust=True)["cost"].values
-    assert run.validation[0]["cost"] == pytest.approx(cost[0].mean(), rel=1e-6)
+    best = min(entry["cost"] for entry in run.validation)
+    assert best == pytest.approx(cost[0].mean(), rel=1e-6)
     np.testing.assert_allclose(cost[1], cost[0], rtol=1e-4)
     np.testing.assert_array_equal(cost[2], cost[0])
     # In some episodes no alarm speaks, and then nothing is corrected.

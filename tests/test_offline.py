@@ -6,14 +6,14 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from models import KINDS
+
+from filtergym import Trajectory
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.running.transitions import member, transitions_of
-from models import KINDS
-
-from filtergym import Trajectory
 from filtergym.names import competitor, make_policy
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -143,12 +143,12 @@ def test_random_actions_go_with_the_policy_before_them(minari):
         True,
         False,
     ]
-    _, tuned, random = write_datasets(ENV, episodes=2, horizon=5)
+    _, tuned, random = write_datasets(ENV, episodes=8, horizon=20)
     assert tuned.environment == random.environment
     assert tuned.environment["gains"] == competitor(ENV, tuned.policy).task_keywords["gains"]
     parts = [minari.load_dataset(entry.name) for entry in (tuned, random)]
     both = minari.combine_datasets(parts, "filtergym/both-v0")
-    assert (both.total_episodes, both.total_steps) == (4, 20)
+    assert (both.total_episodes, both.total_steps) == (16, 320)
     scores = [minari.get_normalized_score(part, np.array([tuned.mean_return])) for part in parts]
     assert tuned.mean_return > random.mean_return
     assert scores == [1.0, 1.0]

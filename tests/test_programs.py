@@ -13,6 +13,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from models import make_model
+
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.task import Component, named_arrays
@@ -28,8 +30,6 @@ from filtergym.evaluation.competitors.programs import (
 )
 from filtergym.evaluation.running.rollout import measure_time, rollout, start_lanes
 from filtergym.evaluation.storage.dataset import FAULTS
-from models import make_model
-
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -350,7 +350,7 @@ def test_a_hello_names_every_number(env_id):
     estimator.end()
     hello = json.loads(json.dumps(estimator.hello(measured), allow_nan=False))
     assert (hello["tracks"], hello["environment"]) == (1, env_id)
-    assert [(c["name"], c["unit"]) for c in hello["components"]] == list(map(tuple, model.task.components))
+    assert [(c["name"], c["unit"], c["period"]) for c in hello["components"]] == [*model.task.components]
     for name, part in (("initial", started[0]), ("measurement", measured)):
         present = [own for own in hello[name] if own["shape"] is not None]
         assert [own["name"].replace(".", "_") for own in present] == [n for n, _ in named_arrays(part)]

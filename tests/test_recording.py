@@ -10,7 +10,11 @@ import gymnasium as gym
 import numpy as np
 import pandas
 import pytest
+from models import make_model
+
+from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.baselines.problem import problem_of
+from filtergym.commands.evaluation import causal_names
 from filtergym.envs.data.recorded_tables import Columns
 from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
@@ -21,10 +25,6 @@ from filtergym.evaluation.running.metrics import chi_square_band
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
-from models import make_model
-
-from filtergym import evaluate, read_recording, record, tidy_records
-from filtergym.commands.evaluation import causal_names
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigation-v0"
@@ -484,7 +484,11 @@ WRONG = [
     (TARGET, POLAR | {"range": [9e3, -1.0, 1.0, 1.0, 1.0]}, "range is a distance, and row 1 has -1 m"),
     (TARGET, changed(truth_position_x=ONE), "the column truth_position_y is missing"),
     (TARGET, changed(truth_height=ONE), "truth_height is no truth of filtergym/ManeuveringTarget-v0"),
-    (TARGET, changed(truth_velocity_x=ONE, truth_velocity_y=ONE), "its truth lacks position_x, position_y, which the cost of"),
+    (
+        TARGET,
+        changed(truth_velocity_x=ONE, truth_velocity_y=ONE),
+        "its truth lacks position_x, position_y, which the cost of",
+    ),
     (LOOSE, {**LOG, "time": [0.0, 1.0, 2.0, 4.0]}, "times are 2 s apart after row 2 and 1 s elsewhere"),
     (LOOSE, {**LOG, "fix": [None] * 4}, "no row has a fix"),
     (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),

@@ -4,10 +4,11 @@ has: their distribution is compared between the episodes with and without each o
 
 import numpy as np
 import pytest
+from scipy import stats
+
 from filtergym.envs.contract import draws
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue
-from scipy import stats
 
 REPORTS = {
     "LooselyCoupledNavigation": lambda m, truth: [m.reported_deviation, m.available],

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from models import KINDS, make_model
+
+import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import reference
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from models import KINDS, make_model
-
-import filtergym
 
 ID = "filtergym/ManeuveringTarget-v0"
 

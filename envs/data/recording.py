@@ -270,10 +270,12 @@ class Recording:
         for episode, name in enumerate(self.names):
             nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
             if not numpy.isfinite(world.error_cost(nothing)).any():
-                unknown = numpy.isnan(nothing).all(axis=1)
-                alone = numpy.where(numpy.eye(len(unknown), dtype=bool), math.nan, 0.0)
-                needed = [i for i, row in enumerate(alone) if numpy.isnan(world.error_cost(row[:, None])).any()]
-                missing = [task.components[i].name for i in needed if unknown[i]]
+                missing = []
+                for i, component in enumerate(task.components):
+                    alone = numpy.zeros((len(task.components), 1))
+                    alone[i] = math.nan
+                    if numpy.isnan(nothing[i]).all() and numpy.isnan(world.error_cost(alone)).any():
+                        missing.append(component.name)
                 raise ValueError(
                     f"recording {name!r}: its truth lacks {', '.join(missing) or 'whole rows'}, which the cost of "
                     f"{task.id} counts: add {', '.join(f'truth_{one}' for one in missing) or 'them'}"

@@ -22,6 +22,7 @@ from ...envs.engine.episode_noise import MeasurementRow
 from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
+from .adapters import select_lanes
 from .filters import find_fault, put_in_loop
 from .kinds import check_competitor, kind_of, make_competitor
 from .online_state import Estimate, History, OnlineState, Taken, Watch
@@ -300,9 +301,9 @@ class OnlineFilter:
         mean, covariance = near.mean.reshape(n, -1), near.covariance.reshape(n, n, -1)
         words: list[str] = numpy.atleast_1d(found.lost).tolist()
         for i, fault in enumerate(words):
-            one = slice(i, i + 1)
-            given = map_arrays(lambda array, one=one: array[..., one], measurement)
-            reason = fault and self.task.explain_loss(mean[..., one], covariance[..., one], given)
+            track = numpy.array([i])
+            given = select_lanes(measurement, track)
+            reason = fault and self.task.explain_loss(mean[..., track], covariance[..., track], given)
             words[i] = f"the estimate is not finite: {reason}" if reason else fault
         return self._each(words)
 
