@@ -114,7 +114,7 @@ class StateSpaceWorld(World["StateSpace", Truth, Measurement]):
         self.switches = own.switching and len(own.world) > 1
         self.loses = self.parameters.availability < 1.0
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
-        usual = usual_sensor_noise(own.world[0], own.mean, self.parameters.sampling_interval, own.inputs)
+        usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
         self.receptions = Receptions(task, numpy.sqrt(numpy.diag(usual)))
         self.delayed = self.drawn + self.receptions.row_uniforms
         self.delays = self.parameters.late > 0.0
