@@ -218,7 +218,7 @@ def find_invalid_noise(
             if of_state[channel.places, channel.places].any():
                 continue
             there = (available[channel.places] > 0.0).any(axis=0)
-            finite = numpy.isfinite(own).all(axis=(1, 2))
+            finite = numpy.asarray(numpy.isfinite(own).all(axis=(1, 2)))
             least = numpy.linalg.eigvalsh(numpy.where(finite[:, None, None], own, 0.0))[:, 0]
             wrong = there & ~(finite & (least > 0.0))
             if wrong.any():
@@ -518,7 +518,7 @@ class Equations:
         not finite; empty where all are.
         """
         entries = values.reshape(len(values), -1, x.shape[1])
-        wrong = ~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0)
+        wrong = numpy.asarray(~numpy.isfinite(entries).all(axis=1) & numpy.isfinite(x).all(axis=0))
         if not wrong.any():
             return ""
         lane = int(wrong.any(axis=0).argmax())
