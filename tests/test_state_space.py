@@ -494,7 +494,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
     """Its commands, on a simulated drive whose odometer speaks at every second measurement."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "car.py").write_text(BLOCKS[7][1], encoding="utf-8")
+    (tmp_path / "car.py").write_text(BLOCKS[9][1], encoding="utf-8")
     try:
         made = filtergym.record(importlib.import_module("car").Car.id, episodes=1, horizon=150, jitter=0.9)
         gps, odometry = made.measurements["values"][0].T
@@ -506,7 +506,7 @@ def test_the_page_on_tables_runs(tmp_path, command, monkeypatch):
         ):
             text = "\n".join([header, *(",".join(map(str, row)).replace("nan", "") for row in rows.tolist())])
             (tmp_path / file).write_text(text, encoding="utf-8")
-        for line in BLOCKS[8][1].splitlines():
+        for line in BLOCKS[10][1].splitlines():
             code, shown, errors = command(*shlex.split(line)[1:])
             assert (code, bool(shown)) == (0, True), errors
     finally:

@@ -7,11 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import training_seeds
-from filtergym.agents.learned_policy import ENVELOPE, PRETRAINED, read_arrays
-from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.storage.store import Store
-from filtergym.papers.grid import markdown_table
-from records import read_record
+from records import read_record, round_number
 from safetensors.numpy import load_file
 from training_seeds import (
     Comparison,
@@ -25,6 +21,11 @@ from training_seeds import (
     spread,
     trained_of,
 )
+
+from filtergym.agents.learned_policy import ENVELOPE, PRETRAINED, read_arrays
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.storage.store import Store
+from filtergym.papers.grid import markdown_table
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -166,8 +167,11 @@ def test_command_makes_the_record_and_the_record_the_tables(folders, tmp_path, m
     text = seeds_markdown(record)
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
         assert word in text
-    # What the record has lost, digits beyond the sixth, is not seen.
-    records = [Comparison(**each) for each in json.loads((tmp_path / "seeds.json").read_text())]
+    # The tables are of the digits that the record keeps.
+    records = [
+        Comparison(**{name: round_number(v) if isinstance(v, float) else v for name, v in each.items()})
+        for each in json.loads((tmp_path / "seeds.json").read_text())
+    ]
     for grid in comparison_grids(problem_of(records[0].environment), trained_of(load_runs(folders)), records):
         assert "\n".join(markdown_table(grid.header, grid.rows)) in text
     # The first table is shown, the others wait for a click; inside HTML, Markdown needs blank lines around it.

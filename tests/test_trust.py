@@ -8,11 +8,11 @@ import sys
 import zipfile
 
 import pytest
-from filtergym.agents.export import export_run
-from filtergym.agents.learned_policy import PRETRAINED
 
 import filtergym
 from filtergym.__main__ import main
+from filtergym.agents.export import export_run
+from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -189,7 +189,7 @@ def test_a_file_of_ones_own_is_no_library(tmp_path):
     short = ("--episodes", "2", "--set", "horizon=8", "--jobs", "2", "--backend", "numpy", "--out", "out")
     for start, *words in (
         ("bin/filtergym", "evaluate", ID, "--policy", "middle:Middle", "--policy", "imm", *short),
-        ("-mfiltergym", "report", "out"),
+        ("-P", "-m", "filtergym", "report", "out"),
     ):
         done = subprocess.run(
             [sys.executable, start, *words], cwd=tmp_path, capture_output=True, text=True, check=False
