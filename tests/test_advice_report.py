@@ -6,19 +6,20 @@ import gzip
 import itertools
 import json
 import re
+import subprocess
 import sys
 
 import browser
 import numpy as np
 import pytest
+
+from filtergym.__main__ import main
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.running.metrics import chi_square_band
-
-from filtergym.__main__ import main
 from filtergym.reports.tables.advice import advice_rows, further_sentences, verdict
 
 pytest.importorskip("plotly")
@@ -166,6 +167,26 @@ def test_every_picture_is_drawn_and_nothing_complains(page, tmp_path):
         assert all(counts)
         assert not [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
         assert driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_a_sensor_that_is_no_component_has_a_report_without_a_track(tmp_path):
+    """A model of one's own, whose sensor ``float`` measures the component ``level``."""
+    (tmp_path / "tank.py").write_text(
+        "import filtergym\n"
+        "from filtergym import Sensor\n"
+        "Tank = filtergym.state_space('mine/Tank-v0', f=[[1, 1], [0, 1]], Q=[[0.01, 0], [0, 0.01]], mean=[1, 0],\n"
+        "    sensors={'float': Sensor([[1, 0]], R=0.1)}, covariance=[[1, 0], [0, 1]], names=['level', 'rate'])\n"
+    )
+    noise = np.random.default_rng(0)
+    level = 1.0 + np.cumsum(np.cumsum(noise.normal(0.0, 0.1, 200)))
+    rows = [f"{k},{value}" for k, value in enumerate(level + noise.normal(0.0, 0.3, 200))]
+    (tmp_path / "log.csv").write_text("\n".join(["time,float", *rows]) + "\n")
+    words = ("advise", "log.csv", "--environment", "tank:mine/Tank-v0", "--report", "report.html")
+    done = subprocess.run(
+        [sys.executable, "-m", "filtergym", *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, capsys):

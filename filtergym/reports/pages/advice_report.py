@@ -170,6 +170,8 @@ def _track(
         return {}
     group = task.log_format.predicted[0].group
     components = list(task.groups.get(group, (group,)))[:2]
+    if not {*components} <= {one.name for one in task.components}:
+        return {}  # a sensor of a model of one's own need not be named as a component
     units = [component.unit for component in task.components if component.name in components]
     chosen = run.sel(component=components).isel(episode=0, time=slice(None, None, step))
     found: dict[str, Any] = {
