@@ -283,8 +283,8 @@ def _put_in_order(measurements: Sequence[Measurement], lateness: int, xp: Any) -
 class Unscented(Extended):
     """The unscented Kalman filter; arguments as of :class:`Extended`.
 
-    An angle that is measured may have any spread. Where no Gaussian is the posterior, as after one bearing of a wide
-    position, what holds is that the covariance is definite and the mean of NEES at most twice the number of states.
+    A measured angle may have any spread. Where the posterior is not Gaussian, as after one bearing of an uncertain
+    position, the covariance stays definite and the mean NEES is at most twice the number of states.
     """
 
     def __init__(

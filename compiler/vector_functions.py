@@ -5,6 +5,7 @@ reverse mode, one row for each entry of the answer (:mod:`.gradients`). Both are
 lane, which are then computed with the functions of any array namespace: NumPy's, torch's, or on traced arrays again.
 """
 
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -42,8 +43,6 @@ class VectorFunction:
         given: g.
         matrix: the Jacobian where it is the same everywhere, ``(m, n)``; else None, and with further numbers.
         offset: value at zero where that is so, ``(m,)``; else None.
-    linear: entries of the Jacobian that are the same everywhere, ``(m, n)``; of an angle that is wrapped, too: the
-            derivative of ``arctan2(sin(a), cos(a))`` is one.
 
     Raises:
         NotTraceable: if the function is no straight line of arithmetic.
@@ -75,17 +74,18 @@ class VectorFunction:
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]
-        self.linear = self._find_linear_entries() if size else numpy.zeros((self.size, 0), dtype=bool)
 
-    def _find_linear_entries(self) -> numpy.ndarray:
-        """Entries of the Jacobian that are the same at random states of four magnitudes."""
+    @functools.cached_property
+    def linear(self) -> numpy.ndarray:
+        """Entries of the Jacobian that are the same everywhere, ``(m, n)``; of an angle that is wrapped, too: the
+        derivative of ``arctan2(sin(a), cos(a))`` is one. They are found by random states of four magnitudes.
+        """
         rng, count = numpy.random.default_rng(0), 8
         x = rng.normal(size=(self.inputs, 4 * count)) * numpy.repeat(10.0 ** numpy.arange(4), count)
         given = numpy.repeat(rng.uniform(0.1, 1.0, (self.given, 1)), 4 * count, axis=1)
         with numpy.errstate(all="ignore"):
             J = self.jacobian(numpy.concatenate([x, given]), numpy)
-            spread = numpy.nanmax(J, axis=2) - numpy.nanmin(J, axis=2)
-            found: numpy.ndarray = spread <= 1e-9 * numpy.abs(J).max(axis=2)
+            found: numpy.ndarray = numpy.ptp(J, axis=2) <= 1e-9 * numpy.abs(J).max(axis=2)
         return found
 
     @property

@@ -281,7 +281,7 @@ class Task(ABC):
         return None
 
     def explain_loss(self, mean: Array, covariance: Array, measurement: Any) -> str:
-        """Say in a sentence why a filter lost an episode at a measurement; empty where the task cannot know.
+        """Explain in a sentence why a filter lost an episode at a measurement; empty where the task cannot.
 
         Args:
             mean: last valid estimate, ``(C, N)``.

@@ -468,6 +468,13 @@ def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
     return "dates" if dates else "seconds", (found / unit).to_numpy()
 
 
+def describe_time(clock: str, time: float) -> str:
+    """Write a time of :func:`clock_seconds` for people."""
+    if clock != "dates":
+        return f"{time:g} s"
+    return str(numpy.datetime64(round(time), "s"))
+
+
 def check_order(time: numpy.ndarray) -> None:
     """Raise ValueError for times that decrease, with both times and what to do.
 

@@ -15,8 +15,8 @@ import numpy
 from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
 from ..contract.live_input import LARGEST
-from ..contract.log_format import TrackLog
-from ..contract.task import Task
+from ..contract.log_format import LogFormat, TrackLog
+from ..contract.task import Component, Task
 from .flight_tables import (
     COLUMNS,
     FLIGHT_SUFFIXES,
@@ -202,7 +202,7 @@ class Columns:
                 jumps = numpy.abs(steps - period) < TURN_SHARE * period
                 if jumps.any() and numpy.nanmedian(steps) < TURN_SHARE * period:
                     self.notes.append(
-                        f"{name} jumps by a turn after row {jumps.argmax()}, and its error then counts as one: declare "
+                        f"{name} jumps by a turn after row {jumps.argmax()}, and errors of whole turns count: declare "
                         f"angles={{{name.removeprefix(TRUTH)!r}: {unit!r}}}"
                     )
 
@@ -364,13 +364,12 @@ def read_columns(
             row = large.idxmax()
             raise ValueError(f"{name} is {table[name][row]:g} in row {row}, and {LARGEST:g} at most")
     table.insert(0, "time", seconds(read[time_name]))
+    components = cls(cls.Parameters(**keywords)).components
     if truth is not None:
-        table, told = _add_truth(table, read[time_name], cls, keywords, truth)
+        table, told = _add_truth(table, read[time_name], log_format, components, truth)
         notes = (*notes, *told)
     parts = []
-    angles = {
-        TRUTH + one.name for one in cls(cls.Parameters(**keywords)).components if one.period is not None
-    }
+    angles = {TRUTH + one.name for one in components if one.period is not None}
     log_time = _times_as_written(read[time_name])
     for name, rows in _by_recording(table, read.get(RECORDING)).items():
         own = Columns(
@@ -398,8 +397,8 @@ def read_columns(
 def _add_truth(
     table: "pandas.DataFrame",
     times: "pandas.Series",
-    cls: type[Task],
-    keywords: Mapping[str, Any],
+    log_format: LogFormat,
+    components: Sequence[Component],
     truth: TruthFile,
 ) -> tuple["pandas.DataFrame", tuple[str, ...]]:
     """Add the truth of a file of its own to the rows of a log, and say how many have one.
@@ -407,11 +406,9 @@ def _add_truth(
     Raises:
         ValueError: if it cannot be read or matched, or the log has a truth already.
     """
-    log_format: Any = cls.log_format
     here = [name for name in table if name.startswith(TRUTH)]
     if here:
         raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
-    components = cls(cls.Parameters(**keywords)).components
     periods = {TRUTH + one.name: one.period for one in components if one.period is not None}
     try:
         found = read_truth(truth.path, log_format, [one.name for one in components], TRUTH, TIME)

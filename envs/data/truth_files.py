@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
 
+from ...filters.angles import shorten
 from ..contract.log_format import LogFormat
-from .flight_tables import COLUMNS, check_order, clock_seconds, list_names, numbers, read_table
+from .flight_tables import COLUMNS, check_order, clock_seconds, describe_time, list_names, numbers, read_table
 
 if TYPE_CHECKING:
     import pandas
@@ -119,14 +120,15 @@ def match_truth(
     for name, values in truth.columns.items():
         step = values[after] - values[before]
         if name in periods:
-            step = step - periods[name] * numpy.round(step / periods[name])
+            step = shorten(step[None], {0: periods[name]})[0]
         inside = values[before] + share * step
         columns[name] = numpy.where(same, values[near], numpy.where(between, inside, numpy.nan))
     known = numpy.logical_and.reduce([numpy.isfinite(values) for values in columns.values()])
     if not known.any():
         raise ValueError(
-            f"no measurement has a truth: the log's times are from {_when(clock, now[0])} to {_when(clock, now[-1])}, "
-            f"those of the truth from {_when(clock, then[0])} to {_when(clock, then[-1])}"
+            f"no measurement has a truth: the log's times are from {describe_time(clock, now[0])} to "
+            f"{describe_time(clock, now[-1])}, those of the truth from {describe_time(clock, then[0])} to "
+            f"{describe_time(clock, then[-1])}"
         )
     exact = int((same & known).sum())
     note = (
@@ -134,13 +136,6 @@ def match_truth(
         f"{int(known.sum()) - exact:,} between two that are at most {LONGEST_GAP:g} s apart"
     )
     return columns, note + (f"; {offset:+g} s were added to its times" if offset else "")
-
-
-def _when(clock: str, time: float) -> str:
-    """Write a time for people."""
-    if clock != "dates":
-        return f"{time:g} s"
-    return str(numpy.datetime64(round(time), "s"))
 
 
 def offset_note(time: numpy.ndarray, position: numpy.ndarray, truth: numpy.ndarray) -> str:

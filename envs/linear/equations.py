@@ -237,7 +237,7 @@ class Measurement(NamedTuple):
     interval: Array | None = None
     """Since the measurement before, or the start, s, ``(N,)``; None where the model is not timed."""
     inputs: Array | None = None
-    """What is told of the inputs that acted in that time, ``(p, N)``; None where the model has none."""
+    """Known inputs that acted in that time, ``(p, N)``; None where the model has none."""
     late: Array | None = None
     """What comes now and is of ``lateness`` measurements ago, ``(m, N)``, zero where nothing does; None where nothing
     comes late."""
@@ -564,7 +564,7 @@ class Equations:
         return self._warn("the derivative of f", self.model.f.jacobian, self._with_passed(x, passed))
 
     def measurement_matrix(self, x: Array, passed: Passed) -> Array:
-        """Jacobian of h, likewise."""
+        """Jacobian of h, ``(m, n, N)``; the last axis is 1 where it is the same everywhere."""
         if self._H is not None:
             return self._H[:, :, None]
         return self._warn("the derivative of h", self.model.h.jacobian, self._with_inputs(x, passed))

@@ -14,7 +14,7 @@ import numpy
 from ...envs.contract.filter import Filter, Input, Stated
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
-from ...envs.data.flight_tables import clock_seconds
+from ...envs.data.flight_tables import clock_seconds, describe_time
 from ..storage.dataset import NO_ROW
 from ..storage.estimate_tables import EstimateTable, read_estimates
 
@@ -24,6 +24,8 @@ ENDED = 10
 """Sampling intervals after the last row of a track from which on it is lost: some programs answer less often."""
 LEAST_SHARE = 0.5
 """Of the measurements, that must have a row: with fewer the times are of another clock, or of another log."""
+SINCE_FIRST = "since its first measurement"
+"""Name of the clock that begins with a log, in errors."""
 SHOWN = 5
 """Names of tracks in an error."""
 
@@ -100,39 +102,35 @@ def _recorded_times(task: Task, table: EstimateTable, name: str) -> dict[str, nu
             raise ValueError(f"the times of {name} are {table.clock}, and those of a simulation seconds")
         _check_simulated(task, table, name)
         return None
-    clocks: list[dict[str, numpy.ndarray]] = []
-    own_clock = "seconds"
+    log_clock, clocks = "seconds", {}
     if recording.log_time is not None:
         found = [
             (track, *clock_seconds(pandas.Series(written[:rows])))
             for track, rows, written in zip(recording.names, recording.rows, recording.log_time, strict=True)
         ]
-        own_clock = found[0][1]
-        clocks.append({track: time for track, _, time in found})
+        log_clock = found[0][1]
+        clocks["by the log"] = {track: time for track, _, time in found}
     if table.clock in ("seconds", "log"):
-        # Of a log in seconds either may be meant; a file that names the time of the log means that.
+        # Of a log in seconds either may be meant; a column with the name of the log's time means that.
         since = recording.seconds + recording.started[:, None]
-        elapsed = {
-            track: time[:rows]
-            for track, time, rows in zip(recording.names, since, recording.rows, strict=True)
+        elapsed = zip(recording.names, since, recording.rows, strict=True)
+        clocks = {
+            SINCE_FIRST: {track: time[:rows] for track, time, rows in elapsed},
+            **(clocks if log_clock == "seconds" else {}),
         }
-        if table.clock == "log" and own_clock == "seconds" and clocks:
-            clocks.append(elapsed)
-        else:
-            clocks = [elapsed, *(clocks if own_clock == "seconds" else [])]
-    elif own_clock != table.clock:
-        raise ValueError(f"the times of {name} are {table.clock}, and those of the log {own_clock}")
+        if table.clock == "log":
+            clocks = dict(reversed(clocks.items()))
+    elif log_clock != table.clock:
+        raise ValueError(f"the times of {name} are {table.clock}, and those of the log {log_clock}")
     tolerance = _tolerance(task)
-    shares = [_share_found(table, times, tolerance) for times in clocks]
-    best = int(numpy.argmax(shares))
+    shares = {which: _share_found(table, times, tolerance) for which, times in clocks.items()}
+    best = max(shares, key=lambda which: shares[which])
     if shares[best] < LEAST_SHARE:
+        spans = (f"{_span([*times.values()], table.clock)} {which}" for which, times in clocks.items())
         raise ValueError(
             f"{100.0 * shares[best]:.0f} % of the measurements have a row in {name} within {tolerance:.3g} s, and "
             f"{100.0 * LEAST_SHARE:.0f} % must: its times go from {_span([table.time], table.clock)}, those of the "
-            "log from "
-            + " or, since its first measurement, from ".join(
-                _span(list(times.values()), table.clock) for times in clocks
-            )
+            f"log from {', or from '.join(spans)}"
         )
     return clocks[best]
 
@@ -147,7 +145,9 @@ def _usual_interval(task: Task) -> float:
 
 
 def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
-    """Raise ValueError where most rows are beyond the episodes of a simulation."""
+    """Raise ValueError where most rows are beyond the episodes of a simulation, whose intervals are at most twice the
+    usual one.
+    """
     end = (task.horizon + 1) * _usual_interval(task)
     if numpy.mean((table.time >= 0.0) & (table.time <= 2.0 * end)) < LEAST_SHARE:
         raise ValueError(
@@ -157,10 +157,9 @@ def _check_simulated(task: Task, table: EstimateTable, name: str) -> None:
 
 def _span(times: Sequence[numpy.ndarray], clock: str) -> str:
     """First and last time, in words."""
-    first, last = min(time.min() for time in times), max(time.max() for time in times)
-    if clock != "dates":
-        return f"{first:.9g} to {last:.9g} s"
-    return " to ".join(str(numpy.datetime64(int(time * 1e3), "ms")) for time in (first, last))
+    return " to ".join(
+        describe_time(clock, time) for time in (min(t.min() for t in times), max(t.max() for t in times))
+    )
 
 
 def _share_found(table: EstimateTable, times: Mapping[str, numpy.ndarray], tolerance: float) -> float:
