@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy
+
+import filtergym
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
-
-import filtergym
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
 sensing = importlib.import_module("budgeted_sensing")

@@ -92,8 +92,9 @@ def sb3_single(id: str) -> Portion:
 
 def sb3_native(id: str) -> Portion:
     import gymnasium
-    from filtergym.agents import to_sb3
     from stable_baselines3 import PPO
+
+    from filtergym.agents import to_sb3
 
     env = to_sb3(gymnasium.make_vec(id, num_envs=NATIVE, autoreset_mode="SameStep"))
     return learnt_by(PPO("MlpPolicy", env, n_steps=PORTION, batch_size=PORTION * NATIVE, n_epochs=1))

@@ -17,9 +17,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.stress.crash_test import CrashTest, Finding
-from filtergym.papers.grid import markdown_table
-
 from filtergym.names import find_competitor
+from filtergym.papers.grid import markdown_table
 
 COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]
 

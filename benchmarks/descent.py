@@ -19,14 +19,15 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import torch
+from rich.console import Console
+from rich.table import Table
+
 from filtergym.agents.bptt import NetworkPolicy, descend_episodes
 from filtergym.agents.training_run import RunOptions, TrainingRun, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from rich.console import Console
-from rich.table import Table
 
 BACKENDS = ("torch", "compiled")
 FEWER = 8

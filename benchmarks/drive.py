@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy
 import xarray
+
 from filtergym.envs.data.strapdown import GRAVITY, AidedInertial, aid, align, free_windows, tangent_plane
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 

@@ -10,11 +10,10 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+import filtergym
 from filtergym.envs.data.recording import Recording
 from filtergym.evaluation.running.metrics import Record
 from filtergym.papers.grid import markdown_table
-
-import filtergym
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
 LEVELS: dict[str, dict[str, float]] = {

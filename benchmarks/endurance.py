@@ -20,10 +20,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import gymnasium
 import numpy
-from filtergym.envs.engine.catalogue import catalogue
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+
+from filtergym.envs.engine.catalogue import catalogue
 
 CHECKED_EVERY = 10
 """Steps between two looks at the covariances' signs."""

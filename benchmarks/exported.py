@@ -23,6 +23,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
+from peer_imm import imm_steps_per_second
+
 from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
@@ -37,8 +39,6 @@ from filtergym.evaluation.competitors.steered_filter import steer
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
-from peer_imm import imm_steps_per_second
-
 from filtergym.exports.c_source import FLAGS, Writer, files_of
 from filtergym.exports.replay import Replay, mean_rows, replay, run_filter
 from filtergym.exports.request import ExportRequest

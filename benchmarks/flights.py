@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy
 import pandas
+
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.flights import TRAFFIC, Flights, flight_of, read_flights, traffic_samples
-
 from filtergym.names import competitors_of, tidy_records
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -13,12 +13,12 @@ from collections.abc import Collection
 
 import numpy
 import xarray
+
+import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.evaluation.running.times import EQUAL_TIMES, FRONT_MARK, Point, front, time_of, time_text
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
 from filtergym.papers.grid import markdown_table
-
-import filtergym
 
 CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     "LooselyCoupledNavigation": (

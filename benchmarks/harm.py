@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy
+from stresses import STRESSES
+
 from filtergym.agents.gate import GatedMaker, is_gateable
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.running.metrics import mean_cost
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
-from stresses import STRESSES
-
 from filtergym.names import GATED, find_competitor
 from filtergym.reports.tables.ranking import HARM
 

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy
 import xarray
+
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
-
 from filtergym.names import find_competitor
 
 NUMBERS = (100, 200, 1000, 5000)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy
 import xarray
+
 from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
@@ -20,9 +21,8 @@ from filtergym.evaluation.competitors.kinds import RandomPolicy
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import reduce_episodes
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
-from filtergym.papers.grid import markdown_table
-
 from filtergym.names import evaluation_requests
+from filtergym.papers.grid import markdown_table
 from filtergym.reports.tables.benchmark import affordable_episodes
 
 SIGNIFICANT = 3.0

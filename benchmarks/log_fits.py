@@ -19,6 +19,7 @@ import tempfile
 from pathlib import Path
 
 import numpy
+
 from filtergym.baselines.advice import FittedLog, fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of

@@ -15,11 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy
+
+import filtergym
 from filtergym.envs.data.recording import Recording
 from filtergym.envs.engine.scenario_choice import read_recording
 from filtergym.papers.grid import markdown_table
-
-import filtergym
 
 ID = "filtergym/ManeuveringTarget-v0"
 COMPETITORS = ("imm", "kalman-imm", "kalman-imm-turn", "adaptive-rearm", "sage-husa", "bptt", "kalman-net")

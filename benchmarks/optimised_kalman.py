@@ -26,9 +26,9 @@ import numpy
 import okf
 import public_problems as public
 import torch
-from filtergym.evaluation.storage.files import write_text
 
 import filtergym
+from filtergym.evaluation.storage.files import write_text
 
 SEEDS = 3
 """Training runs, unless the command says otherwise."""

@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
+
+from filtergym import read_recording
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.fitting import fit
 from filtergym.baselines.problem import problem_of
@@ -27,9 +30,6 @@ from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
-from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
-
-from filtergym import read_recording
 
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples" / "own_logs"
 LATE = 0.15

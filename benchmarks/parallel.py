@@ -105,10 +105,10 @@ def command_of(process: int) -> str:
 def killing(words: list[str]) -> None:
     """A cluster of two nodes; after some results a worker is killed, then a node with everything on it."""
     import ray
-    from filtergym.evaluation.running.parallel import Workers
-    from filtergym.evaluation.running.rollout import Progress
     from ray.cluster_utils import Cluster
 
+    from filtergym.evaluation.running.parallel import Workers
+    from filtergym.evaluation.running.rollout import Progress
     from filtergym.reports.tables.benchmark import BenchmarkOptions, Callbacks, run_benchmark
 
     options = BenchmarkOptions(environments=words or ["filtergym/ManeuveringTarget-v0"])

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy
-from filtergym.envs.engine.catalogue import catalogue
 
 import filtergym
+from filtergym.envs.engine.catalogue import catalogue
 
 
 class Parity(NamedTuple):

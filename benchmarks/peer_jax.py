@@ -11,6 +11,7 @@ from typing import Any
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import numpy
+
 from filtergym.compiler.functions import map_arrays
 from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.contract.observation import Array

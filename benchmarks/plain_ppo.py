@@ -18,12 +18,12 @@ from typing import Any
 
 import gymnasium
 import numpy
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.engine.catalogue import bare_name
 from rich.console import Console
 from rich.table import Table
 
 import filtergym
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.engine.catalogue import bare_name
 
 LONG = {"filtergym/TightlyCoupledNavigation-v0"}
 """Where a decision holds for ten measurements of three filters: fewer of them, and fewer episodes."""
@@ -64,6 +64,7 @@ def arguments() -> argparse.Namespace:
 def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
     """Train once and compare with the paper's algorithm and with the action zero."""
     import torch
+
     from filtergym.agents import to_sb3
     from filtergym.agents.sb3_training import ALGORITHMS
     from filtergym.agents.settings import parse_settings

@@ -9,12 +9,11 @@ beside them the ANEES, and the time of a measurement over that of ``bptt``.
 import argparse
 from pathlib import Path
 
+import filtergym
 from filtergym.agents.training_run import best_agent, load_run
 from filtergym.evaluation.running.metrics import mean_cost
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.papers.grid import markdown_table
-
-import filtergym
 
 OPPONENTS = ("bptt", "bptt-small", "kalman-net", "semi-markov-9", "semi-markov-15", "semi-markov")
 """Whom students are compared with: agents, banks of less time, and the strongest filter."""

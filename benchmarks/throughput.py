@@ -43,14 +43,14 @@ import gymnasium
 import numpy
 import pandas
 import peer_imm
+
+import filtergym
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.program import FUNCTIONS, Graph
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.reward import cost_reward
-
-import filtergym
 
 SIZES = (1, 16, 256, 4096, 65536)
 STEPS = 100

@@ -14,10 +14,10 @@ import sys
 from pathlib import Path
 
 import numpy
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.papers.grid import markdown_table
 
 import filtergym
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.papers.grid import markdown_table
 
 ENVIRONMENTS = ("ManeuveringTarget", "UavAutopilot", "RadarEsmTracking", "LooselyCoupledNavigation")
 BUDGETS = (100_000, 1_000_000, 10_000_000)

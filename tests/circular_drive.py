@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from filtergym.filters import geodesy
 from scipy.spatial.transform import Rotation
+
+from filtergym.filters import geodesy
 
 RATE = 40.0
 """Of the synthetic IMU, Hz."""

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from filtergym.envs.engine import compiled
-from filtergym.envs.engine.catalogue import catalogue
 from models import random_actions, short_episodes
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
+from filtergym.envs.engine import compiled
+from filtergym.envs.engine.catalogue import catalogue
 
 # The process that spreads the tests has imported readline, which tells its children how wide its terminal is.
 os.environ.pop("COLUMNS", None)

@@ -7,10 +7,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from filtergym.envs.contract.model import Model
-from filtergym.envs.engine.catalogue import task_class
 from gymnasium.utils.env_checker import check_env
 from models import make_model, random_actions, short_episodes
+
+from filtergym.envs.contract.model import Model
+from filtergym.envs.engine.catalogue import task_class
 
 NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 BACKENDS = [backend for backend, library in NEEDED.items() if importlib.util.find_spec(library)]

@@ -91,12 +91,12 @@ def write_whole_seeds(reader: str, place: Path) -> None:
     """Write honest files of another kind into a folder."""
     import made_results
     import test_inertial_logs as inertial
+
+    import filtergym
     from filtergym.baselines.catalogue import baselines_of
     from filtergym.baselines.fitted_filters import families_of
     from filtergym.baselines.problem import problem_of
     from filtergym.evaluation.running.parallel import Workers
-
-    import filtergym
     from filtergym.reports.tables.results import settings_of, write_results
     from filtergym.submission import Card, make_submission, write_submission
 
@@ -169,14 +169,14 @@ def stored(place: Path):
 def reading(reader: str, place: Path):
     """Return the path of a reader's files, and what reads one."""
     import test_inertial_logs as inertial
+
+    import filtergym
+    from filtergym import read_flights, read_recording
     from filtergym.agents.settings import read_config
     from filtergym.agents.training_run import load_run
     from filtergym.baselines.problem import problem_of
     from filtergym.baselines.tuned_values import table_path
     from filtergym.envs.loosely_coupled_navigation.inertial import inertial_recording
-
-    import filtergym
-    from filtergym import read_flights, read_recording
     from filtergym.names import find_competitor
     from filtergym.reports.tables.results import read_results
     from filtergym.submission import check_submission, read_submission, unpack
@@ -230,9 +230,8 @@ def check_result(result) -> None:
     """Raise AssertionError for a result that no reader may hand on: a recording whose replay is not finite, a
     competitor that answers in what is no number.
     """
-    from filtergym.envs.data.recording import Recording
-
     from filtergym import evaluate
+    from filtergym.envs.data.recording import Recording
 
     found = {}
     if isinstance(result, Recording):

@@ -2,12 +2,11 @@
 
 import re
 
+import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.storage.dataset import keywords_of
-
-import filtergym
 from filtergym.reports.tables.benchmark import result_of
 from filtergym.reports.tables.worst import find_worst
 

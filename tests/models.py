@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+
 from filtergym.baselines import catalogue as baselines
 from filtergym.envs.contract.filter import Filter, Input, Likelihood
 from filtergym.envs.contract.model import Model

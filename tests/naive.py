@@ -4,8 +4,9 @@ import math
 
 import gymnasium
 import numpy
-from filtergym.compiler.counter_numbers import numbers
 from scipy.stats import multivariate_normal
+
+from filtergym.compiler.counter_numbers import numbers
 
 
 def dense(rows, like):

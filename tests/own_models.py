@@ -2,11 +2,11 @@
 
 import gymnasium
 import numpy as np
+
+import filtergym
 from filtergym.baselines import catalogue as baselines
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.backend import make_model
-
-import filtergym
 
 
 def make_models(common):

@@ -15,6 +15,7 @@ import dataclasses
 import functools
 
 import numpy as np
+
 from filtergym.compiler.functions import map_arrays
 
 SAFETY = 32.0

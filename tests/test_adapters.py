@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.maneuvering_target.estimators import KalmanModel
-from filtergym.envs.contract.filter import Initial
-from filtergym.evaluation.running.rollout import rollout
-from filtergym.filters import kalman
 from models import make_model
 
 import filtergym
 from filtergym import adapters
 from filtergym.adapters import SingleTrackEstimator
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.maneuvering_target.estimators import KalmanModel
+from filtergym.envs.contract.filter import Initial
+from filtergym.evaluation.running.rollout import rollout
+from filtergym.filters import kalman
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"

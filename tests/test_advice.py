@@ -7,6 +7,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from models import Asked
+
+from filtergym import evaluate
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
 from filtergym.baselines.advice import FittedLog, advise, share_out
@@ -21,9 +24,6 @@ from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.competitors import likelihood as likelihood_module
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Estimate
-from models import Asked
-
-from filtergym import evaluate
 from filtergym.reports.tables.advice import PRICES, advice_lines, parameter_lines, price_table
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from models import Asked
+
+import filtergym
 from filtergym.baselines.advice import FittedLog, find_outliers, fit_all
 from filtergym.baselines.fitted_filters import read_artefact, write_advised
 from filtergym.baselines.fitting import OUTLIER_SHARE, WIDE, Fit, RobustEstimator
@@ -19,9 +22,6 @@ from filtergym.envs.contract.filter import Initial
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.envs.maneuvering_target.logs import scale_noise
 from filtergym.envs.maneuvering_target.world import Measurement
-from models import Asked
-
-import filtergym
 from filtergym.exports.c_source import FLAGS, export_c
 from filtergym.exports.request import request_export
 from filtergym.names import find_competitor, find_log_setup

@@ -5,13 +5,15 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
+
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 pytest.importorskip("stable_baselines3")
-from filtergym.agents import to_sb3
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from filtergym.agents import to_sb3
 
 ID = "filtergym/ManeuveringTarget-v0"
 

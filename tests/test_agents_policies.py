@@ -7,6 +7,9 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from models import make_model
+
+from filtergym import evaluate
 from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, load_policy, pretrained_path
 from filtergym.agents.residual import ResidualPolicy
@@ -16,9 +19,6 @@ from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.competitors.kinds import ConstantPolicy, FunctionPolicy, kind_of
 from filtergym.evaluation.running.rollout import run_competitor
-from models import make_model
-
-from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.problem import Problem, problem_of
 
 from filtergym import evaluate
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import Problem, problem_of
 from filtergym.names import competitor, tidy_records
 from filtergym.reports.tables import standing
 from filtergym.reports.tables.terminal_tables import with_interval
@@ -22,6 +22,9 @@ pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 import torch
+from models import make_model
+from sb3_contrib import RecurrentPPO
+
 from filtergym.agents import training_run, training_session, validation
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import Descent, NetworkPolicy, train_bptt
@@ -33,8 +36,6 @@ from filtergym.agents.sb3_training import train_sb3
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import RunOptions, load_run, new_run, resume_run
 from filtergym.agents.training_session import Session, Trainee
-from models import make_model
-from sb3_contrib import RecurrentPPO
 
 ID = "filtergym/ManeuveringTarget-v0"
 SMALL = {

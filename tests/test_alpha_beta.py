@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.filters import alpha_beta
 from filtergym.filters.alpha_beta import Covariance
 from filtergym.papers.imm_alpha_beta.alpha_beta_errors import (

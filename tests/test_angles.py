@@ -4,11 +4,11 @@ import warnings
 
 import numpy as np
 import pytest
-from filtergym.filters.angles import shorten, unwrap
 from own_models import make_models
 
 import filtergym
 from filtergym import Sensor
+from filtergym.filters.angles import shorten, unwrap
 
 UNITS = {"rad": 1.0, "deg": 180.0 / np.pi}
 

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+
 from filtergym.filters.array_namespace import lane_arrays, namespace, select_nested, stack_nested
 
 

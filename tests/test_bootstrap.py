@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import xarray
+from scipy import stats
+
 from filtergym.evaluation.running.metrics import sums_of_present
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, ratio
 from filtergym.evaluation.statistics.statistic import ALL, Statistic, reduce_run
-from scipy import stats
 
 
 @pytest.mark.parametrize("seed", range(3))

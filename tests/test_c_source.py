@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from filtergym.compiler import c_source
 from filtergym.compiler.c_source import helper_functions, write_lanes, write_program
 from filtergym.compiler.c_text import (

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+
+import filtergym
 from filtergym.baselines.problem import problem_of
+from filtergym.commands.terminal import fill
 from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.figures.worst_episodes import (
@@ -22,9 +25,6 @@ from filtergym.evaluation.statistics.cause_split import (
     phrases_of,
     reason_weight,
 )
-
-import filtergym
-from filtergym.commands.terminal import fill
 from filtergym.reports.tables.reasons import (
     explained_by_default,
     largest_reasons,
@@ -129,7 +129,6 @@ def test_opponents():
 def test_a_summary_splits_what_a_whole_evaluation_does(records):
     from filtergym.evaluation.running.parallel import Workers
     from filtergym.evaluation.running.summary import combine_summaries, summaries
-
     from filtergym.names import evaluation_requests
 
     problem = problem_of(ENV)

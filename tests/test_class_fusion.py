@@ -5,6 +5,7 @@ import math
 
 import numpy
 import pytest
+
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
 from filtergym.papers.radar_esm_class_fusion.experiment import (

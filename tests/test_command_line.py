@@ -11,16 +11,16 @@ from types import SimpleNamespace
 
 import commands
 import pytest
-from filtergym.baselines.problem import problem_of
-from filtergym.compiler import native
-from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.running import summary
 from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
+from filtergym.baselines.problem import problem_of
 from filtergym.commands import terminal
 from filtergym.commands.progress import ProgressLines
 from filtergym.commands.terminal import progress_bar
+from filtergym.compiler import native
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.running import summary
 from filtergym.names import is_learned
 from filtergym.reports.tables import benchmark
 from filtergym.reports.tables.results import read_results

@@ -3,14 +3,14 @@
 import gymnasium
 import numpy as np
 import pytest
+from models import KINDS, make_model
+
+from filtergym import evaluate
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import programs
 from filtergym.evaluation.competitors.kinds import DRAWN_AT_ONCE, RandomPolicy
-from models import KINDS, make_model
-
-from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"

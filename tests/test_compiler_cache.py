@@ -10,6 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
+
 from filtergym.compiler import cache, native
 from filtergym.compiler.functions import Function
 from filtergym.compiler.program import Graph

@@ -6,6 +6,7 @@ import platform
 import numpy as np
 import pytest
 from contract import assert_properties
+
 from filtergym.compiler import cache, native
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.library import BINARY, VARIANTS, fastest, portable

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+
 from filtergym.compiler import cache, functions, namespace, native
 from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.program import Graph

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from filtergym.compiler import cache, namespace
 from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.namespace import NotTraceable

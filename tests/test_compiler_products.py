@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.compiler import namespace
 from filtergym.compiler.c_source import write_lanes
 from filtergym.compiler.functions import Function, Specialised

@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from filtergym.compiler import cache, emission, functions, namespace, native
 from filtergym.compiler.block import block_for, block_of
 from filtergym.compiler.emission import emit
@@ -10,8 +13,6 @@ from filtergym.compiler.library import VARIANTS, portable
 from filtergym.compiler.native import OPTIMISED, Setting, quick_setting
 from filtergym.compiler.parts import cut_parts
 from filtergym.compiler.program import COMPARISONS, Graph
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 pytest.importorskip("llvmlite")
 

@@ -5,11 +5,11 @@ import subprocess
 import sys
 
 import pytest
+
+from filtergym.__main__ import main
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
-
-from filtergym.__main__ import main
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.envs.contract.controls import bank_probabilities
 
 LOG_PREDICTED = np.log([[0.2, 0.5], [0.8, 0.5]])

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from filtergym.filters import coordinated_turn, kalman
 from scipy.linalg import expm, expm_frechet
+
+from filtergym.filters import coordinated_turn, kalman
 
 T = 6.0
 RATES = np.array([0.0, 1e-300, -1e-12, 1e-7, -1e-3, 0.0166, -0.01668, 0.1, -0.3, 0.6, 3.0])

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from filtergym.compiler.counter_code import bind_numbers
 from filtergym.compiler.counter_numbers import (
     ARRAYS,

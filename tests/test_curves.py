@@ -7,15 +7,15 @@ import re
 import numpy as np
 import pytest
 import xarray
+from models import make_model
+from scipy.stats import chi2
+
+from filtergym import evaluate, record
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.named_axes import action_names
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.storage.dataset import windows_of
-from models import make_model
-from scipy.stats import chi2
-
-from filtergym import evaluate, record
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"

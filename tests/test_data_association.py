@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.filters import data_association
 from scipy.stats import multivariate_normal
 from test_kalman import positive_definite
+
+from filtergym.filters import data_association
 
 DETECTION, BATCH, PLOTS, STATES = 0.9, 5, 3, 4
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
+
+from filtergym import evaluate, online, read_recording
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.fitted_filters import families_of, read_artefact, write_advised
 from filtergym.baselines.maneuvering_target.anchored import regress_odometry
@@ -18,8 +20,6 @@ from filtergym.envs.data.recording import Recording, join_recordings
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.competitors.likelihood import Span, cut_windows
 from filtergym.filters import dead_reckoning
-
-from filtergym import evaluate, online, read_recording
 from filtergym.reports.tables.advice import advice_lines
 
 ID = "filtergym/ManeuveringTarget-v0"

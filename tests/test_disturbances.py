@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from models import make_model
+
 from filtergym.baselines.maneuvering_target.references import KnownTurn
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.draws import Draws
@@ -12,7 +14,6 @@ from filtergym.envs.contract.faults import Disturbance, Disturbances
 from filtergym.envs.maneuvering_target import world
 from filtergym.envs.maneuvering_target.disturbances import DISTURBANCES
 from filtergym.evaluation.competitors.filters import put_in_loop
-from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 

@@ -13,11 +13,12 @@ import command_line
 import pytest
 from contract import assert_properties
 from environment_page import TABLES, environment_table
+from models import make_model
+from records import FOLDER, read_record
+
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue, parameter_names
-from models import make_model
-from records import FOLDER, read_record
 
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")

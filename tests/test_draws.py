@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from filtergym.envs.contract.draws import Draws
 
 RUNS = 20000

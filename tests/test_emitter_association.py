@@ -5,14 +5,14 @@ import math
 
 import numpy
 import pytest
+from models import make_model
+
+from filtergym import evaluate
 from filtergym.baselines.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import class_fusion, emitter_association
-from models import make_model
-
-from filtergym import evaluate
 
 ID = "filtergym/RadarEsmTracking-v0"
 CONFUSION = numpy.array([[0.7, 0.2, 0.1], [0.1, 0.6, 0.3], [0.25, 0.15, 0.6]])

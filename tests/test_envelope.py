@@ -5,14 +5,14 @@ import shutil
 
 import numpy as np
 import pytest
+from models import make_model
+
+import filtergym
 from filtergym.agents.envelope import EnvelopeAlarm, TrainingRange, departure, training_range
 from filtergym.agents.learned_policy import load_policy, pretrained_path, write_envelope
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.rollout import start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
-from models import make_model
-
-import filtergym
 from filtergym.names import find_competitor
 
 TARGET = problem_of("filtergym/ManeuveringTarget-v0")

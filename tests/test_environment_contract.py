@@ -8,14 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from contract import Subject, assert_properties
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.contract.model import Episode
-from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.running.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 from models import KINDS, begin, make_model, next_row, random_actions, short_episodes
 
 from filtergym import evaluate, make_policy
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.contract.model import Episode
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.running.recording import NoFilter
 
 ALLOWED_WARNINGS = (
     "we recommend using a symmetric and normalized space",  # weights lie between 0 and 1

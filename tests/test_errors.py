@@ -3,13 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.interface.environment import TaskEnv
-from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from models import make_model
 
 import filtergym
 from filtergym import evaluate
+from filtergym.envs.engine.catalogue import task_class
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"

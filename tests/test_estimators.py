@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors.kinds import make_competitor
-from filtergym.evaluation.storage.dataset import notes_of
 from models import KINDS, make_model
 
 import filtergym
 from filtergym.__main__ import main
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors.kinds import make_competitor
+from filtergym.evaluation.storage.dataset import notes_of
 from filtergym.reports.tables.results import read_results
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -8,6 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray
+
+import filtergym
+from filtergym import evaluate, tidy_records
 from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
@@ -16,9 +19,6 @@ from filtergym.baselines.tuning import Candidate, Search, episode_costs, geometr
 from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import windows_of
-
-import filtergym
-from filtergym import evaluate, tidy_records
 
 ENV = "filtergym/ManeuveringTarget-v0"
 assert filtergym

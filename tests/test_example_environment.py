@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from contract import assert_equals_its_vector
 from environment_page import environment_table
-from filtergym.baselines.problem import problem_of
 from models import load_module, make_model
 
 import filtergym
+from filtergym.baselines.problem import problem_of
 
 FOLDER = Path(__file__).parent.parent / "docs" / "examples"
 ID = "mine/InvertedPendulum-v0"

@@ -6,14 +6,14 @@ import re
 
 import pytest
 import xarray
-from filtergym.evaluation.running.metrics import flight_records
-from filtergym.papers.grid import Grid
 from rich.table import Table
 from rich.text import Text
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
 from filtergym.commands import evaluation
+from filtergym.evaluation.running.metrics import flight_records
+from filtergym.papers.grid import Grid
 from filtergym.reports.tables.export import latex_table, latex_text, records_as_csv
 from filtergym.reports.tables.recording_tables import recording_tables
 from filtergym.reports.tables.terminal_tables import flights_table, results_tables

@@ -3,10 +3,10 @@ import types
 
 import numpy
 import pytest
+
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, pretrained_path
 from filtergym.baselines.problem import import_problem
 from filtergym.envs.engine.backend import make_model
-
 from filtergym.exports.onnx_network import export_onnx, network_graph
 from filtergym.exports.request import request_export
 

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+
+from filtergym import evaluate
 from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.compiler import c_source as compiler_source
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.banks import HypothesisBank
 from filtergym.evaluation.competitors.programs import Program
-from filtergym.filters import kalman
-
-from filtergym import evaluate
 from filtergym.exports import c_source
 from filtergym.exports.c_filter import file_stem
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
 from filtergym.exports.replay import mean_rows, replay, run_filter
 from filtergym.exports.request import ExportRequest
+from filtergym.filters import kalman
 from filtergym.names import find_competitor
 
 EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'

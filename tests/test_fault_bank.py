@@ -5,15 +5,15 @@ import math
 
 import numpy as np
 import pytest
+from models import act, assert_no_action_is_the_estimator, make_model, watch_hypotheses
+
+import filtergym  # noqa: F401  # registers the environments
 from filtergym.envs.contract.filter import Initial, Input
 from filtergym.envs.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.envs.loosely_coupled_navigation.fault_prior import FEW, TRAINING
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.filters.linear_systems import van_loan
 from filtergym.filters.loosely_coupled import error_model
-from models import act, assert_no_action_is_the_estimator, make_model, watch_hypotheses
-
-import filtergym  # noqa: F401  # registers the environments
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
 INTERVAL = 0.1

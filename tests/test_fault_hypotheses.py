@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 from models import act, assert_no_action_is_the_estimator, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
+from filtergym.envs.tightly_coupled_navigation.fault_hypotheses import FaultHypotheses
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
 ZERO = np.zeros(8)

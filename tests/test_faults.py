@@ -7,6 +7,7 @@ import pathlib
 from dataclasses import replace
 
 import pytest
+
 from filtergym.agents import training_session
 from filtergym.agents.training_run import RunOptions, best_agent, load_run, new_run, resume_run
 from filtergym.agents.training_session import Bookkeeping, Session, Trainee

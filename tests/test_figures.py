@@ -6,6 +6,15 @@ import re
 import numpy as np
 import pytest
 import xarray
+from front import draw_fronts, panels_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from pictures import draw_learning_curves
+from records import read_benchmark, recorded_environments
+
+from filtergym import evaluate
 from filtergym.evaluation.figures.curve_figures import (
     draw_error_over_time,
     draw_mode_probabilities,
@@ -25,15 +34,6 @@ from filtergym.evaluation.figures.looks import (
 from filtergym.evaluation.figures.print_layout import WIDTHS, logarithmic, save, sensible_limits
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.times import Point, ProcessorTime
-from front import draw_fronts, panels_of
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
-from pictures import draw_learning_curves
-from records import read_benchmark, recorded_environments
-
-from filtergym import evaluate
 
 ENV, UAV = "filtergym/ManeuveringTarget-v0", "filtergym/UavAutopilot-v0"
 NAMES = [

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pandas
 import pytest
+
+from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.file_estimates import FileEstimates
 from filtergym.evaluation.storage.blind import write_blind
 from filtergym.evaluation.storage.dataset import NO_ROW, notes_of
 from filtergym.evaluation.storage.estimates import write_estimates
-
-from filtergym import evaluate, read_recording, record, tidy_records
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SETTINGS = {"scenario": "irregular-scans", "episodes": 6, "horizon": 20, "detection_probability": (0.8, 0.8)}

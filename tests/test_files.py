@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from filtergym.evaluation.storage.files import (
     claim_folder,
     whole_file,

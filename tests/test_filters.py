@@ -4,16 +4,16 @@ import math
 
 import numpy as np
 import pytest
+from models import make_model
+from scipy.stats import multivariate_normal
+
+import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.filter import Likelihood
 from filtergym.evaluation.competitors.filters import find_fault, is_lacking, put_in_loop
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import packed_covariance
-from models import make_model
-from scipy.stats import multivariate_normal
-
-import filtergym
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SHORT = {"filtergym/TightlyCoupledNavigation-v0": {"horizon": 20}}

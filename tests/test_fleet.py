@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from contract import BACKENDS, continued
+
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import find_mixture
 from filtergym.envs.interface.fleet import Course

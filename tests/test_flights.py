@@ -13,17 +13,17 @@ import numpy as np
 import pymap3d
 import pytest
 import xarray
+from gymnasium.vector import AutoresetMode
+from models import make_model
+
+from filtergym import Flights, Trajectory, evaluate, tidy_records
+from filtergym.__main__ import main
 from filtergym.envs.data import flight_tables
 from filtergym.envs.data.flight_cleaning import fit_parabolas
 from filtergym.envs.data.flights import read_flights
 from filtergym.evaluation.running.metrics import flight_records
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.filters.geodesy import east_north
-from gymnasium.vector import AutoresetMode
-from models import make_model
-
-from filtergym import Flights, Trajectory, evaluate, tidy_records
-from filtergym.__main__ import main
 
 ID = "filtergym/ManeuveringTarget-v0"
 DOCS = Path(__file__).parent.parent / "docs"

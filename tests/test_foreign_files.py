@@ -9,6 +9,8 @@ import warnings
 
 import numpy as np
 import pytest
+
+from filtergym import read_flights, read_recording
 from filtergym.agents.learned_policy import PRETRAINED, load_policy
 from filtergym.agents.settings import read_config
 from filtergym.baselines.fitted_filters import read_artefact
@@ -22,8 +24,6 @@ from filtergym.envs.data.foreign_files import (
     read_yaml,
 )
 from filtergym.evaluation.storage.stored import read_json
-
-from filtergym import read_flights, read_recording
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 ROWS = [{"time": 2.0 * i, "x": 2e4 + 200.0 * i, "y": 1e4 - 100.0 * i} for i in range(60)]

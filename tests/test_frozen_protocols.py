@@ -8,12 +8,12 @@ import sys
 
 import numpy as np
 import pytest
-from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.running.parallel import Workers
 
 import filtergym
 from filtergym import protocol as protocols
 from filtergym.commands.protocol import quoted_row
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.running.parallel import Workers
 from filtergym.protocol import find_entries, read_protocol, run_protocol
 
 FROZEN = {"filtergym-1": "25cfbd9dcaba4cbfdd3bedcbdcc51c265bb44cdd69a0f12273d6693c147446ff"}

@@ -7,12 +7,12 @@ import warnings
 import commands
 import numpy as np
 import pytest
-from filtergym.agents.learned_policy import PRETRAINED
-from filtergym.baselines.catalogue import baselines_of
 from made_results import results_of
 from scipy.io import netcdf_file
 
 from filtergym.__main__ import main
+from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.reports.tables.results import settings_of, write_results
 
 ID = "filtergym/ManeuveringTarget-v0"

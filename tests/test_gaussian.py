@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.filters import gaussian, small_matrices
 from scipy.stats import multivariate_normal
+
+from filtergym.filters import gaussian, small_matrices
 
 
 def positive_definite(rng, n, batch):

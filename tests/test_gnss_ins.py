@@ -6,8 +6,9 @@ import math
 import numpy
 import pytest
 import scipy.optimize
-from filtergym.filters import extended_kalman, geodesy, gnss_ins, satellites, singer
 from naive import dense
+
+from filtergym.filters import extended_kalman, geodesy, gnss_ins, satellites, singer
 
 SITE = (math.radians(53.9), math.radians(27.5667), 220.0)
 SLOTS = (1, 11, 19, 20)

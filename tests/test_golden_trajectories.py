@@ -17,9 +17,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.engine.catalogue import catalogue
 from models import make_model
 from rounding import REPETITIONS, assert_near, move_roundings, moved_parameters, tolerance
+
+from filtergym.envs.engine.catalogue import catalogue
 
 FOLDER = Path(__file__).parent / "golden"
 SEED = 7

@@ -4,6 +4,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import backend
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
@@ -13,6 +14,8 @@ pytest.importorskip("llvmlite")
 pytest.importorskip("stable_baselines3")
 import array_api_compat.torch as torch_namespace
 import torch
+from rounding import assert_same, move_roundings
+
 from filtergym.agents import bptt
 from filtergym.agents.bptt import NetworkPolicy, descend_episodes, train_bptt
 from filtergym.agents.training_run import RunOptions, new_run
@@ -22,7 +25,6 @@ from filtergym.compiler import namespace
 from filtergym.compiler.functions import Function
 from filtergym.compiler.gradients import FLAT, RULES, pullback
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph
-from rounding import assert_same, move_roundings
 
 UNARY = ("negative", "abs", "sign", "floor", "ceil", "trunc", "round", "sqrt", "exp", "expm1", "exp2", "log")
 UNARY += ("log1p", "log2", "log10", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.filters import imm, kalman
 
 SEEDS = range(5)

@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
+
+from filtergym import evaluate, read_recording
 from filtergym.envs.data import strapdown
 from filtergym.envs.data.recording import Recording
 from filtergym.envs.loosely_coupled_navigation.inertial import (
@@ -18,8 +20,6 @@ from filtergym.envs.loosely_coupled_navigation.inertial import (
     regular_times,
 )
 from filtergym.filters import geodesy
-
-from filtergym import evaluate, read_recording
 
 RATE_BIAS, FORCE_BIAS = (0.004, -0.003, 0.002), (0.05, -0.03, 0.04)
 """Of the simulated IMU, rad/s and m/s^2: left alone they make 50 m of 20 s."""

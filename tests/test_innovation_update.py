@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from filtergym.filters import innovation_update
 from scipy.stats import multivariate_normal
 from test_kalman import positive_definite
+
+from filtergym.filters import innovation_update
 
 N, M, BATCH = 4, 3, 6
 

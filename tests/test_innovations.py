@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import scipy
 import xarray
-from filtergym.evaluation.statistics.predictions import Predictions
 
 from filtergym import evaluate, record, tidy_records
+from filtergym.evaluation.statistics.predictions import Predictions
 
 CASES = {
     "filtergym/ManeuveringTarget-v0": ("imm", "missed-detections", ["position"], ["m"]),

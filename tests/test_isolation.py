@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from models import make_model
+
+import filtergym
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors import isolation
 from filtergym.evaluation.competitors.isolated_estimator import landlock_version
 from filtergym.evaluation.competitors.isolation import isolate_source
 from filtergym.evaluation.competitors.program_process import ENDED
 from filtergym.evaluation.running.rollout import rollout, start_lanes
-from models import make_model
-
-import filtergym
 from filtergym.names import competitor, isolate_names
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from filtergym.filters import kalman
 from scipy.stats import multivariate_normal
+
+from filtergym.filters import kalman
 
 
 def positive_definite(rng, n, batch):

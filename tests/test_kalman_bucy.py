@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_lyapunov
+
 from filtergym.filters import linear_systems
 from filtergym.papers.kalman_bucy_ins_gnss import kalman_bucy
-from scipy.linalg import solve_continuous_lyapunov
 
 SEEDS = range(2)
 AUGMENTED = (

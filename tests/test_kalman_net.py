@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 import scipy.stats
+from models import Asked, make_model
+
+import filtergym
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, write_arrays
 from filtergym.baselines.problem import problem_of
@@ -15,9 +18,6 @@ from filtergym.envs.tightly_coupled_navigation import kalman_net as satellites
 from filtergym.envs.uav_autopilot import kalman_net as aircraft
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.filters import coordinated_turn, gnss_ins, loosely_coupled, packed_covariance
-from models import Asked, make_model
-
-import filtergym
 
 RADAR, FUSION = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 AIRCRAFT, ESM = "filtergym/UavAutopilot-v0", "filtergym/RadarEsmTracking-v0"

@@ -6,6 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from contract import BACKENDS, Subject, assert_properties
+from models import KINDS, make_model
+
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import episode_noise
@@ -13,7 +15,6 @@ from filtergym.envs.engine.compiled import share_world
 from filtergym.envs.engine.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import OWN_PAY, reference
-from models import KINDS, make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.uav_autopilot.level_bank import LevelBank, grid
-from filtergym.filters import noise_levels, packed_covariance
 from models import act, assert_no_action_is_the_estimator, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
+from filtergym.envs.uav_autopilot.level_bank import LevelBank, grid
+from filtergym.filters import noise_levels, packed_covariance
 
 ID = "filtergym/UavAutopilot-v0"
 

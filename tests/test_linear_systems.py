@@ -2,8 +2,9 @@ import math
 
 import numpy
 import pytest
-from filtergym.filters import gusts, linear_systems
 from scipy.linalg import solve_continuous_lyapunov
+
+from filtergym.filters import gusts, linear_systems
 
 SEEDS = range(2)
 

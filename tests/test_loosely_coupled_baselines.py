@@ -4,6 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from models import make_model
+
+import filtergym  # noqa: F401  # registers the environments
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedEstimator
 from filtergym.baselines.loosely_coupled_navigation.metrics import (
@@ -16,13 +20,9 @@ from filtergym.baselines.loosely_coupled_navigation.metrics import (
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.filters import loosely_coupled
 from filtergym.filters.linear_systems import van_loan
-from filtergym.papers.kalman_bucy_ins_gnss import experiment, kalman_bucy
-from models import make_model
-
-import filtergym  # noqa: F401  # registers the environments
-from filtergym import evaluate, tidy_records
 from filtergym.names import competitor
 from filtergym.papers import kalman_bucy_ins_gnss as paper
+from filtergym.papers.kalman_bucy_ins_gnss import experiment, kalman_bucy
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
 KNOWN = baselines_of(ID)

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from models import make_model
+
 from filtergym.baselines.loosely_coupled_navigation.policies import FixedGain
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.model import Model
@@ -11,7 +13,6 @@ from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledN
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.filters import linear_systems, loosely_coupled
 from filtergym.papers.kalman_bucy_ins_gnss import kalman_bucy
-from models import make_model
 
 MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])
 START = np.diag([0.0, 0.36, 0.16])

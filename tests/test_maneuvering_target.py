@@ -5,15 +5,15 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
-from filtergym.envs.data.trajectory import Trajectory
-from filtergym.filters import alpha_beta, imm
-from filtergym.filters.gaussian import log_density
 from models import begin, make_model
 from naive import BEARING_SIGMA, RANGE_SIGMA, T, episode_numbers, naive_bank, variances
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
+from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
+from filtergym.envs.data.trajectory import Trajectory
+from filtergym.filters import alpha_beta, imm
+from filtergym.filters.gaussian import log_density
 
 ID = "filtergym/ManeuveringTarget-v0"
 REGULAR = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0), "coloured_sigma": (0.0, 0.0)}

@@ -6,6 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from models import begin, make_model, next_row, watch_estimator
+from naive import transition
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
+
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.adaptive_estimators import (
     SageHusa,
@@ -24,12 +30,6 @@ from filtergym.baselines.tuning import Candidate, episode_costs
 from filtergym.envs.maneuvering_target.semi_markov import TRAINING
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
-from models import begin, make_model, next_row, watch_estimator
-from naive import transition
-from scipy.linalg import block_diag
-from scipy.stats import multivariate_normal
-
-from filtergym import evaluate, tidy_records
 
 ID = "filtergym/ManeuveringTarget-v0"
 T, LANES = 6.0, 8

@@ -5,12 +5,13 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from models import make_model
+from naive import RANGE_SIGMA, T, episode_numbers, naive_bank, transition, variances
+
 from filtergym.baselines.maneuvering_target.policies import AdaptiveGain, InteractingMultipleModel
 from filtergym.baselines.maneuvering_target.references import KnownInputBound
 from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
-from models import make_model
-from naive import RANGE_SIGMA, T, episode_numbers, naive_bank, transition, variances
 
 ID = "filtergym/ManeuveringTarget-v0"
 CONTROLS = ("evidence", "gains", "gain", "mode", "weights")

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+
+from filtergym import evaluate
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.kinds import Policy, kind_of
@@ -10,8 +12,6 @@ from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.kept import Kept, limits
 from filtergym.evaluation.running.rollout import rollout, run_episodes
 from filtergym.evaluation.running.seeds import episode_seeds
-
-from filtergym import evaluate
 
 pytest.importorskip("llvmlite")
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.filters import noise_adaptation as adaptation
 
 STEPS, BATCH = 60, 3

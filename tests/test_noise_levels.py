@@ -4,6 +4,7 @@ import math
 
 import numpy
 import pytest
+
 from filtergym.filters import imm, noise_levels, packed_covariance
 from filtergym.filters.noise_levels import Hypotheses, SensorNoise
 

@@ -4,15 +4,15 @@ import re
 
 import numpy as np
 import pytest
+from models import make_model
+
+from filtergym import evaluate, record
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.storage.dataset import notes_of
-from models import make_model
-
-from filtergym import evaluate, record
 
 RADAR = "filtergym/ManeuveringTarget-v0"
 UNRELIABLE = {  # scenario, horizon, and what may not be received

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from models import begin, make_model, next_row
+
 from filtergym.envs.contract.observation import (
     BOUNDED_LOG,
     KEPT_AS_LOG1P,
@@ -15,7 +17,6 @@ from filtergym.envs.contract.observation import (
     Quantity,
     linear_scale,
 )
-from models import begin, make_model, next_row
 
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),

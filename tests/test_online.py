@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+import filtergym
 from filtergym.envs.contract.live_input import LiveInput
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
@@ -15,8 +17,6 @@ from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.competitors.online_state import History
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
-
-import filtergym
 from filtergym.names import find_competitor, import_problem
 
 RADAR, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from filtergym.filters.ordered_sums import ordered_sum, weighted_sum
 
 M, N = 9, 67  # NumPy's own sum groups its terms from eight on

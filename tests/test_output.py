@@ -7,11 +7,11 @@ import shutil
 
 import commands
 import pytest
-from filtergym.agents.learned_policy import PRETRAINED
-from filtergym.baselines.problem import problem_of
 
 from filtergym import evaluate
 from filtergym.__main__ import main
+from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.baselines.problem import problem_of
 from filtergym.commands.terminal import console
 from filtergym.reports.tables import benchmark
 

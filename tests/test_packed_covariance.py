@@ -2,6 +2,7 @@ from typing import Any
 
 import numpy
 import pytest
+
 from filtergym.filters import kalman, packed_covariance
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 from contract import assert_properties
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import catalogue
 
 from filtergym.__main__ import application
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.catalogue import catalogue
 from filtergym.names import find_competitor
 
 ROOT = Path(__file__).parent.parent

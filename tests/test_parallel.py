@@ -17,6 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from models import KINDS
+
+import filtergym
+from filtergym import evaluate, tidy_records
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
@@ -31,10 +35,6 @@ from filtergym.evaluation.running.parallel import Workers
 from filtergym.evaluation.running.summary import Summary, combine_summaries, summaries
 from filtergym.evaluation.storage import code
 from filtergym.evaluation.storage.store import Store
-from models import KINDS
-
-import filtergym
-from filtergym import evaluate, tidy_records
 from filtergym.names import evaluation_requests
 from filtergym.reports.tables import benchmark, work
 

@@ -11,13 +11,14 @@ import warnings
 
 import numpy as np
 import pytest
+from models import make_model
+
 from filtergym.envs.contract.parameters import field_limits
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.lanes import Lanes
 from filtergym.envs.engine.reward import REWARDS, reference
 from filtergym.envs.engine.scenario_choice import find_scenario
 from filtergym.envs.interface.step_report import step_report
-from models import make_model
 
 ENDLESS = {float: (-1e6, -1e-6, 1e-6, 1e6), int: (1, 2, 300)}
 """Where a limit leaves a number open: extreme, and still sensible in some unit."""

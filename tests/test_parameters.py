@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+
 from filtergym.envs.contract.parameters import TaskParameters, check_length, parameter, square_matrix
 
 

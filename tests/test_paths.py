@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.agents.learned_policy import pretrained_path
-from filtergym.agents.named_policies import pretrained_agents
 
 from filtergym import evaluate, make_policy, read_flights, read_recording, record
+from filtergym.agents.learned_policy import pretrained_path
+from filtergym.agents.named_policies import pretrained_agents
 
 ENV = "filtergym/ManeuveringTarget-v0"
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.envs.data.plausibility import check_extents
-from filtergym.envs.engine.catalogue import catalogue
-from filtergym.evaluation.storage.dataset import notes_of
 from test_recording import table
 
 from filtergym import evaluate, read_recording, record
+from filtergym.envs.data.plausibility import check_extents
+from filtergym.envs.engine.catalogue import catalogue
+from filtergym.evaluation.storage.dataset import notes_of
 from filtergym.reports.tables.advice import reading_lines
 
 TARGET, LOOSE, ESM = (

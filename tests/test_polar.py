@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from filtergym.filters import polar
 
 SIGMAS = 100.0, math.radians(0.25)

@@ -6,13 +6,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from models import KINDS, make_model
+
+from filtergym import evaluate, make_policy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.world import World
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.interface.privileged import context_shapes
-from models import KINDS, make_model
-
-from filtergym import evaluate, make_policy
 
 ID = "filtergym/ManeuveringTarget-v0"
 LOOSE = "filtergym/LooselyCoupledNavigation-v0"

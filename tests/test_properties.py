@@ -4,11 +4,12 @@ The profile in ``conftest.py`` draws the same examples in every run.
 """
 
 import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from filtergym.envs.data.trajectory import Trajectory
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 # --- modes of no probability
 

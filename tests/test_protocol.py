@@ -10,17 +10,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from contract import BACKENDS, Subject, assert_properties, continued
-from filtergym.envs.data.trajectory import Trajectory
-from filtergym.envs.drawing import rendering
-from filtergym.envs.engine.lanes import ModelStepper
-from filtergym.envs.interface.environment import TaskEnv
-from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeAwareObservation, TimeLimit
 from models import KINDS
 
 import filtergym  # noqa: F401  (registers the environments)
+from filtergym.envs.data.trajectory import Trajectory
+from filtergym.envs.drawing import rendering
+from filtergym.envs.engine.lanes import ModelStepper
+from filtergym.envs.interface.environment import TaskEnv
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 ID = "filtergym/ManeuveringTarget-v0"
 make_three = functools.partial(gym.make_vec, num_envs=3)

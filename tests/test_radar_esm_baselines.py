@@ -4,19 +4,19 @@ import math
 
 import numpy
 import pytest
+from models import make_model
+
+import filtergym  # noqa: F401  # registers the environments
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.evaluation.running.rollout import start_lanes
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
+from filtergym.papers import radar_esm_class_fusion as reproduction
 from filtergym.papers.quantities import Quantity
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
-from models import make_model
-
-import filtergym  # noqa: F401  # registers the environments
-from filtergym import evaluate, tidy_records
-from filtergym.papers import radar_esm_class_fusion as reproduction
 
 ID = "filtergym/RadarEsmTracking-v0"
 WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy
 import pytest
+
 from filtergym.envs.contract.causes import Moment
 from filtergym.envs.contract.model import Model
 from filtergym.envs.radar_esm_tracking.causes import causes_of

@@ -4,9 +4,10 @@ import math
 
 import numpy
 import pytest
+from scipy.stats import norm
+
 from filtergym.filters import gnss_ins, range_errors
 from filtergym.filters.extended_kalman import JacobianRow
-from scipy.stats import norm
 
 S, SIZE = 4, gnss_ins.SIZE + 4
 

@@ -5,11 +5,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from filtergym.envs.engine.catalogue import catalogue
 from readme import with_printed
 from records import read_record
 
 import filtergym
+from filtergym.envs.engine.catalogue import catalogue
 
 README = Path(__file__).parent.parent / "README.md"
 INDEX_PAGE = README.parent / "docs" / "package_index.md"

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from contract import assert_properties
+
 from filtergym.filters import loosely_coupled, receiver_faults
 from filtergym.filters.linear_systems import van_loan
 from filtergym.filters.receiver_faults import matrix

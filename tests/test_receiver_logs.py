@@ -7,9 +7,9 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
-from filtergym.filters import geodesy
 
 from filtergym import read_recording
+from filtergym.filters import geodesy
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 COUNT = 40

@@ -4,9 +4,9 @@ costs more than the paper's algorithm, in every environment.
 
 import numpy as np
 import pytest
-from filtergym.baselines.catalogue import baselines_of
 
 from filtergym import evaluate
+from filtergym.baselines.catalogue import baselines_of
 
 TRAINING_EPISODES, EPISODES = 200, 64
 ROUNDS = 1

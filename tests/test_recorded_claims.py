@@ -1,10 +1,11 @@
 """What the pages say of results, read from the records of the benchmark that the pages show."""
 
 import pytest
+from records import read_record
+
 from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
-from records import read_record
 
 pytestmark = pytest.mark.claims
 COMPETE = ("policy", "estimator")

@@ -10,10 +10,6 @@ import front
 import pytest
 from comparison import compared_policies
 from contract import assert_properties
-from filtergym.agents.named_policies import pretrained_agents
-from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.competitors.kinds import RANKED
-from filtergym.evaluation.running.metrics import Record
 from front import panels_of
 from made_results import results_of
 from readme import with_numbers
@@ -31,6 +27,10 @@ from records import (
 from results_table import chosen_markdown, results_markdown
 from sentence_numbers import number_text, record_of
 
+from filtergym.agents.named_policies import pretrained_agents
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.competitors.kinds import RANKED
+from filtergym.evaluation.running.metrics import Record
 from filtergym.reports.tables.ranking import who_is_best
 from filtergym.reports.tables.results import settings_of, write_results
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import gymnasium
 import numpy as np
 import pytest
+
+import filtergym
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import import_problem
 from filtergym.baselines.table import Baselines
@@ -18,8 +20,6 @@ from filtergym.envs.engine.catalogue import catalogue, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
 from filtergym.evaluation.competitors.kinds import ConstantPolicy
 from filtergym.evaluation.running.parallel import Workers
-
-import filtergym
 from filtergym.reports.pages.outcome import outcome_sentences
 from filtergym.reports.tables.results import read_results
 

@@ -7,14 +7,14 @@ import sys
 import gymnasium
 import numpy
 import pytest
+
+from filtergym import evaluate
 from filtergym.envs.drawing import estimate_picture, rendering
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.envs.maneuvering_target.picture import ellipse_axes
 from filtergym.evaluation.figures.animation import episode_frames, write_animation
-
-from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"

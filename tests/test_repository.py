@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+
 from filtergym.envs.engine.catalogue import catalogue
 
 yaml = pytest.importorskip("yaml")

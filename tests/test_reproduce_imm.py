@@ -5,6 +5,10 @@ from typing import Any
 
 import numpy
 import pytest
+from models import make_model
+
+from filtergym import evaluate
+from filtergym.papers import imm_alpha_beta as paper
 from filtergym.papers.imm_alpha_beta import claims, experiment, figures
 from filtergym.papers.imm_alpha_beta.experiment import record_measurements
 from filtergym.papers.imm_alpha_beta.gain_schedules import (
@@ -20,10 +24,6 @@ from filtergym.papers.imm_alpha_beta.imm_readings import (
 )
 from filtergym.papers.quantities import Quantity
 from filtergym.papers.reproduction import judge_claims
-from models import make_model
-
-from filtergym import evaluate
-from filtergym.papers import imm_alpha_beta as paper
 
 ID = "filtergym/ManeuveringTarget-v0"
 

@@ -6,6 +6,9 @@ import re
 
 import numpy as np
 import pytest
+from test_c_source import SPECIAL, compiled, random_program
+from test_exports_c import replayed
+
 from filtergym.compiler import cache, emission, namespace, native, rolling
 from filtergym.compiler.block import block_of
 from filtergym.compiler.c_loops import Arrays, Rows
@@ -17,9 +20,6 @@ from filtergym.compiler.library import portable
 from filtergym.compiler.namespace import Traced
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, Result, program
 from filtergym.compiler.rolling import CONSTANTS, SCRATCH, TURN, roll
-from test_c_source import SPECIAL, compiled, random_program
-from test_exports_c import replayed
-
 from filtergym.exports.traced_filter import ANSWER, MEASUREMENT, STATE
 
 QUICK = [

@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from models import make_model
+
+from filtergym import evaluate, record, tidy_records
+from filtergym.__main__ import main
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import (
@@ -19,10 +23,6 @@ from filtergym.evaluation.storage.dataset import (
     seed_of,
     windows_of,
 )
-from models import make_model
-
-from filtergym import evaluate, record, tidy_records
-from filtergym.__main__ import main
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 CASES = {

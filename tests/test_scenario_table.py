@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.table import Variant
 from filtergym.envs.engine.catalogue import catalogue

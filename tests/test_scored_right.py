@@ -8,9 +8,9 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.agents.learned_policy import PRETRAINED
 
 from filtergym import evaluate, make_policy
+from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.names import competitor
 
 DOCS = Path(__file__).parent.parent / "docs"

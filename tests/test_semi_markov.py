@@ -4,13 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from filtergym.envs.maneuvering_target.semi_markov import (
-    SLOWEST,
-    VAGUE,
-    SemiMarkov,
-    training_prior,
-)
-from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
 from models import (
     LANES,
     Asked,
@@ -23,6 +16,13 @@ from models import (
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
+from filtergym.envs.maneuvering_target.semi_markov import (
+    SLOWEST,
+    VAGUE,
+    SemiMarkov,
+    training_prior,
+)
+from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
 
 ID = "filtergym/ManeuveringTarget-v0"
 T = 6.0

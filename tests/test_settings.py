@@ -10,10 +10,10 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import task_class
 
 from filtergym import evaluate
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.catalogue import task_class
 
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")

@@ -4,9 +4,10 @@ import math
 
 import numpy
 import pytest
-from filtergym.filters import singer
 from scipy.integrate import quad
 from scipy.linalg import expm
+
+from filtergym.filters import singer
 
 
 def van_loan(alpha, sigma, T):

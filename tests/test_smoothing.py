@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+
 from filtergym.filters import gaussian, imm, kalman, smoothing
 
 H = np.array([[1.0, 0.0]])

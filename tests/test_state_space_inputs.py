@@ -5,12 +5,12 @@ import shutil
 import numpy as np
 import pytest
 import scipy
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.linear.state_space import Measurement
 from own_models import make_models, simulate
 
 import filtergym
 from filtergym import Input, read_recording
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.linear.state_space import Measurement
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import scipy
-from filtergym.baselines.state_space import Extended, InteractingKalman, Unscented
-from filtergym.envs.contract.filter import Input
-from filtergym.envs.engine.backend import make_model
 from own_models import make_models, simulate
 
 import filtergym
 from filtergym import Sensor
+from filtergym.baselines.state_space import Extended, InteractingKalman, Unscented
+from filtergym.envs.contract.filter import Input
+from filtergym.envs.engine.backend import make_model
 
 Q = np.diag([0.1, 0.2])
 R = {"gps": 4.0, "odometry": 0.25}

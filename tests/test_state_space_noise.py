@@ -6,14 +6,14 @@ import subprocess
 
 import numpy as np
 import pytest
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.backend import make_model
-from filtergym.envs.engine.registration import USER_TASKS
-from filtergym.evaluation.running.times import Point, ProcessorTime, front
 from own_models import make_models, simulate
 
 import filtergym
 from filtergym import Input, Sensor, read_recording
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.backend import make_model
+from filtergym.envs.engine.registration import USER_TASKS
+from filtergym.evaluation.running.times import Point, ProcessorTime, front
 from filtergym.exports.c_source import FLAGS, export_c
 from filtergym.exports.request import request_export
 

@@ -4,6 +4,10 @@ import re
 
 import numpy as np
 import pytest
+from own_models import make_models, simulate
+
+import filtergym
+from filtergym import Sensor, read_recording
 from filtergym.baselines.advice import FittedLog, fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
@@ -13,10 +17,6 @@ from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.envs.linear.state_space import Measurement
 from filtergym.evaluation.statistics.innovations import with_innovations
-from own_models import make_models, simulate
-
-import filtergym
-from filtergym import Sensor, read_recording
 from filtergym.reports.tables.advice import parameter_lines
 
 Q = np.diag([0.1, 0.2, 0.01])

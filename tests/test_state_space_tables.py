@@ -7,15 +7,15 @@ import gymnasium
 import numpy as np
 import pandas
 import pytest
+
+import filtergym
+from filtergym import read_recording, record
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.statistics.innovations import with_innovations
-
-import filtergym
-from filtergym import read_recording, record
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+
+from filtergym import evaluate
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.settings import ESTIMATORS
 from filtergym.compiler import namespace
@@ -11,8 +13,6 @@ from filtergym.evaluation.competitors.kinds import make_competitor
 from filtergym.evaluation.competitors.steered_filter import steer, trace_policy
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
-
-from filtergym import evaluate
 from filtergym.names import find_competitor, import_problem
 
 pytest.importorskip("llvmlite")

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import xarray
+
 from filtergym.evaluation.storage import store as module
 from filtergym.evaluation.storage.store import Store, Work
 

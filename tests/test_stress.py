@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from own_models import forget
+
+from filtergym import state_space
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.functions import map_arrays
 from filtergym.evaluation.stress.alterations import ALTERATIONS, EVERY, SETTLED
 from filtergym.evaluation.stress.crash_test import CrashTest
-from own_models import forget
-
-from filtergym import state_space
 
 SHORT = [one for one in ALTERATIONS if one.length <= 260]
 UNALTERED = ALTERATIONS[0]

@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from models import Asked, make_model
+from test_kalman_net import AIRCRAFT, RADAR, episodes, network
+
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
@@ -12,8 +15,6 @@ from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine import reward
 from filtergym.envs.maneuvering_target.kalman_net import LEAST_SPEED, STANDING
 from filtergym.envs.maneuvering_target.student import ACCELERATION_REACH
-from models import Asked, make_model
-from test_kalman_net import AIRCRAFT, RADAR, episodes, network
 
 NAME = "student"
 

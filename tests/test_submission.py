@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+import filtergym
+from filtergym import submission as submissions
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors import isolated_estimator
 from filtergym.evaluation.running import evaluate as evaluations
 from filtergym.evaluation.running.parallel import Workers
-
-import filtergym
-from filtergym import submission as submissions
 from filtergym.protocol import read_protocol
 from filtergym.submission import (
     MOST_BYTES,

@@ -6,6 +6,10 @@ import numpy
 import pytest
 import scipy.linalg
 import scipy.stats
+from models import make_model
+from naive import dense
+
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tuning import Search, tune
@@ -18,13 +22,9 @@ from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.filters import gnss_ins
+from filtergym.papers import multi_hypothesis_ins_gnss as paper
 from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
 from filtergym.papers.quantities import Quantity
-from models import make_model
-from naive import dense
-
-from filtergym import evaluate, tidy_records
-from filtergym.papers import multi_hypothesis_ins_gnss as paper
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
 

@@ -4,6 +4,8 @@ import math
 
 import numpy
 import pytest
+from naive import dense
+
 from filtergym.envs.contract.faults import Step
 from filtergym.envs.contract.model import Model
 from filtergym.envs.tightly_coupled_navigation.disturbances import Reception, Reflections
@@ -14,7 +16,6 @@ from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
 from filtergym.envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from filtergym.filters import gnss_ins
 from filtergym.filters.packed_covariance import unpack
-from naive import dense
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
 

@@ -6,11 +6,12 @@ import sys
 import gymnasium
 import numpy
 import pytest
+from models import KINDS, make_model, short_episodes
+from rounding import assert_same, flown_side_by_side
+
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.envs.engine.reward import charge
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
-from models import KINDS, make_model, short_episodes
-from rounding import assert_same, flown_side_by_side
 
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")

@@ -3,9 +3,9 @@
 import numpy as np
 import pandas
 import pytest
-from filtergym.envs.data.truth_files import LONGEST_GAP, offset_note
 
 from filtergym import read_recording
+from filtergym.envs.data.truth_files import LONGEST_GAP, offset_note
 
 ID = "filtergym/ManeuveringTarget-v0"
 COUNT = 80

@@ -3,6 +3,7 @@ from typing import Any
 
 import numpy
 import pytest
+
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.contract.task import Scenario

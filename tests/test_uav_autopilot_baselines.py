@@ -7,6 +7,9 @@ from typing import Any
 import numpy
 import pytest
 import xarray
+from models import Asked, make_model
+
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
@@ -21,11 +24,8 @@ from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.statistic import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
-from filtergym.papers.uav_autopilot_kalman import experiment
-from models import Asked, make_model
-
-from filtergym import evaluate, tidy_records
 from filtergym.papers import uav_autopilot_kalman as paper
+from filtergym.papers.uav_autopilot_kalman import experiment
 
 ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])

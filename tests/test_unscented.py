@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from filtergym.filters.unscented import Spread, sigma_points, transform, weights
 from own_models import make_models
 
 import filtergym
 from filtergym import Sensor
+from filtergym.filters.unscented import Spread, sigma_points, transform, weights
 
 SPREADS = [Spread(), Spread(0.5, 2.0, 0.0), Spread(1.0, 0.0, -2.0), Spread(1e-3, 2.0, 0.0)]
 

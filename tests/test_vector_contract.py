@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from contract import BACKENDS, Subject, assert_properties, continued
-from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from gymnasium.vector import AutoresetMode
 from models import KINDS
 
 import filtergym  # noqa: F401  (registers the environments)
+from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 COMPANY = [*zip((3, 8, 13), AutoresetMode, strict=True), (1, AutoresetMode.SAME_STEP)]
 """Few, as many as fill up a batch, and more, each in a mode; and alone."""

@@ -6,9 +6,8 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
-from filtergym.papers.grid import markdown_table
-
 from filtergym.__main__ import GROUPS, application, import_command
+from filtergym.papers.grid import markdown_table
 
 KINDS = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
 

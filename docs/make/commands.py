@@ -8,15 +8,6 @@ from typing import Annotated
 
 import training_seeds
 import typer
-from filtergym.agents.export import export_run
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import bare_name
-from filtergym.envs.engine.scenario_choice import find_scenario
-from filtergym.evaluation.figures.print_layout import check_columns, check_formats, save
-from filtergym.evaluation.running.metrics import Record
-from filtergym.evaluation.running.parallel import Workers
-from filtergym.evaluation.storage.files import writable_file, write_text
-from filtergym.evaluation.storage.store import UNFINISHED, Store
 from front import draw_fronts, panels_of
 from notebooks import notebook_files, write_executed
 from playground import FILTERS, compile_filter, has_compiler, module_file
@@ -39,6 +30,8 @@ from records import (
 
 from filtergym.__main__ import main as run
 from filtergym.__main__ import program_of
+from filtergym.agents.export import export_run
+from filtergym.baselines.problem import problem_of
 from filtergym.commands.terminal import (
     Cluster,
     Columns,
@@ -52,6 +45,13 @@ from filtergym.commands.terminal import (
     console,
     progress_bar,
 )
+from filtergym.envs.engine.catalogue import bare_name
+from filtergym.envs.engine.scenario_choice import find_scenario
+from filtergym.evaluation.figures.print_layout import check_columns, check_formats, save
+from filtergym.evaluation.running.metrics import Record
+from filtergym.evaluation.running.parallel import Workers
+from filtergym.evaluation.storage.files import writable_file, write_text
+from filtergym.evaluation.storage.store import UNFINISHED, Store
 from filtergym.reports.tables.export import write_records
 from filtergym.reports.tables.results import read_results, settings_of
 

@@ -3,15 +3,15 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from pictures import draw_differences
+from records import BenchmarkRecords, ResultRecord
+
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import FRONT_MARK, PYTHON_MARK, TIME_TITLE, column_of_times
 from filtergym.papers.grid import Grid, markdown_table
-from pictures import draw_differences
-from records import BenchmarkRecords, ResultRecord
-
 from filtergym.reports.tables.ranking import HARM, ranking, ranking_sentence, who_is_best
 from filtergym.reports.tables.terminal_tables import (
     HEADLINE,

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, cast
 
+from records import BenchmarkRecords
+
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
@@ -11,8 +13,6 @@ from filtergym.evaluation.figures.print_layout import figure_with_pairs, in_prin
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import points_of_records, times_of_records
 from filtergym.papers.grid import markdown_table
-from records import BenchmarkRecords
-
 from filtergym.reports.tables.terminal_tables import HEADLINE
 
 BUDGETS = (100, 300, 1000, 5000)

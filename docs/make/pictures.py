@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
+
 from filtergym.evaluation.figures.looks import COLOURS, styles
 from filtergym.evaluation.figures.print_layout import (
     add_title,

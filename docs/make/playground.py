@@ -14,7 +14,6 @@ import tempfile
 from pathlib import Path
 
 from filtergym.baselines.problem import problem_of
-
 from filtergym.exports.c_filter import file_stem
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export

@@ -15,10 +15,6 @@ from docutils import nodes
 from docutils.parsers.rst import directives
 from docutils.statemachine import StringList
 from environment_page import causes_table, environment_table
-from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.figures.print_layout import save
-from filtergym.evaluation.storage.files import write_text
-from filtergym.papers.grid import markdown_table
 from front import budgets_markdown, draw_fronts, panels_of
 from pictures import draw_public_problems
 from playground import page_script, read_modules
@@ -39,6 +35,11 @@ from sentence_numbers import number_text, record_of
 from sphinx.addnodes import download_reference
 from sphinx.util.docutils import SphinxDirective, SphinxRole
 from training_seeds import learning_curves, seeds_markdown, seeds_overview
+
+from filtergym.baselines.problem import problem_of
+from filtergym.evaluation.figures.print_layout import save
+from filtergym.evaluation.storage.files import write_text
+from filtergym.papers.grid import markdown_table
 
 
 def _words(text: str) -> list[str]:

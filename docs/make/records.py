@@ -18,7 +18,6 @@ from filtergym.envs.engine.catalogue import bare_name, catalogue, nearest
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.storage.files import write_text
 from filtergym.evaluation.storage.stored import read_json
-
 from filtergym.reports.tables.terminal_tables import main_components
 
 FOLDER = Path(__file__).parent.parent / "records"

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
+from records import BenchmarkRecords, ResultRecord
+
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import TIME_NOTE, TIME_TITLE, column_of_times
 from filtergym.papers.grid import markdown_table
-from records import BenchmarkRecords, ResultRecord
-
 from filtergym.reports.tables.ranking import ranking_sentence
 from filtergym.reports.tables.terminal_tables import (
     COST_NOTE,

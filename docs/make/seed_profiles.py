@@ -21,14 +21,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
-from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.catalogue import bare_name
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, percentile_interval
-from filtergym.papers.grid import markdown_table
 from pictures import draw_profiles
 from records import ResultRecord
 from sentence_numbers import Number
 
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine.catalogue import bare_name
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, percentile_interval
+from filtergym.papers.grid import markdown_table
 from filtergym.reports.tables.terminal_tables import with_interval
 
 RESAMPLES = 10_000

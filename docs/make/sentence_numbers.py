@@ -9,10 +9,10 @@ path is record, row and column of a table of text, see :func:`.records.table_cel
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from filtergym.envs.engine.catalogue import bare_name, catalogue
-from filtergym.evaluation.running.times import ProcessorTime, time_text
 from records import BENCHMARK, FOLDER, SEEDS, read_record, table_cell
 
+from filtergym.envs.engine.catalogue import bare_name, catalogue
+from filtergym.evaluation.running.times import ProcessorTime, time_text
 from filtergym.reports.tables.terminal_tables import with_interval
 
 
