@@ -28,6 +28,7 @@ from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
 from ..evaluation.competitors.filters import Adapter, as_filter
 from ..evaluation.competitors.kinds import (
+    Competitor,
     ConstantPolicy,
     Kind,
     Policy,
@@ -567,3 +568,9 @@ def as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = Fa
     if corrected is not None:
         agent = ResidualPolicy(model, corrected, agent)
     return Gated(model, agent, fallback=corrected) if gated else agent
+
+
+def find_gated(name: str, inner: str, problem: Problem, find: Callable[[str], Competitor]) -> Competitor:
+    """Return the competitor of ``gated:NAME``."""
+    policy = find(inner)
+    return Competitor(name, GatedMaker(problem, inner, policy.maker), policy.learned)

@@ -1,11 +1,13 @@
 """Policies that an evaluation finds by name, file or folder: shipped agents, exported ones, models' zips, and runs."""
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
 from ..baselines.problem import Problem
 from ..envs.contract.task import Task
 from ..envs.data.flights import is_folder
+from ..evaluation.competitors.kinds import Competitor, Source
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
@@ -14,14 +16,6 @@ from .training_run import TrainingRun, best_agent, load_run
 def pretrained_agents(id: str) -> list[str]:
     """Names of the agents that are shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
-
-
-def ranked_names(problem: Problem) -> list[str]:
-    """Names of all that is shipped for a problem and is told nothing of the truth: policies and estimators as they are,
-    those that were tuned, and agents.
-    """
-    known = problem.baselines
-    return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
 def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
@@ -101,3 +95,16 @@ def with_normalisation(found: Any) -> Any:
     from .sb3_policy import Sb3Policy
 
     return Sb3Policy(found)
+
+
+def _find_learned(name: str, problem: Problem, trust: bool, find_shipped: Any) -> Competitor | None:
+    """Return a shipped agent, or that of a file or folder; None where the name means neither."""
+    maker = find_learned_policy(problem.task, name, trust)
+    if maker is None:
+        return None
+    shipped = problem.is_shipped and name in pretrained_agents(problem.id)
+    content = pretrained_path(problem.id, name).read_bytes() if shipped else b""
+    return Competitor(name, maker, True, hashlib.sha256(content).hexdigest() if shipped else None)
+
+
+LEARNED = Source(_find_learned, (".zip", ".safetensors"), pretrained_agents, with_normalisation)

@@ -42,7 +42,7 @@ from .fitting import (
     with_noise_scale,
     with_outliers,
 )
-from .judgement import FEWEST, Competitor, Judgement, Share, likeliest_of, share_out
+from .judgement import FEWEST, JudgedFilter, Judgement, Share, likeliest_of, share_out
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -171,9 +171,9 @@ class Advice(NamedTuple):
 
     recording: Recording
     share: Share
-    competitors: list[Competitor]
+    competitors: list[JudgedFilter]
     """The advised one first, then by their log-likelihood."""
-    fitted: Competitor
+    fitted: JudgedFilter
     """The simplest of the fitted ones that the likeliest of them does not beat beyond chance."""
     rival: str
     """Shipped filter that one would take without the judged measurements."""
@@ -205,7 +205,7 @@ class Advice(NamedTuple):
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     @property
-    def advised(self) -> Competitor:
+    def advised(self) -> JudgedFilter:
         """Who is advised."""
         return self.competitors[0]
 
@@ -317,8 +317,8 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
 
 
 def _choose(
-    log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[Competitor]
-) -> tuple[Competitor, Anchor | None]:
+    log: FittedLog, fits: Fits, judgement: Judgement, competitors: Sequence[JudgedFilter]
+) -> tuple[JudgedFilter, Anchor | None]:
     """Return the simplest fitted filter that the likeliest does not beat, or an anchored one that beats that, and how
     the anchored one compares.
     """

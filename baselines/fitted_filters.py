@@ -3,7 +3,7 @@
 import importlib.metadata
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ import numpy
 
 from ..envs.contract.log_format import is_assumed
 from ..envs.contract.parameters import quote_shortened
+from ..evaluation.competitors.kinds import Competitor, Source
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
 from ..filters.geodesy import PlaneOrigin
@@ -278,3 +279,19 @@ def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, f
     except ValueError as error:
         raise ValueError(f"{path}: filter {name!r}: {error}") from error
     return make_tuned_policy(f"{problem.id} fitted {name}", family, values)
+
+
+def _find_advised(
+    name: str, problem: Problem, trust: bool, find_shipped: Callable[[str, str], Competitor]
+) -> Competitor | None:
+    """Return the filter of a file of ``filtergym advise``, fitted or shipped; None of another file."""
+    if not name.endswith(SUFFIX):
+        return None
+    found = read_artefact(Path(name), problem)
+    if found.fitted is not None:
+        return Competitor(name, found.fitted, log=found.log)
+    shipped = find_shipped(found.filter, f"shipped filter (named by {name})")
+    return Competitor(name, shipped.maker, log=found.log)
+
+
+ADVISED = Source(_find_advised, (SUFFIX,))

@@ -72,7 +72,7 @@ def share_out(recording: Recording) -> Share:
     return Share([*found[0], *found[2]], found[1], found[3], warm_up, True)
 
 
-class Competitor(NamedTuple):
+class JudgedFilter(NamedTuple):
     """One line of the table of an advice."""
 
     name: str
@@ -166,7 +166,7 @@ class Judgement:
         as_good = (name for name in known if gains[name].high < AS_GOOD or name == likeliest)
         return min(as_good, key=lambda name: (operations(name), -means[name]))
 
-    def simplest(self, fitted: Sequence[Competitor]) -> Competitor:
+    def simplest(self, fitted: Sequence[JudgedFilter]) -> JudgedFilter:
         """Return the first of the fitted ones that the likeliest of them does not beat beyond chance: the simplest come
         first.
         """
@@ -174,7 +174,7 @@ class Judgement:
         as_good = (c for c in fitted if self.difference(likeliest.name, c.name).low <= 0.0)
         return next(as_good, likeliest)
 
-    def is_worth(self, fitted: Competitor, rival: str, operations: Callable[[str], float]) -> bool:
+    def is_worth(self, fitted: JudgedFilter, rival: str, operations: Callable[[str], float]) -> bool:
         """Whether a fitted filter gains beyond chance over the rival, or is cheaper and ``AS_GOOD``."""
         low = fitted.gain.low
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
@@ -212,12 +212,12 @@ class Judgement:
         ]
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
-    def competitor(self, name: str, rival: str) -> Competitor:
+    def competitor(self, name: str, rival: str) -> JudgedFilter:
         """Judge somebody, paired with another."""
         found, judged = self.predictions, self.judged
         penalty = self.parameters.get(name, 0) / self.chosen.sum()
         gain = found.difference(name, rival, self.chosen)
-        return Competitor(
+        return JudgedFilter(
             name,
             name in self.parameters,
             self.parameters.get(name, 0),
@@ -233,7 +233,7 @@ class Judgement:
         )
 
 
-def likeliest_of(competitors: Sequence[Competitor]) -> Competitor:
+def likeliest_of(competitors: Sequence[JudgedFilter]) -> JudgedFilter:
     """The one of largest log-likelihood; where nobody says any, the one of smallest error."""
     known = [c for c in competitors if not math.isnan(c.log_likelihood)]
     if not known:

@@ -47,6 +47,11 @@ class Problem:
         return importable_name(self.task)
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether it is of this package, so that its digest covers the code."""
+        return self.name == self.id
+
+    @property
     def short_name(self) -> str:
         """Name for its files, and where an id is too long."""
         return short_name(self.id)

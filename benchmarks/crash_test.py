@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
-from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.stress.crash_test import CrashTest, Finding
 from filtergym.names import find_competitor
@@ -47,10 +46,10 @@ def main() -> None:
     problem = problem_of(options.environment)
     paper = problem.baselines.score_paper
     experiment = problem.experiment(None, options.episodes)
-    test = CrashTest(experiment, options.steps, (paper, find_competitor(problem, paper)))
+    test = CrashTest(experiment, options.steps, (paper, find_competitor(problem, paper).maker))
     rows = []
     for name in options.policy or ranked_names(problem):
-        rows.append(row(name, list(test.findings(name, find_competitor(problem, name)))))
+        rows.append(row(name, list(test.findings(name, find_competitor(problem, name).maker))))
         print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
     print(*markdown_table(COLUMNS, rows), sep="\n")
 

@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy
 from peer_imm import imm_steps_per_second
 
-from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
@@ -231,7 +230,7 @@ def lines(
 ) -> Iterator[dict[str, Any]]:
     """A line for each competitor."""
     for name in names:
-        maker = find_competitor(problem, name)
+        maker = find_competitor(problem, name).maker
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
         try:
             traced, given = replay(ExportRequest(problem, name, maker), episodes, measurements)

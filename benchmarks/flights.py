@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy
 import pandas
 
+from filtergym import tidy_records
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.flights import TRAFFIC, Flights, flight_of, read_flights, traffic_samples
-from filtergym.names import competitors_of, tidy_records
+from filtergym.names import find_competitors
 
 ID = "filtergym/ManeuveringTarget-v0"
 FEWEST, COARSEST, INTERVAL, SMOOTHING = 20, 10.0, 6.0, 10.0
@@ -55,7 +56,8 @@ def main() -> None:
     parser.add_argument("--policy", action="append", help="default: the strongest of every kind")
     asked = parser.parse_args()
     problem = problem_of(ID)
-    competitors = competitors_of(problem, asked.policy or COMPETITORS)
+    found = find_competitors(problem, asked.policy or COMPETITORS)
+    competitors = {one.name: one.maker for one in found}
     rows = []
     for smoothing in (SMOOTHING, 0.0):
         for name, flights in sets(smoothing).items():

@@ -21,7 +21,7 @@ from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.running.metrics import mean_cost
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
-from filtergym.names import GATED, find_competitor
+from filtergym.names import find_competitor
 from filtergym.reports.tables.ranking import HARM
 
 LOST = 10.0
@@ -90,9 +90,9 @@ def competitors_of(problem: Problem, policies: list[str]) -> dict[str, Any]:
     first = dict.fromkeys([problem.baselines.compared_paper, fallback])
     makers = {name: problem.competitor(name) for name in first}
     for policy in policies:
-        makers[policy] = found = find_competitor(problem, policy)
-        if is_gateable(found) and not policy.startswith(GATED):
-            makers[GATED + policy] = GatedMaker(problem, policy, found)
+        makers[policy] = found = find_competitor(problem, policy).maker
+        if is_gateable(found) and not policy.startswith("gated:"):
+            makers[f"gated:{policy}"] = GatedMaker(problem, policy, found)
     return makers
 
 

@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy
 import xarray
 
-from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
 from filtergym.evaluation.competitors.kinds import RandomPolicy
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import reduce_episodes
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
-from filtergym.names import evaluation_requests
+from filtergym.functions import requests_of
+from filtergym.names import find_competitors, ranked_names
 from filtergym.papers.grid import markdown_table
 from filtergym.reports.tables.benchmark import affordable_episodes
 
@@ -66,7 +66,7 @@ def episode_costs(
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
     experiment = problem.experiment(scenario, episodes, seed)
-    asked = evaluation_requests(problem, experiment, names)
+    asked = requests_of(problem, experiment, find_competitors(problem, names))
     return {
         one.name: reduce_episodes(one, declare, lambda done: None).reduction.results()["cost",]
         for one in asked

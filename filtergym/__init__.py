@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from .envs.linear.inputs import Input
     from .envs.linear.sensors import Sensor
     from .evaluation.competitors.kinds import FunctionPolicy
+    from .functions import evaluate, make_policy, record, tidy_records
     from .live import online
-    from .names import evaluate, make_policy, record, tidy_records
     from .own_models import state_space
 
 __version__ = "0.1.0"
@@ -52,14 +52,14 @@ MODULES = {
     "Recording": "envs.data.recording",
     "Sensor": "envs.linear.sensors",
     "Trajectory": "envs.data.trajectory",
-    "evaluate": "names",
-    "make_policy": "names",
+    "evaluate": "functions",
+    "make_policy": "functions",
     "online": "live",
     "read_flights": "envs.data.flights",
     "read_recording": "envs.engine.scenario_choice",
-    "record": "names",
+    "record": "functions",
     "state_space": "own_models",
-    "tidy_records": "names",
+    "tidy_records": "functions",
 }
 """Where names of this package come from, when they are first used."""
 

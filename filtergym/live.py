@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
+from .baselines.problem import import_problem
 from .envs.contract.parameters import Limits, check
 from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
-from .evaluation.competitors.kinds import kind_of, make_competitor
+from .evaluation.competitors.kinds import Competitor, kind_of, make_competitor
 from .evaluation.competitors.online import OnlineFilter
 from .evaluation.competitors.stepping import SteppingPolicy
 from .evaluation.running.evaluate import control_of
-from .names import find_competitor, find_log_setup, import_problem, with_normalisation
+from .names import adopt, find_competitor
 
 
 def online(
@@ -62,9 +63,9 @@ def online(
         check(what, value, bool, Limits())
     named = isinstance(policy, str | Path)
     name = str(policy) if named else type(policy).__name__
-    maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
+    found = find_competitor(problem, policy, trust) if named else Competitor(name, adopt(policy))
+    maker, log = found.maker, found.log
     kind = kind_of(maker)
-    log = find_log_setup(problem, policy)
     read = {} if log is None else log.parameters
     keywords = {**read, **getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(

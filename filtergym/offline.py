@@ -28,7 +28,8 @@ from .evaluation.running.rollout import Progress
 from .evaluation.running.seeds import episode_seeds
 from .evaluation.running.transitions import Transitions, transitions_of
 from .evaluation.storage.files import whole_files
-from .names import find_competitor, find_policy
+from .functions import find_policy
+from .names import find_competitor
 
 CHUNK = 256
 """Episodes flown side by side, and held in memory until they are written."""
@@ -213,7 +214,7 @@ def plan_datasets(
     chosen = list(policies or default_policies(problem, control))
     acting: list[SteppingPolicy] = []
     for policy in chosen:
-        before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust)) else None
+        before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust).maker) else None
         own = before.control if before is not None and control is None else control
         theirs = {} if before is None else before.task_keywords
         fitting = replace(experiment, control=own, keywords={**theirs, **parameters})

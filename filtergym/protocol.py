@@ -189,7 +189,7 @@ def _find_entry(own: ProtocolEnvironment, name: str, trust: bool, rename: Any) -
     if rename is not None:
         [name] = rename(problem, [name])
     try:
-        maker = find_competitor(problem, name, trust)
+        maker = find_competitor(problem, name, trust).maker
     except ValueError as error:
         raise ValueError(
             f"{own.id}: {error}. --policy {own.short}=NAME enters another competitor there"
@@ -331,7 +331,7 @@ def _cells(protocol: Protocol, entry: Entry, options: Mapping[str, Any]) -> Iter
 
 def _result(entry: Entry, cells: Mapping[str, list[Summary]]) -> tuple[EnvironmentResult, list[Record]]:
     own, name = entry.environment, entry.name
-    records = {scenario: combine_summaries(found)[0] for scenario, found in cells.items()}
+    records = {scenario: combine_summaries(found).records for scenario, found in cells.items()}
     tables = {
         scenario: {(r.policy, r.metric, r.component): r for r in each if r.window == "all"}
         for scenario, each in records.items()

@@ -6,7 +6,9 @@ import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.running.curves import curves_of
+from filtergym.evaluation.running.summary import Evaluation
 from filtergym.evaluation.storage.dataset import keywords_of
+from filtergym.names import find_competitors
 from filtergym.reports.tables.benchmark import result_of
 from filtergym.reports.tables.worst import find_worst
 
@@ -30,5 +32,6 @@ def results_of(id, names, scenario, episodes, **options):
     experiment = problem.experiment(
         scenario, episodes, about["seed"], about["split"], keywords=keywords_of(dataset)
     )
-    worst = find_worst(problem, experiment, costs, records, [paper])
-    return result_of(problem, dataset, records, curves, pretrained_agents(id), worst)
+    evaluation = Evaluation(dataset, records, curves, costs)
+    worst = find_worst(experiment, evaluation, find_competitors(problem, names), [paper])
+    return result_of(problem, evaluation, pretrained_agents(id), worst)

@@ -24,7 +24,7 @@ from filtergym.envs.maneuvering_target.logs import scale_noise
 from filtergym.envs.maneuvering_target.world import Measurement
 from filtergym.exports.c_source import FLAGS, export_c
 from filtergym.exports.request import request_export
-from filtergym.names import find_competitor, find_log_setup
+from filtergym.names import find_competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
 PROBLEM = problem_of(ID)
@@ -69,7 +69,7 @@ LOGS = {
 
 def mean_of_evaluation(path, log):
     """Estimates of position in the rows of the log after the start, ``(n, 2)``."""
-    setup = find_log_setup(PROBLEM, path)
+    setup = find_competitor(PROBLEM, path).log
     recording = read_recording(log, ID, speeds=(0.001, 1000.0), **setup.assumed)
     dataset = filtergym.evaluate(ID, str(path), recording, tracks=True)
     seen = np.isfinite(recording.log_time[0])
@@ -79,7 +79,7 @@ def mean_of_evaluation(path, log):
 
 def mean_of_online(path, log):
     """The same, row by row."""
-    named = {old: new for new, old in find_log_setup(PROBLEM, path).columns.items()}
+    named = {old: new for new, old in find_competitor(PROBLEM, path).log.columns.items()}
     table = csv.DictReader(log.open())
     rows = [{named[k]: float(v) for k, v in row.items() if "truth" not in k} for row in table]
     running = filtergym.online(ID, str(path))
@@ -131,7 +131,7 @@ def test_a_shipped_filter_is_saved_by_its_name(tmp_path):
 
 def test_without_deviations_the_file_says_which(tmp_path):
     log = write_log(tmp_path / "log.csv", PLANE[:2], sigma=30.0)
-    setup = find_log_setup(PROBLEM, _saved(tmp_path, log))
+    setup = find_competitor(PROBLEM, _saved(tmp_path, log)).log
     assert 20.0 < setup.deviations["sigma_x"] < 90.0
     assert setup.assumed == {"range_sigma": setup.deviations["sigma_x"]}
     running = filtergym.online(ID, str(tmp_path / "mine.filter.json"))
@@ -149,7 +149,7 @@ def test_without_deviations_the_file_says_which(tmp_path):
 def test_latitude_needs_an_origin_and_lies_near_it(tmp_path):
     path = _saved(tmp_path, write_log(tmp_path / "log.csv", PLACE))
     running = filtergym.online(ID, str(path))
-    origin = find_log_setup(PROBLEM, path).plane
+    origin = find_competitor(PROBLEM, path).log.plane
     east, north = (math.degrees(10.0 / length) for length in (6.39e6 * math.cos(math.radians(48.8)), 6.37e6))
     rows = [
         {"time": 4.0 * k, "latitude": origin.latitude + k * north, "longitude": origin.longitude + k * east}

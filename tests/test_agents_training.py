@@ -11,10 +11,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from filtergym import evaluate
+from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.names import competitor, tidy_records
+from filtergym.names import competitor
 from filtergym.reports.tables import standing
 from filtergym.reports.tables.terminal_tables import with_interval
 

@@ -18,6 +18,8 @@ from filtergym.evaluation.figures.worst_episodes import (
     select_worst,
 )
 from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of
+from filtergym.evaluation.running.parallel import Workers
+from filtergym.evaluation.running.summary import Evaluation, run_requests
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.cause_split import (
     held_causes,
@@ -25,6 +27,8 @@ from filtergym.evaluation.statistics.cause_split import (
     phrases_of,
     reason_weight,
 )
+from filtergym.functions import requests_of
+from filtergym.names import find_competitors
 from filtergym.reports.tables.reasons import (
     explained_by_default,
     largest_reasons,
@@ -127,19 +131,15 @@ def test_opponents():
 
 
 def test_a_summary_splits_what_a_whole_evaluation_does(records):
-    from filtergym.evaluation.running.parallel import Workers
-    from filtergym.evaluation.running.summary import combine_summaries, summaries
-    from filtergym.names import evaluation_requests
 
     problem = problem_of(ENV)
-    requests = evaluation_requests(problem, problem.experiment(None, EPISODES, 3), NAMES)
+    requests = requests_of(problem, problem.experiment(None, EPISODES, 3), find_competitors(problem, NAMES))
     with Workers(1, None) as workers:
-        found = dict(summaries(requests, workers))
-    others, curves, head = combine_summaries([found[i] for i in range(len(found))])
-    split = [r for r in others if r.metric.startswith("cause_")]
+        found = run_requests(requests, workers)
+    split = [r for r in found.records if r.metric.startswith("cause_")]
     assert split == [r for r in records if r.metric.startswith("cause_")]
-    assert "cost_minus_best" in curves
-    assert phrases_of(head)["missed"] == "where a scan misses the target"
+    assert "cost_minus_best" in found.curves
+    assert phrases_of(found.dataset)["missed"] == "where a scan misses the target"
 
 
 def test_every_environment_says_what_its_causes_are(env_id):
@@ -242,7 +242,10 @@ def test_the_worst_episodes_are_those_that_cost_most_and_are_flown_again_bit_for
         )
     worst = describe_worst(again, numbers, "imm", "kalman-imm-turn")
     assert [one.seed for one in worst] == dataset["episode_seed"].values[numbers].tolist()
-    [found] = find_worst(problem, experiment, {"imm": costs}, records, ["imm"]).values()
+    evaluation = Evaluation(dataset, records, None, {"imm": costs})
+    [found] = find_worst(
+        experiment, evaluation, find_competitors(problem, ["imm", "kalman-imm-turn"]), ["imm"]
+    ).values()
     assert [one.seed for one in found] == [one.seed for one in worst]
     assert found[0].ratio == pytest.approx(worst[0].cost / worst[0].opponent_cost)
     assert found[0].track.attrs["seed"] == worst[0].seed

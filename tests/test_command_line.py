@@ -14,6 +14,7 @@ import pytest
 from made_results import without_times
 
 from filtergym.__main__ import GROUPS, import_command, main
+from filtergym.agents.learned_policy import pretrained_path
 from filtergym.baselines.problem import problem_of
 from filtergym.commands import terminal
 from filtergym.commands.progress import ProgressLines
@@ -21,7 +22,7 @@ from filtergym.commands.terminal import progress_bar
 from filtergym.compiler import native
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running import summary
-from filtergym.names import is_learned
+from filtergym.names import find_competitor
 from filtergym.reports.tables import benchmark
 from filtergym.reports.tables.results import read_results
 
@@ -402,8 +403,9 @@ def test_the_quick_benchmark_runs_a_tuned_one_in_the_place_of_what_it_was_and_on
     ("name", "learned"),
     [
         ("imm", False), ("imm-tuned", False), ("known-turn", False), ("bptt", True), ("gated:bptt", True),
-        ("gated:adaptive", False), ("runs/mine", True), ("mine.safetensors", True), ("module:Class", False),
+        ("gated:adaptive", False), (str(pretrained_path(ENV, "bptt")), True),
+        ("filtergym.baselines.maneuvering_target.policies:InteractingMultipleModel", False),
     ],
 )  # fmt: skip
-def test_what_is_learned_is_told_by_its_name(name, learned):
-    assert is_learned(problem_of(ENV), name) is learned
+def test_a_competitor_is_learned_or_not(name, learned):
+    assert find_competitor(problem_of(ENV), name).learned is learned

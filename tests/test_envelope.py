@@ -23,16 +23,18 @@ SMALL = 3.0
 
 @pytest.mark.parametrize("name", ["ppo", "kalman-net"])
 def test_in_training_nothing_is_said(name):
-    assert departure(TARGET.task, find_competitor(TARGET, name), None, {}) is None
+    assert departure(TARGET.task, find_competitor(TARGET, name).maker, None, {}) is None
     flown = TARGET.task.scenarios["random"]  # by itself, and not by its name
-    assert departure(TARGET.task, find_competitor(TARGET, name), flown, {}) is None
+    assert departure(TARGET.task, find_competitor(TARGET, name).maker, flown, {}) is None
 
 
 def test_a_parameter_that_was_another_is_named():
-    found = departure(FUSION.task, find_competitor(FUSION, "bptt"), None, {"coloured_factor": (30.0, 30.0)})
+    found = departure(
+        FUSION.task, find_competitor(FUSION, "bptt").maker, None, {"coloured_factor": (30.0, 30.0)}
+    )
     assert found.parameters["coloured_factor"][1] == (30.0, 30.0)
     assert "trained with coloured_factor" in str(found)
-    assert departure(FUSION.task, find_competitor(FUSION, "bptt"), None, {"horizon": 50}) is None
+    assert departure(FUSION.task, find_competitor(FUSION, "bptt").maker, None, {"horizon": 50}) is None
 
 
 @pytest.mark.parametrize("name", ["bptt", "kalman-net"])
@@ -41,14 +43,14 @@ def test_a_recording_of_another_sensor_is_outside(name):
     # Whose deviation is stated with every measurement, and not as a parameter that all is scaled by.
     own = {n: v for n, v in recording.parameters.items() if n not in ("range_sigma", "bearing_sigma")}
     recording = dataclasses.replace(recording, parameters=own)
-    found = departure(TARGET.task, find_competitor(TARGET, name), recording, {})
+    found = departure(TARGET.task, find_competitor(TARGET, name).maker, recording, {})
     assert found.share > 0.9
     assert "sigma" in found.field
     assert "% of" in str(found)
 
 
 def test_who_learned_nothing_departs_from_nothing():
-    assert departure(TARGET.task, find_competitor(TARGET, "imm"), None, {"range_sigma": SMALL}) is None
+    assert departure(TARGET.task, find_competitor(TARGET, "imm").maker, None, {"range_sigma": SMALL}) is None
 
 
 def test_the_command_says_it(command):
@@ -101,7 +103,7 @@ def test_what_is_no_number_was_not_seen():
 
 def test_an_agent_is_inside_of_its_envelope_in_training_and_outside_of_it_elsewhere():
     """Of episodes that were not flown for it; and with a deviation of the range that is a thirtieth of the usual."""
-    maker = find_competitor(TARGET, "bptt")
+    maker = find_competitor(TARGET, "bptt").maker
     alarmed = []
     for keywords in ({}, {"range_sigma": SMALL}):
         model = make_model(TARGET.id, maker.control, **keywords)

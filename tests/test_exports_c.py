@@ -38,7 +38,7 @@ def run(command, monkeypatch, tmp_path):
 
 def replayed(environment, name, keywords=None, scenario=None, **options):
     problem = problem_of(f"filtergym/{environment}-v0")
-    maker = name if not isinstance(name, str) else find_competitor(problem, name)
+    maker = name if not isinstance(name, str) else find_competitor(problem, name).maker
     return replay(ExportRequest(problem, str(name), maker, scenario, keywords or {}), **options)
 
 
@@ -245,7 +245,7 @@ def test_an_exported_policy_competes_as_what_it_was(environment, name, scenario,
 def costs_of(environment, name, folder, scenario=None, **keywords):
     """Costs of the episodes of a policy, and of the program that it is exported as, ``(2, episodes)``."""
     problem = problem_of(f"filtergym/{environment}-v0")
-    export_c(ExportRequest(problem, name, find_competitor(problem, name), scenario, keywords), folder)
+    export_c(ExportRequest(problem, name, find_competitor(problem, name).maker, scenario, keywords), folder)
     words = [compiler(), "-std=c99", "-O0", "main.c", f"{file_stem(name)}.c", "-lm", "-o", "run"]
     subprocess.run(words, cwd=folder, check=True)
     both = {"own": name, "program": Program(str(folder / "run"))}
@@ -438,7 +438,7 @@ def test_a_strangers_words_cannot_get_into_the_text(tmp_path):
 def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch):
     monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
     problem = problem_of("filtergym/ManeuveringTarget-v0")
-    maker = find_competitor(problem, "kalman-imm")
+    maker = find_competitor(problem, "kalman-imm").maker
     folder = tmp_path / "new" / "imm"
     request = ExportRequest(problem, "kalman-imm", maker, keywords={"horizon": 20})
     figures = export_c(request, folder, "float", "as typed")
@@ -481,7 +481,7 @@ def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch
         ValueError, match=r"'fixed-low' in float is off by .*more than 1e-09.*export it in double"
     ):
         export_c(
-            ExportRequest(problem, "fixed-low", find_competitor(problem, "fixed-low")),
+            ExportRequest(problem, "fixed-low", find_competitor(problem, "fixed-low").maker),
             tmp_path / "new",
             "float",
         )

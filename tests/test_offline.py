@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from models import KINDS
 
-from filtergym import Trajectory
+from filtergym import Trajectory, make_policy
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.running.transitions import member, transitions_of
-from filtergym.names import competitor, make_policy
+from filtergym.names import competitor
 
 ENV = "filtergym/ManeuveringTarget-v0"
 SEEDS = episode_seeds("train", 3, 3)

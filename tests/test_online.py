@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import filtergym
+from filtergym.baselines.problem import import_problem
 from filtergym.envs.contract.live_input import LiveInput
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
@@ -17,7 +18,7 @@ from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.competitors.online_state import History
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
-from filtergym.names import find_competitor, import_problem
+from filtergym.names import find_competitor
 
 RADAR, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 ESM, UAV = "filtergym/RadarEsmTracking-v0", "filtergym/UavAutopilot-v0"
@@ -43,7 +44,7 @@ def with_measurement(model, episode):
 )
 def test_the_same_measurements_give_the_same_bits(id, name, options, monkeypatch):
     problem, count, seeds = import_problem(id), 30, [3, 4, 5]
-    maker = find_competitor(problem, name)
+    maker = find_competitor(problem, name).maker
     keywords = {"horizon": count, **getattr(maker, "task_keywords", {}), **options}
     kind = kind_of(maker)
     control = control_of(maker, None, problem.task, name)

@@ -47,7 +47,7 @@ def dataset():
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.commands.evaluation.run_experiment", lambda *_, **__: dataset)
+    monkeypatch.setattr("filtergym.evaluation.running.summary.run_experiment", lambda *_, **__: dataset)
     monkeypatch.setattr(
         "filtergym.commands.evaluation.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
     )
@@ -114,8 +114,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
     def unexpected(*_, **__):
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("filtergym.commands.evaluation.run_experiment", unexpected)
-    monkeypatch.setattr("filtergym.commands.evaluation.summaries", unexpected)
+    monkeypatch.setattr("filtergym.commands.evaluation.run_requests", unexpected)
     monkeypatch.setattr("filtergym.reports.tables.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"

@@ -95,7 +95,7 @@ def known(page, params):
     for policy in [policies] if isinstance(policies, str) else policies:
         plain = policy.removeprefix("gated:")
         if not re.search(r"[/:.]", plain):
-            assert find_competitor(problem_of(id), plain), (page, policy)
+            assert find_competitor(problem_of(id), plain).maker, (page, policy)
     scenario = params.get("scenario")
     if isinstance(scenario, str) and re.fullmatch(r"[a-z-]+", scenario):
         assert scenario in catalogue()[id].scenarios, (page, scenario)

@@ -32,11 +32,12 @@ from filtergym.evaluation.running import summary
 from filtergym.evaluation.running.evaluate import run_piece
 from filtergym.evaluation.running.metrics import record_statistics
 from filtergym.evaluation.running.parallel import Workers
-from filtergym.evaluation.running.summary import Summary, combine_summaries, summaries
+from filtergym.evaluation.running.summary import Summary, combine_summaries, run_requests, summaries
 from filtergym.evaluation.storage import code
 from filtergym.evaluation.storage.store import Store
-from filtergym.names import evaluation_requests
-from filtergym.reports.tables import benchmark, work
+from filtergym.functions import requests_of
+from filtergym.names import find_competitors
+from filtergym.reports.tables import benchmark
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "imm-tuned", "known-turn", "known-input-bound", "ppo"]
@@ -66,6 +67,11 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
     assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
 
 
+def requests(env, names, **fields):
+    problem = problem_of(env)
+    return requests_of(problem, problem.experiment(**fields), find_competitors(problem, names))
+
+
 @pytest.mark.parametrize("env_id", KINDS)
 def test_summaries_tell_what_the_evaluation_does(env_id, short):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
@@ -81,21 +87,20 @@ def test_summaries_tell_what_the_evaluation_does(env_id, short):
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env_id == ENV else short
     dataset = evaluate(env_id, names, episodes=6, drawn_episodes=1, **shorter)
-    asked = evaluation_requests(
-        problem_of(env_id),
-        problem_of(env_id).experiment(episodes=6, drawn_episodes=1, keywords=shorter),
-        names,
-    )
+    asked = requests(env_id, names, episodes=6, drawn_episodes=1, keywords=shorter)
     assert [one.episodes for one in asked] == [6] * len(names)
-    found = dict(summaries(asked, Workers()))
-    records, curves, evaluation = combine_summaries([found[i] for i in range(len(names))])
-    assert records == tidy_records(dataset)
-    expected = filtergym.evaluation.running.curves.curves_of(dataset)
-    assert set(curves.variables) == set(expected.variables)
-    for name in expected.variables:
-        np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(problem_of(env_id), evaluation, records, curves, pretrained_agents(env_id))
-    whole = benchmark.result_of(problem_of(env_id), dataset, records, expected, pretrained_agents(env_id))
+    summarised, kept = (run_requests(asked, Workers(), whole=whole) for whole in (False, True))
+    assert kept.dataset.identical(dataset)
+    assert summarised.records == kept.records == tidy_records(dataset)
+    assert set(summarised.costs) == set(kept.costs)
+    for name, costs in kept.costs.items():
+        np.testing.assert_array_equal(summarised.costs[name], costs, err_msg=name)
+    assert set(summarised.curves.variables) == set(kept.curves.variables)
+    for name, expected in kept.curves.variables.items():
+        np.testing.assert_array_equal(summarised.curves[name].values, expected.values, err_msg=name)
+    result, whole = (
+        benchmark.result_of(problem_of(env_id), one, pretrained_agents(env_id)) for one in (summarised, kept)
+    )
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
@@ -116,8 +121,8 @@ def test_of_an_episode_a_few_numbers_are_kept_and_of_a_block_nothing_else(monkey
     problem = problem_of(ENV)
     kept, held = [], []
     for episodes in (16, 32, 64):
-        experiment = problem.experiment(episodes=episodes)
-        [asked] = evaluation_requests(problem, experiment, problem.baselines.score_paper, curves=False)
+        [asked] = requests(ENV, problem.baselines.score_paper, episodes=episodes)
+        asked = asked._replace(curves=False)
         blocks = []
 
         def run(*given, blocks=blocks):
@@ -156,16 +161,15 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     whole, expected = tidy_records(dataset), filtergym.evaluation.running.curves.curves_of(dataset)
     monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
     monkeypatch.setattr(summary, "TOGETHER", 16)
-    asked = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=40), names)
+    asked = requests(ENV, names, episodes=40)
     assert len(asked[0].pieces()) == 3
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
     in_any = dict(summaries(asked, Workers()))
     first, other = ([found[i] for i in range(3)] for found in (in_turn, in_any))
-    records, curves, _ = combine_summaries(first)
-    again, curves_again, _ = combine_summaries(other)
-    assert records == again
-    assert curves.identical(curves_again)
+    (_, records, curves, _), again = combine_summaries(first), combine_summaries(other)
+    assert records == again.records
+    assert curves.identical(again.curves)
     # Sums of blocks are rounded otherwise than those of all episodes at once.
     for own, other in zip(records, whole, strict=True):
         assert own[:8] == other[:8]
@@ -200,22 +204,23 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
-    [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm-tuned"])
+    [asked] = requests(ENV, ["imm-tuned"], episodes=4)
     store = Store(tmp_path / "unfinished")
 
     def read(other):
-        return store.read(work.work_of(problem_of(ENV), other), Summary)
+        return store.read(other.work(), Summary)
 
-    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)])
+    [(_, found)] = summaries([asked], Workers(), None, store)
     assert read(asked).contender.measures == found.contender.measures
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
         assert read(asked._replace(experiment=replace(asked.experiment, **changed))) is None
-    monkeypatch.setattr(TunedValues, "values", lambda self, name: ({"gain": 1.0}, ""))
-    assert read(asked) is None
-    assert work.work_of(problem_of(ENV), asked._replace(name="mine.py:Mine")) is None
-    # Of an environment of one's own nobody can say whether its code is what it was.
+    values = {name: 1.1 * value for name, value in problem_of(ENV).tuned_values.values("imm")[0].items()}
+    monkeypatch.setattr(TunedValues, "values", lambda self, name: (values, ""))
+    assert read(requests(ENV, ["imm-tuned"], episodes=4)[0]) is None
+    assert requests(ENV, {"mine": Wrong}, episodes=4)[0].work() is None
+    # Whether the code of an environment of one's own is what it was is not known.
     monkeypatch.setitem(registration.USER_TASKS, ENV, task_class(ENV))
-    assert work.work_of(problem_of(ENV), asked) is None
+    assert requests(ENV, ["imm-tuned"], episodes=4)[0].work() is None
     store.clear()
     assert not (tmp_path / "unfinished").exists()
 
@@ -243,9 +248,9 @@ def edit(tmp_path, monkeypatch):
 )
 def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
-    [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
+    [asked] = requests(ENV, ["imm"], episodes=4)
     store = Store(tmp_path / "unfinished")
-    list(summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)]))
+    list(summaries([asked], Workers(), None, store))
     calls = []
     monkeypatch.setattr(tuning, "episode_costs", lambda *given: calls.append(1) or np.ones(8))
 
@@ -261,7 +266,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
     assert (search(), search()) == (1, 1)
     edit(file, " ")
-    assert (store.read(work.work_of(problem_of(ENV), asked), Summary) is not None) is same
+    assert (store.read(asked.work(), Summary) is not None) is same
     assert search() == (1 if same else 2)
 
 

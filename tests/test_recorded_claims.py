@@ -3,9 +3,9 @@
 import pytest
 from records import read_record
 
-from filtergym.agents.named_policies import ranked_names
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import bare_name, catalogue
+from filtergym.names import ranked_names
 
 pytestmark = pytest.mark.claims
 COMPETE = ("policy", "estimator")

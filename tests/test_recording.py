@@ -14,7 +14,7 @@ from models import make_model
 
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.baselines.problem import problem_of
-from filtergym.commands.evaluation import causal_names
+from filtergym.commands.evaluation import causal_competitors
 from filtergym.envs.data.recorded_tables import Columns
 from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
@@ -683,6 +683,7 @@ def test_agents_of_other_fields_are_left_out_where_nobody_names_them():
     id = "filtergym/LooselyCoupledNavigation-v0"
     problem = problem_of(id)
     for axes, has_agents in ((1, True), (2, False)):
-        names = causal_names(problem, record(id, None, 1, horizon=10, axes=axes))
+        found = causal_competitors(problem, record(id, None, 1, horizon=10, axes=axes))
+        names = [one.name for one in found]
         assert ("bptt" in names) == has_agents
         assert "augmented" in names

@@ -19,10 +19,11 @@ from filtergym.baselines.maneuvering_target.smoothers import (
 )
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
-from filtergym.commands.evaluation import find_names
+from filtergym.commands.evaluation import find_participants
 from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.curves import curves_of
+from filtergym.evaluation.running.summary import Evaluation
 from filtergym.filters import kalman
 from filtergym.reports.pages.html_report import report_html
 from filtergym.reports.pages.outcome import outcome_sentences
@@ -117,7 +118,7 @@ def test_smoothers_are_marked_and_never_ranked():
         "imm-smoother",
         "known-turn",
     ]
-    found = result_of(problem_of(TARGET), dataset, records, curves_of(dataset), [])
+    found = result_of(problem_of(TARGET), Evaluation(dataset, records, curves_of(dataset), {}), [])
     assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
     assert "imm-smoother" not in " ".join([*outcome_sentences([found]), *remarks([found])])
     page = report_html([found], Settings("filtergym benchmark", {}))
@@ -253,7 +254,7 @@ def test_episodes_of_a_recording_are_smoothed_each_to_its_end_without_truth():
 
 def test_recordings_are_shown_to_smoothers_but_not_to_references():
     made = record(TARGET, scenario="random", episodes=2, horizon=8)
-    names = find_names(problem_of(TARGET), made, None)
+    names = [one.name for one in find_participants(problem_of(TARGET), made, None, False)]
     assert "imm-smoother" in names
     assert not {"known-turn", "known-input-bound"} & set(names)
 

@@ -6,6 +6,7 @@ import pytest
 from filtergym import evaluate
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.settings import ESTIMATORS
+from filtergym.baselines.problem import import_problem
 from filtergym.compiler import namespace
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.engine.backend import make_model
@@ -13,7 +14,7 @@ from filtergym.evaluation.competitors.kinds import make_competitor
 from filtergym.evaluation.competitors.steered_filter import steer, trace_policy
 from filtergym.evaluation.running.evaluate import control_of
 from filtergym.evaluation.running.rollout import run_competitor, start_lanes
-from filtergym.names import find_competitor, import_problem
+from filtergym.names import find_competitor
 
 pytest.importorskip("llvmlite")
 
@@ -62,7 +63,7 @@ def estimates(model, episode):
 )
 def test_a_traced_policy_does_what_it_does_when_it_is_asked(environment, name, options):
     problem = import_problem(f"filtergym/{environment}-v0")
-    maker = find_competitor(problem, name)
+    maker = find_competitor(problem, name).maker
     control = control_of(maker, None, problem.task, name)
     keywords = {"horizon": HORIZON, **getattr(maker, "task_keywords", {}), **options}
     model = make_model(problem.task, control, backend="compiled", **keywords)
@@ -79,7 +80,7 @@ def test_a_traced_policy_does_what_it_does_when_it_is_asked(environment, name, o
 
 def test_a_policy_that_draws_numbers_is_not_traced():
     problem = import_problem("filtergym/ManeuveringTarget-v0")
-    maker = find_competitor(problem, "random")
+    maker = find_competitor(problem, "random").maker
     model = make_model(problem.task, "gain", backend="compiled")
     with pytest.raises(NotTraceable):
         model.with_filter(Steer(maker, {}))
@@ -91,7 +92,7 @@ BPTT = "filtergym/ManeuveringTarget-v0", "bptt"
 def test_the_layers_of_a_network_are_loops_that_sum_in_the_same_order(monkeypatch):
     """The same bits as of a straight line, in a program that is shorter than the network has weights."""
     problem = import_problem(BPTT[0])
-    maker = find_competitor(problem, BPTT[1])
+    maker = find_competitor(problem, BPTT[1]).maker
     found, steps = [], []
     for large in (namespace.LARGE, 10**9):  # beyond the second no product is a loop
         monkeypatch.setattr(namespace, "LARGE", large)

@@ -203,7 +203,7 @@ def test_what_nobody_expected_is_a_sentence(monkeypatch, command):
     def broken(*_, **__):
         raise KeyError("lost")
 
-    monkeypatch.setattr("filtergym.commands.evaluation.summaries", broken)
+    monkeypatch.setattr("filtergym.evaluation.running.summary.summaries", broken)
     code, _, errors = command("evaluate", ID, "--policy", "imm")
     assert (code, errors.count("\n")) == (1, 1)
     assert "Error: unexpected KeyError: 'lost' (test_trust.py, line " in errors

@@ -28,7 +28,7 @@ from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.evaluate import check_sendable
 from filtergym.evaluation.running.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.running.parallel import Workers, check_workers
-from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
+from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes, stem_of
 from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
@@ -37,7 +37,6 @@ from filtergym.evaluation.storage.store import Store, Work
 from filtergym.names import find_competitor
 from filtergym.papers.grid import Grid, markdown_table
 from filtergym.reports.tables.terminal_tables import select_components, with_interval
-from filtergym.reports.tables.work import meaning_of, stem_of
 
 
 class Comparison(NamedTuple):
@@ -300,24 +299,24 @@ def episode_means(
 def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
     """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
     problem = study.problem
-    makers = {member.name: find_competitor(problem, str(member.agent), study.trust) for member in study.runs}
+    entered = {m.name: find_competitor(problem, str(m.agent), study.trust) for m in study.runs}
     for name in dict.fromkeys([problem.paper, *study.opponents]):
-        makers[name] = find_competitor(problem, name, study.trust)
-        if kind_of(makers[name]) == "bound":
+        entered[name] = find_competitor(problem, name, study.trust)
+        if kind_of(entered[name].maker) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     members = {member.name: member for member in study.runs}
     horizon = make_task(problem.task, scenario).horizon
     found: dict[str, tuple[EvaluationRequest, Work | None]] = {}
-    for name, maker in makers.items():
-        member = members.get(name)
+    for name, one in entered.items():
+        member, maker = members.get(name), one.maker
         # A learned estimator has a filter of its own, and steers nothing.
         control = member.run.control if member and kind_of(maker) == "policy" else None
         experiment = problem.experiment(scenario, study.episodes, study.seed, study.split, control)
-        meaning = meaning_of(problem, problem.paper if member else name)
+        identity = problem.paper if member and problem.is_shipped else one.identity
         work = None
-        if meaning is not None:
+        if identity is not None:
             agent = hashlib.sha256(member.agent.read_bytes()).hexdigest() if member else ""
-            content = json.dumps([meaning, agent, name, repr(experiment), _own_digest()])
+            content = json.dumps([identity, agent, name, repr(experiment), _own_digest()])
             work = Work(f"{stem_of(experiment)}.seeds", content)
         # An agent's name may be that of a competitor.
         found[name] = EvaluationRequest(experiment, "agent" if member else name, maker, horizon=horizon), work

@@ -17,6 +17,7 @@ from ...envs.contract.task import Task
 from ...envs.data.flight_tables import clock_seconds, describe_time
 from ..storage.dataset import NO_ROW
 from ..storage.estimate_tables import EstimateTable, read_estimates
+from .kinds import Competitor
 
 SAME_TIME = 1e-3
 """s, within which a row is of a measurement; at most a quarter of the time between two."""
@@ -273,3 +274,8 @@ class FileTrack(Filter[Task, Any, FileState]):
             for name, values in self.given.table.likelihood.items()
         }
         return {**told, "missing": state.missing, "lost": state.over * NO_ROW}
+
+
+def find_estimates(name: str, path: str, problem: Any, find: Any) -> Competitor:
+    """Return the competitor of ``file:PATH``."""
+    return Competitor(name, FileEstimates(Path(path).absolute()))

@@ -12,10 +12,12 @@ import sysconfig
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from ...envs.engine.catalogue import find_user_module
 from ..storage.code import package_folders
 from . import isolated_estimator
+from .kinds import Competitor
 from .programs import LIMITS, Program
 
 ISOLATED = "isolated:"
@@ -121,3 +123,8 @@ def _without(place: Path, forbidden: Iterable[Path]) -> Iterator[str]:
         return
     for inner in real.iterdir():
         yield from _without(inner, forbidden)
+
+
+def find_isolated(name: str, inner: str, problem: Any, find: Any) -> Competitor:
+    """Return the competitor of ``isolated:module:Class``."""
+    return Competitor(name, isolate_estimator(inner))

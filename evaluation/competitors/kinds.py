@@ -12,7 +12,7 @@ Stable-Baselines3.
 import functools
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Protocol, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy
 
@@ -29,6 +29,34 @@ TOLD_MORE: tuple[Kind, ...] = ("reference", "bound")
 """What may be told more than is measured, and says so in ``knows``."""
 NOT_CAUSAL = "Not causal, with later measurements"
 """What is said of smoothers wherever they are reported, before their names."""
+
+
+class Competitor(NamedTuple):
+    """A name with what it stands for in a problem."""
+
+    name: str
+    maker: Any
+    """A class or function that makes the competitor, or the competitor itself; see :func:`make_competitor`."""
+    learned: bool = False
+    """Whether it was trained."""
+    identity: str | None = None
+    """Words that change whenever the maker does; None where nothing says whether it is what it was."""
+    log: Any = None
+    """How the log was read that the competitor was fitted to (:class:`.baselines.fitted_filters.LogSetup`), or None."""
+
+
+class Source(NamedTuple):
+    """Competitors that are kept in files and folders."""
+
+    find: Callable[[str, Any, bool, Callable[[str, str], Competitor]], Competitor | None]
+    """The competitor of a name in a problem, or None. Takes also whether to load what can execute code, and a function
+    that returns the shipped competitor of a name; its second argument names the thing in errors."""
+    endings: Sequence[str]
+    """Of the names of its files."""
+    names: Callable[[str], list[str]] = lambda id: []
+    """Names of those that are shipped for a Gymnasium id."""
+    adopt: Callable[[Any], Any] = lambda found: found
+    """Puts an object of a known library behind its adapter, and returns others as they are."""
 
 
 def kind_of(competitor: Any) -> Kind:

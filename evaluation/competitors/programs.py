@@ -34,13 +34,11 @@ import numpy
 from ...compiler.functions import leaves
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, field_words
-from .kinds import Kind
+from .kinds import Competitor, Kind
 from .program_process import WRONG, Failure, Limits, ProgramProcess
 
 VERSION = 1
 """Of the protocol."""
-EXEC = "exec:"
-"""Before the command of a program, where it stands for a competitor's name."""
 LONGEST_HELLO = 10_000
 """Bytes of the answer to the hello."""
 BYTES_OF_NUMBER = 40
@@ -387,3 +385,8 @@ def _read_object(line: bytes) -> dict[str, Any]:
         shown = "".join(c if c.isprintable() else " " for c in line[:80].decode(errors="replace"))
         raise Failure(WRONG, f"it has answered with no object of JSON: {shown!r}")
     return found
+
+
+def find_program(name: str, command: str, problem: Any, find: Any) -> Competitor:
+    """Return the competitor of ``exec:COMMAND``."""
+    return Competitor(name, Program(command))

@@ -5,19 +5,20 @@ next begins, and what they come to is added in their order; so its bits depend o
 """
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
+from ...envs.engine.catalogue import short_name
 from ..statistics.bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
 from ..statistics.statistic import Reduction, Statistic, reduce_run
 from ..storage.store import Store, Work
-from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
-from .evaluate import Experiment, check_sendable, plan_of, run_piece
+from .curves import CompetitorCurves, competitor_curves, curve_statistics, curves_of, stack_curves
+from .evaluate import Experiment, check_sendable, plan_of, run_experiment, run_piece
 from .kept import DRAWN_PREFIX
-from .metrics import Contender, Record, contender_of, record_statistics, records_of
+from .metrics import Contender, Record, contender_of, mean_cost, record_statistics, records_of, tidy_records
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
@@ -47,6 +48,8 @@ class EvaluationRequest(NamedTuple):
     """Episode before which it ends; None: the end."""
     curves: bool = True
     """Whether it is reduced to curves, too: who draws no figure needs none, and they take as long as the records."""
+    identity: str | None = None
+    """Of the competitor, see :class:`..competitors.kinds.Competitor`; with None its summary is not kept in a store."""
 
     @property
     def episodes(self) -> int:
@@ -63,12 +66,47 @@ class EvaluationRequest(NamedTuple):
         """How many there are."""
         return (self.end - self.first) * self.horizon
 
+    def work(self) -> Work | None:
+        """Return the piece of work that the summary is, for a store; None where nothing is kept of it."""
+        if self.identity is None:
+            return None
+        return Work(f"{stem_of(self.experiment)}.{self.name}", f"{self._replace(maker=None, metrics=None)}")
+
     def pieces(self) -> list["EvaluationRequest"]:
         """Return the pieces of work that this is: one, unless there are many episodes."""
         if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
         return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
+
+
+def stem_of(experiment: Experiment) -> str:
+    """Begin the name of a file about an experiment."""
+    environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
+    return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation has found."""
+
+    dataset: xarray.Dataset
+    """All that was kept of every episode (:func:`.evaluate.run_experiment`); or, of summaries, its coordinates and
+    attributes with what was kept of the first episodes, over policy, drawn_episode and time."""
+    records: list[Record]
+    curves: xarray.Dataset | None
+    """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
+    costs: Mapping[str, numpy.ndarray]
+    """Mean cost of every episode by name, ``(episodes,)``, of all whose cost is known."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether errors and costs are known."""
+        return bool(self.dataset.attrs["truth"])
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the measurements are those of a recording."""
+        return bool(self.dataset.attrs["recorded"])
 
 
 class Summary(NamedTuple):
@@ -167,7 +205,6 @@ def summaries(
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
-    work: Sequence[Work | None] = (),
 ) -> Iterator[tuple[int, Summary]]:
     """Summarise competitors, of any environments.
 
@@ -176,7 +213,6 @@ def summaries(
         workers: who does it.
         progress: told of measurements done.
         store: keeps the summary of each, from which a second call takes it. Default: nothing is kept.
-        work: that each is, for the store; None: it is not kept.
 
     Yields:
         Number of a competitor among them and its summary, as they are finished.
@@ -186,10 +222,9 @@ def summaries(
             :func:`.evaluate.run_experiment`.
     """
     store = store or Store()
-    keys = list(work) or [None] * len(asked)
     missing = []
-    for i, (one, key) in enumerate(zip(asked, keys, strict=True)):
-        found = store.read(key, Summary)
+    for i, one in enumerate(asked):
+        found = store.read(one.work(), Summary)
         if found is None:
             missing.append(i)
             continue
@@ -197,7 +232,7 @@ def summaries(
             progress(one.measurements)
         yield i, found
     for i, found in _summarise(asked, missing, workers, progress):
-        store.write(keys[i], found)
+        store.write(asked[i].work(), found)
         yield i, found
 
 
@@ -259,28 +294,55 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 
 
 @one_thread()
-def combine_summaries(
-    found: Sequence[Summary],
-) -> tuple[list[Record], xarray.Dataset | None, xarray.Dataset]:
-    """Return what the summaries of all competitors of an evaluation come to.
-
-    Returns:
-        Records, as :func:`.metrics.tidy_records` makes them; curves, as :func:`.curves.curves_of`, or None where not
-        everybody has some; and the evaluation, of whose variables there is what was kept of the first episodes, over
-        policy, drawn_episode and time.
-    """
+def combine_summaries(found: Sequence[Summary]) -> Evaluation:
+    """Return the evaluation of which these are the summaries of all competitors."""
     evaluation = _heads_together(found)
+    costs = {one.contender.name: one.contender.costs for one in found if one.contender.costs is not None}
     records = records_of([one.contender for one in found], evaluation, _resampling(found[0].episodes))
     each = [one.curves for one in found if one.curves is not None]
     if len(each) < len(found):
-        return records, None, evaluation
+        return Evaluation(evaluation, records, None, costs)
     controls = [one.contender.control for one in found]
     if len({control for control, own in zip(controls, each, strict=True) if own.actions}) > 1:
         each = [
             own._replace(actions=[f"{control}: {part}" for part in own.actions])
             for control, own in zip(controls, each, strict=True)
         ]
-    return records, stack_curves(each, evaluation, found[0].episodes), evaluation
+    curves = stack_curves(each, evaluation, found[0].episodes)
+    return Evaluation(evaluation, records, curves, costs)
+
+
+def run_requests(
+    asked: Sequence[EvaluationRequest],
+    workers: Workers,
+    progress: Progress | None = None,
+    store: Store | None = None,
+    whole: bool = False,
+) -> Evaluation:
+    """Evaluate the competitors of one experiment.
+
+    Args:
+        asked: one request for each.
+        workers: who does it.
+        progress: told of measurements done.
+        store: as of :func:`summaries`.
+        whole: keep every number of every episode; flights and recordings have no summary.
+
+    Raises:
+        ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
+    """
+    if not whole:
+        found = dict(summaries(asked, workers, progress, store))
+        return combine_summaries([found[i] for i in range(len(found))])
+    first = asked[0]
+    dataset = run_experiment(first.experiment, {one.name: one.maker for one in asked}, progress, workers)
+    costs = {}
+    for name in dataset["policy"].values.tolist() if "cost" in dataset else ():
+        own = mean_cost(dataset, name)
+        if not numpy.isnan(own).all():  # of bounds there is none
+            costs[name] = own
+    curves = curves_of(dataset) if first.curves else None
+    return Evaluation(dataset, tidy_records(dataset, first.metrics), curves, costs)
 
 
 def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:

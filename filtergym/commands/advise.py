@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import typer
 
-from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import FittedLog, advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
 from ..baselines.problem import Problem, problem_of
@@ -14,7 +13,7 @@ from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task, read_recording
 from ..evaluation.storage.files import writable_file, write_text
-from ..names import find_competitor
+from ..names import find_competitor, find_competitors
 from ..reports.tables.advice import (
     advice_lines,
     advice_table,
@@ -25,7 +24,7 @@ from ..reports.tables.advice import (
     reading_lines,
 )
 from ..reports.tables.results import settings_of
-from .evaluation import causal_names, departure_lines
+from .evaluation import causal_competitors, departure_lines
 from .shown import advice_maker
 from .terminal import (
     Parameters,
@@ -80,7 +79,7 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     families = families_of(problem, found)
     if ":" not in name and name not in families:
         raise nearest("filter that can be fitted to a recording", name, families)
-    family = families[name] if name in families else own_family(name, find_competitor(problem, name))
+    family = families[name] if name in families else own_family(name, find_competitor(problem, name).maker)
     out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
     if name in families:
         writable_file(out)
@@ -161,11 +160,10 @@ def advise_on_log(
     check_names(problem.task, keywords)
     for line in reading_lines(found):
         console.print(line, highlight=False, soft_wrap=True)
-    known = pretrained_agents(problem.id)
-    names = [name for name in causal_names(problem, found) if agents or name not in known]
-    shipped = {name: find_competitor(problem, name) for name in names}
-    learned = [name for name in known if name in shipped]
-    own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
+    shipped = causal_competitors(problem, found, agents)
+    makers = {one.name: one.maker for one in shipped}
+    learned = sorted(one.name for one in shipped if one.learned)
+    own = {one.name: own_family(one.name, one.maker) for one in find_competitors(problem, policy or [])}
     with progress_bar() as bar:
         fits = bar.add_task("advising", total=1.0)
 
@@ -174,12 +172,12 @@ def advise_on_log(
             bar.say(what)
 
         prices = update_prices(problem, found)
-        advice = advise(FittedLog(problem, found, noise, seed, keywords), shipped, own, progress, prices)
+        advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:
         console.print(costs)
-    departures = list(departure_lines(problem, found, learned, keywords))
+    departures = list(departure_lines(problem, found, [one for one in shipped if one.learned], keywords))
     for sentence in [*advice_lines(advice, learned), *departures]:
         console.print(sentence, highlight=False, soft_wrap=True)
     name = advice.advised.name

@@ -1,9 +1,7 @@
 """The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +10,7 @@ import xarray
 from rich.table import Table
 
 from ..agents.envelope import departure
-from ..agents.named_policies import pretrained_agents
+from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.flights import names_flights, read_flights
 from ..envs.data.plausibility import LOUD
@@ -21,29 +19,26 @@ from ..envs.data.recording_files import is_recording
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest
 from ..envs.engine.scenario_choice import make_task, read_recording
-from ..evaluation.competitors.kinds import RandomPolicy
+from ..evaluation.competitors.kinds import Competitor, RandomPolicy
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
-from ..evaluation.running.curves import curves_of
-from ..evaluation.running.evaluate import Experiment, run_experiment
-from ..evaluation.running.metrics import flight_records, mean_cost
+from ..evaluation.running.metrics import Record, flight_records
 from ..evaluation.running.parallel import Workers
-from ..evaluation.running.summary import combine_summaries, summaries
+from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
 from ..evaluation.statistics.bootstrap import Estimate
 from ..evaluation.statistics.cause_split import phrases_of
 from ..evaluation.statistics.predictions import Predictions, mean_of
 from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.storage.estimates import check_estimates, write_estimates
 from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
-from ..evaluation.storage.store import UNFINISHED, Store
-from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
+from ..evaluation.storage.store import Store
+from ..names import find_competitors, ranked_names
 from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
-from ..reports.tables.reasons import explained_by_default, reason_sentences
+from ..reports.tables.reasons import reason_sentences
 from ..reports.tables.recording_tables import recording_tables
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables.terminal_tables import flights_table, results_tables
-from ..reports.tables.work import work_of
 from ..reports.tables.worst import worst_figures
 from .shown import REPORT, make_report
 from .terminal import (
@@ -160,39 +155,53 @@ def _no_flights(name: str | None) -> ValueError:
     return ValueError(f"--site is for flights from files, and {name!r} is none")
 
 
-def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> list[str]:
-    """Return the names of who is evaluated: those that are given, or those of the quick benchmark.
+def assumed_parameters(environment: str | None, names: Sequence[str]) -> dict[str, float]:
+    """Return the parameters under which a log without deviations is read as the one of an advised filter was; of the
+    first file among the names that holds any.
+    """
+    if environment is None:
+        return {}
+    advised = [name for name in names if name.endswith(SUFFIX)]
+    logs = [found.log for found in find_competitors(problem_of(environment), advised)]
+    return next((log.assumed for log in logs if log is not None and log.assumed), {})
+
+
+def find_participants(
+    problem: Problem, data: Any, policies: Sequence[str] | None, trust: bool
+) -> list[Competitor]:
+    """Return the competitors that are evaluated: those that are named, or those of the quick benchmark.
 
     Args:
         problem: whose they are.
-        data: of :func:`find_data`. To a recording all that could run on it is asked, tuned and learned ones, too;
-            references and bounds are told what it does not hold.
+        data: of :func:`find_data`. On a recording every shipped competitor runs that can, tuned and learned ones, too;
+            references and bounds need what it does not hold.
         policies: names that are given.
+        trust: load models that can execute code.
     """
     known = problem.baselines
     if policies:
-        return list(policies)
+        return find_competitors(problem, policies, trust)
     if not isinstance(data, Recording):
-        return list(without_smoothers_of_closed_loops(problem, known.benchmark or known.names, data))
-    return [*causal_names(problem, data), *known.smoothers]
+        return find_competitors(
+            problem, without_smoothers_of_closed_loops(problem, known.benchmark or known.names, data)
+        )
+    return [*causal_competitors(problem, data), *find_competitors(problem, [*known.smoothers])]
 
 
-def causal_names(problem: Problem, recording: Recording) -> list[str]:
-    """Return the names of all that can run on a recording as it comes: classical, tuned and learned."""
-    # What is drawn by lot says nothing of anybody's sensors.
-    known = problem.baselines
-    classical = [name for name in known.policies if problem.competitor(name) is not RandomPolicy]
+def causal_competitors(problem: Problem, recording: Recording, agents: bool = True) -> list[Competitor]:
+    """Return what is shipped and can run on a recording as it comes: classical, tuned and, if wanted, learned."""
+    found = find_competitors(problem, ranked_names(problem))
+    # Random actions show nothing of a sensor.
     return [
-        *classical,
-        *known.estimators,
-        *problem.tuned_policies,
-        *(name for name in pretrained_agents(problem.id) if _knows_fields(problem, name, recording)),
+        one
+        for one in found
+        if one.maker is not RandomPolicy
+        and (not one.learned or (agents and _knows_fields(problem, one.maker, recording)))
     ]
 
 
-def _knows_fields(problem: Problem, name: str, recording: Recording) -> bool:
+def _knows_fields(problem: Problem, maker: Any, recording: Recording) -> bool:
     """Whether an agent was trained on fields that are shown of a recording: one of other axes shows others."""
-    maker = find_competitor(problem, name)
     stored = getattr(maker, "policy", maker)
     header, control = getattr(stored, "header", None), getattr(stored, "control", None)
     if header is None or control is None:
@@ -215,65 +224,42 @@ def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool
     return data.seconds.size * len(set(names)) <= MOST_PREDICTIONS
 
 
-class Outcome(NamedTuple):
-    """What an evaluation has found."""
+def flights_of(found: Evaluation) -> list[Record]:
+    """Return the records of every flight, where there are few enough to tell one by one."""
+    each = "flight" in found.dataset.coords and found.has_truth
+    if each and found.recorded:
+        each = found.dataset.sizes["episode"] <= MOST_RECORDINGS
+    return flight_records(found.dataset) if each else []
 
-    dataset: xarray.Dataset
-    records: list[Any]
-    curves: Any
-    """For figures; None where none are drawn."""
-    refusal: str
-    """Why the whole result is not written; empty where it is."""
-    store: Store
-    """Keeps what is done until all is written."""
-    costs: Mapping[str, numpy.ndarray]
-    """Mean cost of every episode by name, of all whose cost is known."""
 
-    @property
-    def has_truth(self) -> bool:
-        """Whether errors and costs are known."""
-        return bool(self.dataset.attrs["truth"])
+def likelihood_differences(problem: Problem, dataset: xarray.Dataset) -> dict[str, Estimate]:
+    """Return the log-likelihood per measurement less that of the best, by name."""
+    predictions = Predictions(dataset, make_task(problem.task))
+    everywhere = numpy.ones(predictions.shape, dtype=bool)
+    means = {name: mean_of(predictions.log_likelihood(name), everywhere) for name in predictions.names}
+    known = [name for name, mean in means.items() if not math.isnan(mean)]
+    best = max(known, key=means.__getitem__, default=None)
+    return {} if best is None else {name: predictions.difference(name, best) for name in known}
 
-    @property
-    def flights(self) -> list[Any]:
-        """Records of every flight, where few enough are told apart."""
-        each = "flight" in self.dataset.coords and self.has_truth
-        if each and self.dataset.attrs["recorded"]:
-            each = self.dataset.sizes["episode"] <= MOST_RECORDINGS
-        return flight_records(self.dataset) if each else []
 
-    def explained(self, names: Sequence[str], wanted: Sequence[str]) -> list[str]:
-        """Return whose cost is explained.
-
-        Args:
-            names: that the user wants evaluated.
-            wanted: names that the user wants explained; none: see :func:`.reports.tables.reasons.explained_by_default`.
-        """
-        return list(wanted) or explained_by_default(self.records, names, self.dataset.attrs["paper"])
-
-    def differences(self, problem: Problem) -> dict[str, Estimate]:
-        """Log-likelihood per measurement less that of the best, by name."""
-        predictions = Predictions(self.dataset, make_task(problem.task))
-        everywhere = numpy.ones(predictions.shape, dtype=bool)
-        means = {name: mean_of(predictions.log_likelihood(name), everywhere) for name in predictions.names}
-        known = [name for name, mean in means.items() if not math.isnan(mean)]
-        best = max(known, key=means.__getitem__, default=None)
-        return {} if best is None else {name: predictions.difference(name, best) for name in known}
-
-    def tables(
-        self, problem: Problem, flights: list[Any], differences: Mapping[str, Estimate], width: int
-    ) -> list[Table]:
-        """Return what is printed in so many columns, widest first."""
-        tables = [flights_table(self.dataset, flights, self.records, width)] if flights else []
-        if self.has_truth:
-            compared = results_tables(self.records, problem.knows, width)
-            paper = self.dataset.attrs["paper"]
-            if paper not in {record.policy for record in self.records}:
-                compared[-1].caption = f"{_without_comparison(paper)}\n{compared[-1].caption}"
-            tables += compared
-        if self.dataset.attrs["recorded"]:
-            tables += recording_tables(self.records, differences, self.has_truth, width)
-        return tables
+def tables_of(
+    problem: Problem,
+    found: Evaluation,
+    flights: list[Record],
+    differences: Mapping[str, Estimate],
+    width: int,
+) -> list[Table]:
+    """Return what is printed in so many columns, widest first."""
+    tables = [flights_table(found.dataset, flights, found.records, width)] if flights else []
+    if found.has_truth:
+        compared = results_tables(found.records, problem.knows, width)
+        paper = found.dataset.attrs["paper"]
+        if paper not in {record.policy for record in found.records}:
+            compared[-1].caption = f"{_without_comparison(paper)}\n{compared[-1].caption}"
+        tables += compared
+    if found.recorded:
+        tables += recording_tables(found.records, differences, found.has_truth, width)
+    return tables
 
 
 def _without_comparison(paper: str) -> str:
@@ -284,62 +270,34 @@ def _without_comparison(paper: str) -> str:
 
 
 def run(
-    problem: Problem,
-    experiment: Experiment,
-    names: Sequence[str],
-    outputs: Outputs,
-    workers: Workers,
-    trust: bool,
-) -> Outcome:
-    """Run the competitors of these names.
+    requests: Sequence[EvaluationRequest], outputs: Outputs, workers: Workers, store: Store
+) -> tuple[Evaluation, str]:
+    """Run the competitors of an evaluation.
 
     Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
 
     Args:
-        problem: whose they are.
-        experiment: over what they run.
-        names: of competitors.
+        requests: one for each competitor.
         outputs: what will be written.
         workers: who share the work.
-        trust: load models that can execute code.
+        store: keeps what is done until all is written.
+
+    Returns:
+        The evaluation, and why the whole of it is not written; empty where it is.
     """
-    task = experiment.make_task()
-    measurements = len(set(names)) * experiment.episodes * task.horizon
+    task = requests[0].experiment.make_task()
+    measurements = sum(one.measurements for one in requests)
     size = measurements * len(task.components) * 8
     refusal = _size_warning(size, size, outputs.netcdf)
-    store = Store(None if outputs.folder is None else outputs.folder / UNFINISHED)
-    whole = outputs.folder is not None and not refusal
+    written = outputs.folder is not None and not refusal
+    whole = written or bool(task.flights) or outputs.estimates is not None
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
-
-        def tick(done: int) -> None:
-            bar.update(line, advance=done)
-
-        if task.flights or outputs.estimates is not None or whole:
-            makers = competitors_of(problem, names, trust)
-            named = replace(experiment, paper=problem.paper_among(makers))
-            dataset = run_experiment(named, makers, tick, workers)
-            records = tidy_records(dataset)
-            if outputs.estimates is None:
-                tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]
-                dataset = dataset.drop_vars(tracks)
-            curves = None if outputs.folder is None else curves_of(dataset)
-            return Outcome(dataset, records, curves, refusal, store, _episode_costs(dataset))
-        requests = evaluation_requests(problem, experiment, names, trust, curves=outputs.folder is not None)
-        work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
-        found = dict(summaries(requests, workers, tick, store, work))
-    records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
-    contenders = [one.contender for one in found.values()]
-    costs = {c.name: c.costs for c in contenders if c.costs is not None}
-    return Outcome(dataset, records, summary_curves, refusal, store, costs)
-
-
-def _episode_costs(dataset: xarray.Dataset) -> dict[str, numpy.ndarray]:
-    """Mean cost of every episode by name; of bounds and without truth there is none."""
-    if "cost" not in dataset:
-        return {}
-    costs = {str(name): mean_cost(dataset, name) for name in dataset["policy"].values.tolist()}
-    return {name: own for name, own in costs.items() if not numpy.isnan(own).all()}
+        found = run_requests(requests, workers, lambda done: bar.update(line, advance=done), store, whole)
+    if outputs.estimates is None:
+        tracks = [name for name in found.dataset if name in TRACKS or str(name).startswith("measurement_")]
+        found = found._replace(dataset=found.dataset.drop_vars(tracks))
+    return found, refusal
 
 
 def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
@@ -351,7 +309,8 @@ def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
 
 def write(
     problem: Problem,
-    outcome: Outcome,
+    found: Evaluation,
+    refusal: str,
     outputs: Outputs,
     learned: list[str],
     worst: Mapping[str, Sequence[WorstTrack]],
@@ -360,30 +319,28 @@ def write(
 
     Args:
         problem: that was evaluated.
-        outcome: of :func:`run`.
+        found: of :func:`run`.
+        refusal: likewise.
         outputs: what is written.
         learned: names that are learned.
         worst: by the names of those whose cost is explained their worst episodes.
     """
-    flights = outcome.flights
-    differences = outcome.differences(problem) if outcome.dataset.attrs["recorded"] else {}
+    flights = flights_of(found)
+    differences = likelihood_differences(problem, found.dataset) if found.recorded else {}
     printed, in_file = (
-        outcome.tables(problem, flights, differences, width) for width in (console.width, LATEX_WIDTH)
+        tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
     )
-    records = [*outcome.records, *flights]
+    records = [*found.records, *flights]
     if outputs.estimates is not None:
-        write_estimates(outputs.estimates, outcome.dataset)
+        write_estimates(outputs.estimates, found.dataset)
     if outputs.records is not None:
         write_records(outputs.records, records)
     results: list[Result] = []
-    refusal = outcome.refusal
-    if outputs.folder is not None and outcome.curves is not None:
-        if outcome.has_truth:
+    if outputs.folder is not None and found.curves is not None:
+        if found.has_truth:
             settings = settings_of(command_line())
-            results = [result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned, worst)]
-        whole = outcome.dataset.drop_dims(
-            "drawn_episode", errors="ignore"
-        )  # the track is for the report alone
+            results = [result_of(problem, found, learned, worst)]
+        whole = found.dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
         if not refusal:  # a summary has no variables
             largest = max(v.nbytes for v in whole.data_vars.values())
             refusal = _size_warning(whole.nbytes, largest, outputs.netcdf)
@@ -393,23 +350,22 @@ def write(
             write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
-            for name, figure in evaluation_figures(outcome.curves, outputs.columns, learned=learned):
+            for name, figure in evaluation_figures(found.curves, outputs.columns, learned=learned):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
-            for name, figure in worst_figures(worst, phrases_of(outcome.dataset), outputs.columns):
+            for name, figure in worst_figures(worst, phrases_of(found.dataset), outputs.columns):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
-        outcome.store.clear()
     for table in printed:
         print_table(table)
-    phrases = phrases_of(outcome.dataset)
+    phrases = phrases_of(found.dataset)
     console.print()
     for name in worst:
-        for sentence in reason_sentences(outcome.records, phrases, name):
+        for sentence in reason_sentences(found.records, phrases, name):
             print_sentence(sentence)
-    for note in [*notes_of(outcome.dataset), *missing_rows(outcome.records)]:
+    for note in [*notes_of(found.dataset), *missing_rows(found.records)]:
         print_sentence(note, bold=len(note) if note.startswith(LOUD) else 0)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
@@ -433,16 +389,15 @@ def missing_rows(records: Sequence[Any]) -> Iterator[str]:
 
 
 def departure_lines(
-    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
+    problem: Problem, data: Any, learned: Sequence[Competitor], keywords: Mapping[str, Any]
 ) -> Iterator[str]:
     """Say what agents are shown follows from a log, and how it departs from what each was trained on, in a line.
 
     Args:
         problem: whose agents they are.
         data: scenario, flights or recording.
-        learned: their names.
+        learned: the agents.
         keywords: parameters of the task.
-        trust: load models that can execute code.
     """
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
@@ -450,13 +405,10 @@ def departure_lines(
             f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
             f"costs count in its square; --set {name}=VALUE names another"
         )
-    for name in learned:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it was loaded before, and has warned
-            maker = find_competitor(problem, name, trust)
-        found = departure(problem.task, maker, data, keywords)
+    for agent in learned:
+        found = departure(problem.task, agent.maker, data, keywords)
         if found is not None:
-            yield f"{name}: {found}"
+            yield f"{agent.name}: {found}"
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 import xarray
 
-from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names
@@ -19,22 +18,26 @@ from ..evaluation.running.rollout import Progress
 from ..evaluation.running.threads import one_thread
 from ..evaluation.storage.blind import write_blind
 from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
-from ..names import assumed_parameters, find_competitor, is_learned, isolate_names
+from ..evaluation.storage.store import UNFINISHED, Store
+from ..functions import requests_of
+from ..names import find_competitor, isolate_names, learned_names
 from ..offline import plan_datasets
 from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
+from ..reports.tables.reasons import explained_by_default
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of
 from ..reports.tables.terminal_tables import datasets_table, results_tables
 from ..reports.tables.worst import find_worst
 from .evaluation import (
     FileOptions,
     Outputs,
+    assumed_parameters,
     check_explained,
     departure_lines,
     find_data,
-    find_names,
+    find_participants,
     keeps_predictions,
     run,
     write,
@@ -214,9 +217,10 @@ def evaluate_policies(
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
     if isolated:
         policy, why = isolate_names(problem, policy or []), isolate_names(problem, why or [])
-    names = find_names(problem, data, policy)
+    with limit_programs(time_limit, memory_limit):
+        competitors = find_participants(problem, data, policy, trust)
+    names, learned = [one.name for one in competitors], [one for one in competitors if one.learned]
     check_explained(why or [], names)
-    learned = [name for name in names if is_learned(problem, name)]
     check_names(problem.task, keywords)
     experiment = problem.experiment(
         data,
@@ -232,15 +236,19 @@ def evaluate_policies(
         timed=True,
         keywords=keywords,
     )
+    store = Store(None if out is None else out / UNFINISHED)
+    requests = requests_of(problem, experiment, competitors, curves=out is not None)
     with limit_programs(time_limit, memory_limit):
         with Workers(jobs, cluster) as workers:
-            outcome = run(problem, experiment, names, outputs, workers, trust)
-        explained = outcome.explained(policy or [], why or [])
+            found, refusal = run(requests, outputs, workers, store)
+        paper = found.dataset.attrs["paper"]
+        explained = why or explained_by_default(found.records, policy or [], paper)
         worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
         if out is not None:
-            worst = find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
-    write(problem, outcome, outputs, learned, worst)
-    for sentence in departure_lines(problem, data, learned, keywords, trust):
+            worst = find_worst(experiment, found, competitors, explained)
+    write(problem, found, refusal, outputs, [one.name for one in learned], worst)
+    store.clear()
+    for sentence in departure_lines(problem, data, learned, keywords):
         print_sentence(sentence)
 
 
@@ -397,7 +405,7 @@ def benchmark(
             )
 
         def save_figures(cell: Cell, curves: xarray.Dataset) -> None:
-            learned = pretrained_agents(cell.environment)
+            learned = learned_names(cell.environment)
             for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
@@ -447,6 +455,6 @@ def animate(
         path = writable_file(
             out / f"{problem.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
         )
-        maker = find_competitor(problem, name, trust)
+        maker = find_competitor(problem, name, trust).maker
         write_animation(episode_frames(problem.task, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

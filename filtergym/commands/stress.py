@@ -10,7 +10,7 @@ from ..evaluation.running.threads import one_thread
 from ..evaluation.storage.files import writable_file, write_text
 from ..evaluation.stress.alterations import ALTERATIONS
 from ..evaluation.stress.crash_test import CrashTest, Finding
-from ..names import FILE, find_competitor
+from ..names import find_competitor, find_competitors
 from ..reports.pages.crash_report import crash_page, crash_table
 from ..reports.tables.export import write_records
 from .terminal import (
@@ -70,22 +70,23 @@ def stress(
     problem = problem_of(environment)
     keywords = parse_settings(settings, problem.task)
     for name in policy:
-        if name.startswith(FILE):
+        if name.startswith("file:"):
             raise ValueError(f"{name!r} has answered already, and a crash test asks: name a filter")
     for path in (json, html):
         if path is not None:
             writable_file(path)
-    makers = {name: find_competitor(problem, name, trust) for name in policy}
+    competitors = find_competitors(problem, policy, trust)
     experiment = problem.experiment(scenario, episodes, seed, split, backend=backend, keywords=keywords)
     paper = problem.baselines.score_paper
-    reference = (paper, find_competitor(problem, paper)) if paper else None
+    reference = (paper, find_competitor(problem, paper).maker) if paper else None
     tested: list[list[Finding]] = []
     with progress_bar() as bar:
-        line = bar.add_task("recording", total=len(makers) * (len(ALTERATIONS) + 2))
+        line = bar.add_task("recording", total=len(competitors) * (len(ALTERATIONS) + 2))
         test = CrashTest(experiment, steps, reference)
-        for name, maker in makers.items():
-            bar.update(line, description=f"testing {name}")
-            tested.append(list(test.findings(name, maker, lambda done: bar.update(line, advance=done))))
+        for one in competitors:
+            bar.update(line, description=f"testing {one.name}")
+            found = test.findings(one.name, one.maker, lambda done: bar.update(line, advance=done))
+            tested.append(list(found))
     findings = [finding for own in tested for finding in own]
     for own in tested:
         print_table(crash_table(own))

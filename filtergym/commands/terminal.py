@@ -76,11 +76,11 @@ def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]
 
 def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
     """Names of the environment's policies, estimators, references and bounds, tuned ones, and shipped agents."""
-    from ..agents.named_policies import pretrained_agents
     from ..baselines.problem import problem_of
+    from ..names import shipped_names
 
     ids = _environments_of(ctx)
-    names = dict.fromkeys(name for id in ids for name in [*problem_of(id).names, *pretrained_agents(id)])
+    names = dict.fromkeys(name for id in ids for name in shipped_names(problem_of(id)))
     return [name for name in names if name.startswith(incomplete)]
 
 

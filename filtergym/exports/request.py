@@ -5,9 +5,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..baselines.fitted_filters import SUFFIX, LogSetup
+from ..baselines.fitted_filters import LogSetup
 from ..baselines.problem import Problem
-from ..names import find_competitor, find_log_setup
+from ..names import file_endings, find_competitor
 
 
 class ExportRequest(NamedTuple):
@@ -41,12 +41,13 @@ def request_export(
     Raises:
         ValueError: for an unknown name.
     """
-    log = find_log_setup(problem, name)
+    found = find_competitor(problem, name, trust)
+    log = found.log
     read = log.parameters if log is not None and scenario is None else {}
     return ExportRequest(
         problem,
         _own_name(problem, name),
-        find_competitor(problem, name, trust),
+        found.maker,
         scenario,
         {**read, **keywords},
         log,
@@ -56,7 +57,7 @@ def request_export(
 def _own_name(problem: Problem, name: str | Path) -> str:
     """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
     text = str(name)
-    for ending in (SUFFIX, ".safetensors", ".zip"):
+    for ending in file_endings():
         if text.endswith(ending):
             return Path(name).name.removesuffix(ending).removeprefix(f"{problem.short_name}.")
     return Path(name).name if Path(name).is_dir() else text

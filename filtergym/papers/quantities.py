@@ -15,7 +15,7 @@ import xarray
 
 from ..evaluation.running.rollout import rollout
 from ..evaluation.statistics.bootstrap import Bootstrap, percentile_interval
-from ..names import evaluate
+from ..functions import evaluate
 
 RESAMPLES = 500
 
@@ -82,7 +82,7 @@ def evaluate_policy(
         name: of the policy.
         scenario: name of the scenario.
         episodes: Monte Carlo runs.
-        **keywords: of :func:`~filtergym.names.evaluate`; parameters of the task.
+        **keywords: of :func:`~filtergym.evaluate`; parameters of the task.
     """
     return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 

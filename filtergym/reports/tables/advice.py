@@ -10,7 +10,7 @@ from rich.table import Table
 
 from ...baselines.advice import APART, Advice
 from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
-from ...baselines.judgement import Competitor
+from ...baselines.judgement import JudgedFilter
 from ...baselines.table import Tunable
 from ...envs.contract.log_format import deviation_words, is_assumed
 from ...envs.data.recording import Recording
@@ -76,7 +76,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
 class Row(NamedTuple):
     """A row of the table of an advice."""
 
-    competitor: Competitor
+    competitor: JudgedFilter
     label: str
     cells: tuple[str, ...]
     """In the order of ``COLUMNS``."""
@@ -88,7 +88,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
-    rest: list[Competitor] = []
+    rest: list[JudgedFilter] = []
     for each in advice.competitors:  # a filter that answers as another does in this log needs no row
         if each not in keep and not any(_answers_alike(each, other) for other in [*keep, *rest]):
             rest.append(each)
@@ -132,7 +132,7 @@ def price_table(advice: Advice, learned: Sequence[str]) -> Table | None:
     return table
 
 
-def _answers_alike(one: Competitor, other: Competitor) -> bool:
+def _answers_alike(one: JudgedFilter, other: JudgedFilter) -> bool:
     """Whether two filters say the same of every number of a log: likelihoods that are not known are not the same."""
     compared = "log_likelihood", "gain", "difference", "prediction"
     return all(getattr(one, name) == getattr(other, name) for name in compared)
@@ -202,7 +202,7 @@ def held_out_numbers(advice: Advice) -> dict[str, float | str | None]:
     return {**rounded, "relative_to": advice.rival}
 
 
-def _label(advice: Advice, one: Competitor) -> str:
+def _label(advice: Advice, one: JudgedFilter) -> str:
     """Name of a filter, and what it is here."""
     role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
     role = "advised" if one is advice.advised else role
@@ -528,7 +528,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     """What the learned agents did, which were trained on other data."""
-    found: list[Competitor] = [
+    found: list[JudgedFilter] = [
         c for c in advice.competitors if c.name in learned and not math.isnan(c.relative_error.value)
     ]
     worse = [c for c in found if c.relative_error.low > 0.0]

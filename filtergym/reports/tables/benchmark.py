@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import xarray
 
-from ...agents.named_policies import pretrained_agents, ranked_names
 from ...baselines.problem import Problem, problem_of
 from ...envs.engine.catalogue import catalogue
 from ...envs.engine.scenario_choice import make_task
@@ -19,12 +18,13 @@ from ...evaluation.running.metrics import Record
 from ...evaluation.running.parallel import Workers, check_workers
 from ...evaluation.running.rollout import Progress
 from ...evaluation.running.seeds import episode_seeds
-from ...evaluation.running.summary import EvaluationRequest, Summary, combine_summaries, summaries
+from ...evaluation.running.summary import Evaluation, EvaluationRequest, Summary, combine_summaries, summaries
 from ...evaluation.statistics.cause_split import CAUSE_METRICS, phrases_of
 from ...evaluation.storage.dataset import groups_of, notes_of
 from ...evaluation.storage.files import claim_folder, writable_file
 from ...evaluation.storage.store import UNFINISHED, Store
-from ...names import evaluation_requests
+from ...functions import requests_of
+from ...names import find_competitors, learned_names, ranked_names
 from .ranking import best_of_origins
 from .results import (
     RESULTS,
@@ -38,7 +38,6 @@ from .results import (
     write_results,
 )
 from .terminal_tables import HEADLINE
-from .work import work_of
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
@@ -100,7 +99,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         won = [name for name in tuned if problem.tuned_values.has_won(name.removesuffix("-tuned"))]
         telling = known.benchmark or known.names
         own = (f"{name}-tuned" if f"{name}-tuned" in won else name for name in telling)
-        everything = (*own, *won, *pretrained_agents(problem.id))
+        everything = (*own, *won, *learned_names(problem.id))
     return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
 
 
@@ -155,9 +154,7 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
 
 def result_of(
     problem: Problem,
-    dataset: xarray.Dataset,
-    records: list[Record],
-    curves: xarray.Dataset,
+    evaluation: Evaluation,
     learned: Sequence[str],
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
 ) -> Result:
@@ -165,13 +162,14 @@ def result_of(
 
     Args:
         problem: that was evaluated.
-        dataset: the evaluation, of whose variables only those of the track are needed, which ``drawn_episodes`` keeps.
-        records: of it, tidy.
-        curves: of it; those of what is shown are kept.
+        evaluation: with curves, of which those of what is shown are kept. Of the variables of its dataset only those of
+            the track are needed, which ``drawn_episodes`` keeps.
         learned: names that stand for something learned, those of competitors among them.
         worst: by the names of those whose cost is to be explained their worst episodes; default: the paper's algorithm,
             and none.
     """
+    dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
+    assert curves is not None
     cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
@@ -234,7 +232,7 @@ class BenchmarkOptions(NamedTuple):
             threads=self.threads,
             timed=self.timed,
         )
-        return evaluation_requests(cell.problem, experiment, cell.policies)
+        return requests_of(cell.problem, experiment, find_competitors(cell.problem, cell.policies))
 
 
 class Callbacks(NamedTuple):
@@ -267,11 +265,10 @@ class _Results:
         cell, found = self.wanted[i], self._summaries[i]
         found[name] = summary
         if len(found) == len(cell.policies):
-            records, curves, head = combine_summaries([found.pop(name) for name in cell.policies])
-            assert curves is not None  # they were asked for
-            self.callbacks.drawn(cell, curves)
-            learned = pretrained_agents(cell.environment)
-            self._results[i] = result_of(cell.problem, head, records, curves, learned)
+            evaluation = combine_summaries([found.pop(name) for name in cell.policies])
+            assert evaluation.curves is not None  # they were requested
+            self.callbacks.drawn(cell, evaluation.curves)
+            self._results[i] = result_of(cell.problem, evaluation, learned_names(cell.environment))
         while self._told < len(self._results) and (due := self._results[self._told]) is not None:
             self.callbacks.finished(due)
             self._told += 1
@@ -330,9 +327,8 @@ def _run_cells(
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
-    work = [work_of(wanted[i].problem, one) for one, i in asked]
     results = _Results(wanted, callbacks)
-    for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
+    for k, summary in summaries([one for one, _ in asked], workers, tick, store):
         one, i = asked[k]
         results.add(i, one.name, summary)
     return results.all()

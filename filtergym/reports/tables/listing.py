@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from ...agents.named_policies import pretrained_agents
 from ...baselines.problem import Problem
 from ...compiler.library import fastest
 from ...compiler.native import processor
@@ -11,6 +10,7 @@ from ...envs.contract.task import Task
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import USER_TASKS, parameter_names
 from ...envs.engine.compiled import AVAILABLE
+from ...names import learned_names
 
 FEWEST_COLUMNS = 20
 """Of a text beside its head, however narrow the terminal."""
@@ -52,7 +52,7 @@ def environment_lines(problem: Problem, width: int) -> Iterator[str]:
         "policies": list(known.policies),
         "estimators": list(known.estimators),
         "tuned": problem.tuned_policies,
-        "learned": pretrained_agents(cls.id),
+        "learned": learned_names(cls.id),
         "smoothers": [f"{', '.join(known.smoothers)} (not causal: they use later measurements)"]
         if known.smoothers
         else [],

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ...agents.named_policies import pretrained_agents
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import NEGLIGIBLE, Record
+from ...names import learned_names
 from .results import Result
 from .terminal_tables import HEADLINE, INCONSISTENT_WORDS, consistency_word, with_interval
 
@@ -37,7 +37,7 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
         records: of the scenario.
         learned: names of those that were learned; default: the environment's shipped agents.
     """
-    learned = pretrained_agents(records[0].environment) if learned is None else learned
+    learned = learned_names(records[0].environment) if learned is None else learned
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
     places = []
     for name, kind in dict.fromkeys((r.policy, r.kind) for r in records if r.kind in RANKED):

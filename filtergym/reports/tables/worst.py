@@ -6,42 +6,37 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy
 import xarray
 
-from ...baselines.problem import Problem
+from ...evaluation.competitors.kinds import Competitor
 from ...evaluation.figures.worst_episodes import describe_worst, draw_worst, run_episodes, select_worst
 from ...evaluation.running.evaluate import Experiment
 from ...evaluation.running.metrics import Record
+from ...evaluation.running.summary import Evaluation
 from ...evaluation.storage.dataset import groups_of
-from ...names import competitors_of
 from .reasons import reasons_of
 from .results import WorstTrack, components_to_draw, track_of
 
 
 def find_worst(
-    problem: Problem,
     experiment: Experiment,
-    costs: Mapping[str, numpy.ndarray],
-    records: Sequence[Record],
+    evaluation: Evaluation,
+    competitors: Sequence[Competitor],
     explained: Sequence[str],
-    trust: bool = False,
 ) -> dict[str, list[WorstTrack]]:
     """Run the worst episodes of some competitors once more, each beside the opponent; their tracks by name.
 
     Args:
-        problem: whose competitors they are.
         experiment: of the evaluation.
-        costs: mean cost of every episode by name, ``(episodes,)``.
-        records: of the evaluation.
-        explained: names of the competitors.
-        trust: load models that can execute code.
+        evaluation: of these competitors.
+        competitors: of the evaluation.
+        explained: names of those whose episodes are run.
     """
     found: dict[str, list[WorstTrack]] = {name: [] for name in explained}
-    for name in found.keys() & costs.keys():
-        opponent = opponent_in(records, name)
-        numbers = select_worst(costs[name])
-        makers = competitors_of(problem, [name, opponent] if opponent else [name], trust)
+    for name in found.keys() & evaluation.costs.keys():
+        opponent = opponent_in(evaluation.records, name)
+        numbers = select_worst(evaluation.costs[name])
+        makers = {one.name: one.maker for one in competitors if one.name in (name, opponent)}
         dataset = run_episodes(experiment, makers, numbers)
         components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
         for i, worst in enumerate(describe_worst(dataset, numbers, name, opponent)):
