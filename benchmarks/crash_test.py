@@ -16,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.stress.crash_test import CrashTest, Finding
-from filtergym.names import find_competitor
+from filtergym.names import find_competitor, ranked_names
 from filtergym.papers.grid import markdown_table
 
 COLUMNS = ["", "passed", "degraded", "failed", "degraded under", "failed under"]

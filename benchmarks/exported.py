@@ -50,7 +50,7 @@ from filtergym.exports.traced_filter import (
     TracedFilter,
     one_lane,
 )
-from filtergym.names import find_competitor
+from filtergym.names import find_competitor, ranked_names
 
 COLUMNS = (
     "environment", "competitor", "operations", "state_bytes", "weight_bytes", "source_bytes", "code_bytes",
