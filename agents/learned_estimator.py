@@ -1,6 +1,6 @@
 """A learned estimator: a filter with a network inside, as plain arrays.
 
-The filter is a bank of the environment (``Task.trained_banks``), the network is a learned policy that acts in it. From
+The filter is a bank of the environment (:class:`.TrainedBanks`), the network is a learned policy that acts in it. From
 outside there is neither observation nor action: measurements go in, mean and covariance come out.
 """
 
@@ -48,7 +48,7 @@ class EstimatorMaker:
     """Makes a learned estimator for a task; what an evaluation calls.
 
     Args:
-        bank: name of the filter in ``task.trained_banks``.
+        bank: name of the filter among the trained banks of the task.
         policy: what makes the network for a model of that bank.
     """
 

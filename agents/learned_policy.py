@@ -16,6 +16,7 @@ from typing import Any, get_type_hints
 
 import numpy
 
+from ..envs.contract.companions import action_reach, trained_banks
 from ..envs.contract.model import Model
 from ..envs.contract.parameters import quote_shortened
 from ..envs.contract.task import Task
@@ -305,15 +306,15 @@ class StoredPolicy:
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """How far its actions reach (:attr:`.Task.reach`), where its training said so."""
-        reach = task_class(self.header["environment"]).reach.get(self.control, ())
+        """How far its actions reach (:class:`.Actions`), where its training said so."""
+        reach = action_reach(task_class(self.header["environment"]), self.control)
         return {name: value for name, value in self._keywords.items() if name in reach}
 
     def _check_reach(self, model: Model) -> None:
         """Raise ValueError if an action of the model does not reach as far as in training."""
         now, keywords = model.task.parameters, self.task_keywords
         defaults = type(now)()
-        for name in model.task.reach.get(self.control, ()):
+        for name in action_reach(model.task, self.control):
             if name == "decision_interval":  # an action means the same, however long it holds
                 continue
             trained = keywords.get(name, getattr(defaults, name))
@@ -360,7 +361,7 @@ def load_policy(cls: type[Task], path: Path) -> StoredPolicy | EstimatorMaker:
         raise ValueError(
             f"{path} was trained on {quote_shortened(stored.header['environment'])}, not on {cls.id}"
         )
-    return EstimatorMaker(stored.control, stored) if stored.control in cls.trained_banks else stored
+    return EstimatorMaker(stored.control, stored) if stored.control in trained_banks(cls) else stored
 
 
 def pretrained_path(id: str, name: str) -> Path:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ..baselines.problem import Problem
+from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
 from ..envs.data.flights import is_folder
 from ..evaluation.competitors.kinds import Competitor, Source
@@ -79,7 +80,7 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
 
 def _as_recorded(model: Any, run: TrainingRun) -> Any:
     """Return a model with what was around it in training, and the reach of its actions."""
-    reach = run.problem.task.reach.get(run.control, ())
+    reach = action_reach(run.problem.task, run.control)
     model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):
         return model

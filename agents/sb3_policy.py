@@ -20,6 +20,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from ..envs.contract.companions import action_reach
 from ..envs.interface.environment import TaskEnv
 from ..envs.interface.vector_environment import TaskVectorEnv
 from .eager_optimiser import exclude_from_compilation
@@ -105,13 +106,13 @@ class Sb3Policy:
 
 
 def _reach(model: BaseAlgorithm) -> dict[str, Any]:
-    """How far actions reach (:attr:`.Task.reach`) in the environment that a model holds, where not as by default."""
+    """How far actions reach (:class:`.Actions`) in the environment that a model holds, where not as by default."""
     held = model.get_env()
     inner: Any = None if held is None else held.unwrapped
     env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
     if not isinstance(env, TaskEnv | TaskVectorEnv):
         return {}
-    own, names = env.task.parameters, env.task.reach.get(env.model.control, ())
+    own, names = env.task.parameters, action_reach(env.task, env.model.control)
     defaults = type(own)()
     return {name: getattr(own, name) for name in names if getattr(own, name) != getattr(defaults, name)}
 

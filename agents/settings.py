@@ -21,7 +21,7 @@ OPTIONS = ("control", "scenario", "backend")
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training takes."""
 ESTIMATORS = ("kalman-net", "student")
-"""Algorithms that make a learned estimator: they steer a filter of their own (``Task.trained_banks``)."""
+"""Algorithms that make a learned estimator: they steer a filter of their own (:class:`.TrainedBanks`)."""
 THROUGH_THE_FILTER = ("bptt", "bptt-linear", "bptt-small", *ESTIMATORS)
 """Algorithms of :mod:`.bptt`."""
 OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}

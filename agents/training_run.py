@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from ..baselines.problem import Problem, problem_of
+from ..envs.contract.companions import trained_banks
 from ..envs.contract.model import Model
 from ..envs.contract.parameters import check_integer
 from ..envs.contract.task import Task
@@ -298,8 +299,8 @@ def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
     """
     if algorithm not in ESTIMATORS:
         return cls.controls
-    if algorithm not in cls.trained_banks:
-        having = [other.id for other in catalogue().values() if algorithm in other.trained_banks]
+    if algorithm not in trained_banks(cls):
+        having = [other.id for other in catalogue().values() if algorithm in trained_banks(other)]
         raise ValueError(
             f"{cls.id} has no filter for {algorithm!r} to steer: choose another algorithm, or {', '.join(having)}"
         )

@@ -20,6 +20,8 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
+from ..envs.contract.companions import find_companion
+from ..envs.contract.log_format import LogFormat
 from ..envs.contract.task import Task
 from ..envs.data.recorded_world import fill_arrays, measure_once
 from ..envs.data.recording import Recording
@@ -89,7 +91,7 @@ class FittedLog:
         it is to be ``robust``, fit the share of outliers, too, but not to what is a user's ``own``, whose answer may
         be less.
         """
-        log_format = self.problem.task.log_format
+        log_format = find_companion(self.problem.task, LogFormat)
         if family.anchored or log_format is None or log_format.scale_noise is None:
             return family
         if robust and not own:

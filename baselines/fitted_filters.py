@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.log_format import is_assumed
+from ..envs.contract.companions import find_companion
+from ..envs.contract.log_format import LogFormat, is_assumed
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.competitors.kinds import Competitor, Source
 from ..evaluation.storage.files import write_text
@@ -149,7 +150,8 @@ def write_advised(
         **further: what else is to be known of it, such as its held-out numbers.
     """
     log = setup_of(problem, recording)
-    known = problem.task.log_format.columns if problem.task.log_format else {}
+    log_format = find_companion(problem.task, LogFormat)
+    known = log_format.columns if log_format else {}
     seconds = recording.seconds
     table: dict[str, Any] = {
         "environment": problem.id,
@@ -224,7 +226,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
     }
     if isinstance(log, dict):
         log = {"origin": {}, **log}  # files of older versions say nothing of it
-    log_format = problem.task.log_format
+    log_format = find_companion(problem.task, LogFormat)
     names = {
         "time",
         "recording",
@@ -263,7 +265,7 @@ def _make_fitted(path: Path, problem: Problem, name: str, values: Mapping[str, f
     family = families[name]
     for wrapped, wrap in ((OUTLIER_SHARE, with_outliers), (NOISE_SCALE, with_noise_scale)):
         if wrapped in values:
-            log_format = problem.task.log_format
+            log_format = find_companion(problem.task, LogFormat)
             if log_format is None or log_format.scale_noise is None:
                 raise ValueError(
                     f"{path}: measurements of {problem.id} state no deviations that could be scaled"

@@ -16,6 +16,7 @@ import numpy
 import xarray
 
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.companions import lost_cost
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
@@ -108,7 +109,7 @@ def main() -> None:
     for environment, scenario, names in CASES:
         problem = problem_of(f"filtergym/{environment}-v0")
         paper = episode_costs(environment, scenario, problem.paper, options.episodes)
-        bound = make_task(problem.task, scenario).lost_cost or numpy.inf
+        bound = lost_cost(make_task(problem.task, scenario)) or numpy.inf
         for name in names:
             pool = Pool(paper, episode_costs(environment, scenario, name, options.episodes), bound)
             cells = [coverage(pool, number, options.repetitions) for number in NUMBERS]

@@ -1,6 +1,7 @@
 """An environment from a state-space model in a few lines."""
 
 import dataclasses
+import functools
 import itertools
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -214,7 +215,7 @@ def state_space(
     attributes = state_space_attributes(definition, components, dict(parameters))
     attributes |= {"id": id, "__module__": module, "__qualname__": name, "__doc__": StateSpace.__doc__}
     cls: Any = type(name, (StateSpace,), attributes)
-    cls.reward_unit = _RewardUnit(StateSpaceParameters(**parameters))
+    cls.reward = _EstimatedReward(cls, StateSpaceParameters(**parameters))
     try:
         register_task(cls, state_space_baselines(cls))
     except ValueError as error:
@@ -329,20 +330,24 @@ def _chain(transition: Any, count: int) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, matrix.tolist()))
 
 
-class _RewardUnit:
-    """Unit of the reward of a class, which is estimated when it is first asked for: most uses of a model need none, and
-    it takes a tenth of a second, or half of one where the model is a drift.
+class _EstimatedReward:
+    """Reward of a class whose unit is estimated when it is first asked for: most uses of a model need none, and it
+    takes a tenth of a second, or half of one where the model is a drift.
 
     Args:
+        cls: the class.
         parameters: of the class, as it is registered.
     """
 
-    def __init__(self, parameters: StateSpaceParameters) -> None:
-        self._parameters = parameters
+    cost, kind, log_unit = StateSpace.reward.cost, StateSpace.reward.kind, None
 
-    def __get__(self, task: StateSpace | None, cls: type[StateSpace]) -> float:
-        cls.reward_unit = _typical_cost(cls, self._parameters)
-        return cls.reward_unit
+    def __init__(self, cls: type[StateSpace], parameters: StateSpaceParameters) -> None:
+        self._cls, self._parameters = cls, parameters
+
+    @functools.cached_property
+    def unit(self) -> float:
+        """What an episode is charged, typically."""
+        return _typical_cost(self._cls, self._parameters)
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:

@@ -21,6 +21,7 @@ import msgspec
 import numpy
 
 from .baselines.problem import problem_of
+from .envs.contract.companions import lost_cost
 from .envs.data.foreign_files import read_content
 from .envs.engine.catalogue import bare_name, nearest
 from .evaluation.competitors.kinds import RANKED, kind_of
@@ -123,7 +124,7 @@ def _check(protocol: Protocol) -> None:
     for own in protocol.environments:
         problem = problem_of(own.id)
         pairs.append((f"interface of {own.id}", own.interface, problem.task.interface))
-        pairs.append((f"lost_cost of {own.id}", own.lost_cost, problem.task.lost_cost))
+        pairs.append((f"lost_cost of {own.id}", own.lost_cost, lost_cost(problem.task)))
         for scenario in (own.training, *own.held_out):
             if scenario not in problem.task.scenarios:
                 raise nearest(f"scenario of {own.id}", scenario, problem.task.scenarios)

@@ -19,6 +19,8 @@ from filtergym.baselines.judgement import AS_GOOD, Judgement
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.companions import find_companion
+from filtergym.envs.contract.log_format import LogFormat
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task, read_recording
 from filtergym.evaluation.competitors import likelihood as likelihood_module
@@ -63,7 +65,7 @@ def likelihood_of(recording, name, spans=None, warm_up=10, noise=False):
     task = make_task(task_class(ID), None, **recording.parameters)
     tunable = log_families(recording)[name]
     if noise:
-        tunable = with_noise_scale(tunable, task.log_format.scale_noise)
+        tunable = with_noise_scale(tunable, find_companion(task, LogFormat).scale_noise)
     spans = spans or [Span(0, 10, int(recording.rows[0]))]
     windows = cut_windows(recording, task, spans, warm_up)
     return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes), tunable

@@ -13,6 +13,7 @@ from filtergym import evaluate
 from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, load_policy, pretrained_path
 from filtergym.agents.residual import ResidualPolicy
+from filtergym.envs.contract.companions import TrainedBanks, trained_banks
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.task import named_arrays
@@ -22,7 +23,6 @@ from filtergym.evaluation.running.rollout import run_competitor
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
-BANKS = ("banks", "trained_banks")
 SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
 
 OPTIMAL = {
@@ -116,8 +116,9 @@ def wider(cls):
 
         return type(bank.__name__, (bank,), {"blocks": property(blocks)})
 
-    tables = {table: {name: with_more(b) for name, b in getattr(cls, table).items()} for table in BANKS}
-    return type(cls.__name__, (cls,), tables)
+    banks, trained = ({name: with_more(b) for name, b in t.items()} for t in (cls.banks, trained_banks(cls)))
+    companions = (TrainedBanks(trained), *cls.companions)
+    return type(cls.__name__, (cls,), {"banks": banks, "companions": companions})
 
 
 @pytest.mark.parametrize(

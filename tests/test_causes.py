@@ -9,7 +9,7 @@ import pytest
 import filtergym
 from filtergym.baselines.problem import problem_of
 from filtergym.commands.terminal import fill
-from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Moment, bins, cause_number
+from filtergym.envs.contract.causes import MISSED, OUTLIER, Cause, Causes, Moment, bins, cause_number
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.figures.worst_episodes import (
     describe_worst,
@@ -309,14 +309,14 @@ def test_stretches_cover_an_episode(times):
 def test_causes_of_ones_own_are_checked():
     class Twice(task_class(ENV)):
         id = "mine/Twice-v0"
-        causes = (MISSED, MISSED)
+        companions = (Causes((MISSED, MISSED)),)
 
     with pytest.raises(ValueError, match=r"causes of different names, .* got the name 'missed'"):
         filtergym.register_task(Twice)
 
     class Wrong(task_class(ENV)):
         id = "mine/Wrong-v0"
-        causes = (Cause("shape", "in shape", lambda moment: moment.state > 0.0),)
+        companions = (Causes((Cause("shape", "in shape", lambda moment: moment.state > 0.0),)),)
 
     with pytest.raises(ValueError, match="cause 'shape' must be numbers of shape"):
         filtergym.register_task(Wrong)

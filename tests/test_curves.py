@@ -11,6 +11,7 @@ from models import make_model
 from scipy.stats import chi2
 
 from filtergym import evaluate, record
+from filtergym.envs.contract.companions import LoopRecords
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.named_axes import action_names
@@ -224,11 +225,7 @@ def test_what_it_says_of_itself(dataset, curves, tmp_path):
 
 def test_names_that_an_evaluation_keeps_are_refused(monkeypatch):
     cls = task_class(TARGET)
-    monkeypatch.setattr(cls, "records", lambda self, model, episode, kept: {"action": episode.truth[0]})
+    report = LoopRecords(lambda model, episode, kept: {"action": episode.truth[0]})
+    monkeypatch.setattr(cls, "companions", (report, *cls.companions))
     with pytest.raises(ValueError, match="records something under the name 'action'"):
         evaluate(TARGET, "imm", "paper", 2, horizon=3, backend="numpy")
-    monkeypatch.setattr(cls, "groups", {"here": ("position_x",), "there": ("position_x",)})
-    with pytest.raises(ValueError, match="'position_x' belongs to several groups: here, there"):
-        evaluate(
-            TARGET, "imm", "paper", 2, progress=lambda _: pytest.fail("episodes ran before it was refused")
-        )

@@ -488,7 +488,7 @@ def test_a_horizon_ends_every_flight_and_decisions_that_hold_fit():
 
 
 def test_too_many_scans_are_refused(monkeypatch):
-    monkeypatch.setattr("filtergym.envs.maneuvering_target.task.MOST_SCANS", 71)
+    monkeypatch.setattr("filtergym.envs.maneuvering_target.flights.MOST_SCANS", 71)
     with pytest.raises(ValueError, match="have 72 scans of 6 s together, more than 71: fly fewer"):
         make_model(ID, scenario=three())
 

@@ -9,6 +9,7 @@ import filtergym
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, write_arrays
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.companions import trained_banks
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine.catalogue import catalogue
@@ -25,8 +26,8 @@ NAME = "kalman-net"
 SATELLITES = "filtergym/TightlyCoupledNavigation-v0"
 SHORT = {SATELLITES: {"horizon": 60, "backend": "numpy"}}
 """Of what takes long to compile."""
-TRAINED = [(id, name) for id, cls in catalogue().items() for name in cls.trained_banks]
-HAVING = [id for id, cls in catalogue().items() if NAME in cls.trained_banks]
+TRAINED = [(id, name) for id, cls in catalogue().items() for name in trained_banks(cls)]
+HAVING = [id for id, cls in catalogue().items() if NAME in trained_banks(cls)]
 
 
 def network(model, answer=0.0):
@@ -326,7 +327,7 @@ def test_a_file_is_an_estimator_of_its_environment(tmp_path, command):
 
 def test_training_of_an_environment_without_one(command, tmp_path, monkeypatch):
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setattr(catalogue()[ESM], "trained_banks", {})
+    monkeypatch.setattr(catalogue()[ESM], "companions", ())
     code, _, error = command("train", ESM, "--algo", NAME, "--out", tmp_path / "run")
     assert code == 2
     assert (

@@ -9,6 +9,7 @@ from models import make_model
 from filtergym import evaluate, record
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.contract.companions import trained_banks
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.running.rollout import rollout
@@ -110,7 +111,7 @@ def test_shipped_estimators_never_use_what_was_not_received(id, monkeypatch):
     bits.
     """
     names, (scenario, horizon, _) = [*baselines_of(id).estimators], UNRELIABLE[id]
-    names += [name for name in catalogue()[id].trained_banks if name in pretrained_agents(id)]
+    names += [name for name in trained_banks(catalogue()[id]) if name in pretrained_agents(id)]
     keywords = {"episodes": 4, "horizon": horizon, "backend": "numpy" if "Tightly" in id else "auto"}
     found = evaluate(id, names, scenario, **keywords)
     monkeypatch.setattr(catalogue()[id].World, "mask_missing", lambda world, measurement: measurement)

@@ -10,7 +10,6 @@ import pytest
 
 import filtergym
 from filtergym.baselines.problem import import_problem
-from filtergym.envs.contract.live_input import LiveInput
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import read_recording
@@ -282,7 +281,7 @@ def test_what_cannot_run_ahead_is_refused():
 
 
 def test_a_misspelt_value_is_told_where_an_environment_takes_its_arrays_by_name(monkeypatch):
-    monkeypatch.setattr(import_problem(UAV).task, "live_input", LiveInput)
+    monkeypatch.setattr(import_problem(UAV).task, "companions", ())
     filter = filtergym.online(UAV, "kalman")
     states = len(filter.names)
     filter.start(np.zeros(states), np.eye(states), command=0.0)

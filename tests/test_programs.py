@@ -91,7 +91,9 @@ for k, line in enumerate(sys.stdin):
 def task_of(components=2):
     """A task as far as a program is told of it."""
     named = [Component(f"c{i}", "m") for i in range(components)]
-    return SimpleNamespace(id="mine/Task-v0", components=named, groups={}, parameters=None, closes_loop=False)
+    return SimpleNamespace(
+        id="mine/Task-v0", components=named, groups={}, companions=(), parameters=None, closes_loop=False
+    )
 
 
 def given(N, components=2):
@@ -350,7 +352,9 @@ def test_a_hello_names_every_number(env_id):
     estimator.end()
     hello = json.loads(json.dumps(estimator.hello(measured), allow_nan=False))
     assert (hello["tracks"], hello["environment"]) == (1, env_id)
-    assert [(c["name"], c["unit"], c["period"]) for c in hello["components"]] == [*model.task.components]
+    assert [(c["name"], c["unit"], c["period"]) for c in hello["components"]] == [
+        component[:3] for component in model.task.components
+    ]
     for name, part in (("initial", started[0]), ("measurement", measured)):
         present = [own for own in hello[name] if own["shape"] is not None]
         assert [own["name"].replace(".", "_") for own in present] == [n for n, _ in named_arrays(part)]

@@ -15,6 +15,8 @@ from models import make_model
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.baselines.problem import problem_of
 from filtergym.commands.evaluation import causal_competitors
+from filtergym.envs.contract.companions import find_companion
+from filtergym.envs.contract.log_format import LogFormat
 from filtergym.envs.data.recorded_tables import Columns
 from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
@@ -622,7 +624,7 @@ def test_every_column_is_on_the_page():
     text = PAGE.read_text(encoding="utf-8")
     axes = ("ins_y", "ins_z", "fix_y", "fix_z")
     for env in (TARGET, LOOSE, ESM):
-        columns = [name for name in task_class(env).log_format.columns if name not in axes]
+        columns = [name for name in find_companion(task_class(env), LogFormat).columns if name not in axes]
         assert [name for name in columns if f"`{name}`" not in text] == []
 
 

@@ -25,6 +25,7 @@ from filtergym.reports.tables.results import read_results
 
 MODULE = '''
 import filtergym
+from filtergym.envs.contract.companions import Paper, PictureMaker
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
 from filtergym.evaluation.competitors.kinds import ConstantPolicy
 
@@ -33,10 +34,7 @@ class Turns(ManeuveringTarget):
     """An aircraft that turns, once more."""
 
     id = "mine/Turns-v0"
-    paper_source = "nobody's"
-
-    def picture(self, model):
-        return None
+    companions = (Paper("nobody's"), PictureMaker(lambda model: None), *ManeuveringTarget.companions)
 
 
 class Middle(ConstantPolicy):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from filtergym.envs.contract.companions import Paper, find_companion
 from filtergym.envs.engine.catalogue import catalogue
 
 yaml = pytest.importorskip("yaml")
@@ -21,7 +22,7 @@ def test_every_paper_is_named():
         cited[paper["notes"]] = f"{', '.join(authors)}, {paper['title']}"
     assert cited.keys() == catalogue().keys()
     for id, text in cited.items():
-        assert catalogue()[id].paper_source.startswith(text)
+        assert find_companion(catalogue()[id], Paper).source.startswith(text)
 
 
 def test_every_command_of_the_workflow_exists():

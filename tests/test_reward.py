@@ -22,7 +22,7 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
     -log(1 + x), less that of the zero action.
     """
     model = make_model(env_id)
-    unit = (kind == "log-relative" and model.task.log_reward_unit) or model.task.reward_unit
+    unit = (kind == "log-relative" and model.task.reward.log_unit) or model.task.reward.unit
     beside = reference(kind, model)
     watched, plain, relative = (Lanes(model, 8, each) for each in (beside, None, beside))
     for lanes in (watched, plain, relative):

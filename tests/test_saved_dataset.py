@@ -15,7 +15,6 @@ from filtergym.__main__ import main
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import (
-    group_of_each,
     groups_of,
     keywords_as_text,
     keywords_of,
@@ -118,12 +117,6 @@ def test_keywords_that_json_does_not_know_are_told():
     text = keywords_as_text(given)
     read = keywords_of(xarray.Dataset(attrs={"keywords": text}))
     assert read == {"gain": 0.5, "gains": [[1, 2]], "pair": [1.0, 2.0], "odd": "slice(None, 3, None)"}
-
-
-def test_a_component_of_two_groups_is_refused():
-    assert group_of_each(["a", "b", "c"], {"g": ("a", "c")}) == ["g", "", "g"]
-    with pytest.raises(ValueError, match="'a' belongs to several groups: g, h"):
-        group_of_each(["a", "b"], {"g": ("a",), "h": ("b", "a")})
 
 
 # --- the page

@@ -12,6 +12,8 @@ import filtergym
 from filtergym import read_recording, record
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.companions import find_companion
+from filtergym.envs.contract.log_format import LogFormat
 from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
@@ -85,7 +87,7 @@ def test_a_table_of_any_times_is_what_a_naive_filter_makes_of_it(make, tmp_path,
         np.testing.assert_allclose(own["covariance"].values.reshape(2, 2), P, rtol=1e-12, atol=1e-12)
     # What is predicted of every sensor, and NaN where none was received.
     second = {name: values[0, 1][..., None] for name, values in recording.measurements.items()}
-    predicted, received = task_class(ID).log_format.predict(
+    predicted, received = find_companion(task_class(ID), LogFormat).predict(
         np.array([[0.0], [10.0]]), SimpleNamespace(**second), None
     )
     np.testing.assert_allclose(predicted, [[4.0], [10.0]], rtol=1e-9)

@@ -6,6 +6,7 @@ import numpy
 import pytest
 from naive import dense
 
+from filtergym.envs.contract.causes import Causes
 from filtergym.envs.contract.faults import Step
 from filtergym.envs.contract.model import Model
 from filtergym.envs.tightly_coupled_navigation.disturbances import Reception, Reflections
@@ -346,7 +347,9 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         first, last = s.disturbances["stuck"].window
         held = (s.step >= first) & (s.step <= last) & (k > 1)
         assert (held == (s.disturbances["stuck"].now == 1.0)).all()
-        causes = {c.name: model.causes(state) // 2.0**i % 2.0 for i, c in enumerate(model.task.causes)}
+        causes = {
+            c.name: model.causes(state) // 2.0**i % 2.0 for i, c in enumerate(Causes.of(model.task).causes)
+        }
         assert (causes["stuck accelerometers"] == held).all()
         assert (causes["noisy rate"] == (s.noise_factor > 1.0).any(axis=0)).all()
         if previous is not None:

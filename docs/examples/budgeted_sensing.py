@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 from filtergym.baselines.table import Baselines
+from filtergym.envs.contract.companions import Actions
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.filter import Bank, Initial
 from filtergym.envs.contract.observation import LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.contract.parameters import TaskParameters, parameter
-from filtergym.envs.contract.task import Component, PaperPolicy, Scenario, Task
+from filtergym.envs.contract.task import Component, PaperPolicy, Reward, Scenario, Task
 from filtergym.envs.contract.world import World
 from filtergym.evaluation.competitors.kinds import Policy, RandomPolicy
 from filtergym.filters import imm, kalman, semi_markov
@@ -289,11 +290,9 @@ class BudgetedSensing(Task):
     """Four manoeuvring targets, and a beam that looks at one of them each second."""
 
     id = "mine/BudgetedSensing-v0"
-    paper_source = "none: an example"
     Parameters = BudgetedSensingParameters
     World = Targets
     banks: Mapping[str, Any] = {"beam": BeamBank}
-    actions: Mapping[str, str] = {"beam": "the target that is looked at"}
     scenarios: Mapping[str, Scenario] = {
         "random": Scenario("random", "Targets of any kind; the beam finds each.", training=True),
         "narrow": Scenario(
@@ -304,9 +303,9 @@ class BudgetedSensing(Task):
         ),
     }
     components = tuple(Component(f"position_{j}", "m") for j in NUMBERS)
-    cost_description = "mean squared error of the positions, at most that of a lost target, m^2"
-    reward_unit = 1000.0
+    reward = Reward("mean squared error of the positions, at most that of a lost target, m^2", unit=1000.0)
     paper_policy = PaperPolicy("beam", 0)
+    companions = (Actions({"beam": "the target that is looked at"}),)
 
 
 # --- policies

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 from filtergym.baselines.table import Baselines
+from filtergym.envs.contract.companions import Actions
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.observation import ACTION, LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.contract.parameters import TaskParameters, parameter
 from filtergym.envs.contract.filter import Bank, Initial
 from filtergym.envs.contract.model import Model
-from filtergym.envs.contract.task import Component, PaperPolicy, Scenario, Task
+from filtergym.envs.contract.task import Component, PaperPolicy, Reward, Scenario, Task
 from filtergym.envs.contract.world import World
 from filtergym.evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from filtergym.filters import kalman
@@ -181,11 +182,9 @@ class InvertedPendulum(Task):
     """A pendulum held upright by the estimate of a Kalman filter, in gusts of unknown strength."""
 
     id = "mine/InvertedPendulum-v0"
-    paper_source = "none: an example"
     Parameters = InvertedPendulumParameters
     World = PendulumWorld
     banks: Mapping[str, Any] = {"gain": NoiseBank}
-    actions: Mapping[str, str] = {"gain": "decades of the process noise; 0 is the Kalman filter"}
     scenarios: Mapping[str, Scenario] = {
         "random": Scenario("random", "Gusts of any strength, which changes once.", training=True),
         "storm": Scenario(
@@ -193,9 +192,9 @@ class InvertedPendulum(Task):
         ),
     }
     components = (Component("angle", "rad"), Component("rate", "rad/s"))
-    cost_description = "squared angle over the variance of the sensor"
-    reward_unit = 1.0
+    reward = Reward("squared angle over the variance of the sensor")
     paper_policy = PaperPolicy("gain", (0.0,))
+    companions = (Actions({"gain": "decades of the process noise; 0 is the Kalman filter"}),)
 
     def set_up(self) -> None:
         """Compute the model that the filter believes: the pendulum for small angles."""

@@ -1,6 +1,6 @@
 """The tables of an environment's page, made from its code: what stands in the code stands on the page.
 
-Texts are those of the code: the meaning of controls (``Task.actions``), the observation blocks, the docstrings under
+Texts are those of the code: the meaning of controls (:class:`.Actions`), the observation blocks, the docstrings under
 the fields of parameters and measurement, the scenarios' descriptions, the first lines of policies' docstrings
 and what references know.
 """
@@ -10,6 +10,8 @@ import typing
 from typing import Any
 
 from filtergym.baselines.problem import Problem
+from filtergym.envs.contract.causes import Causes
+from filtergym.envs.contract.companions import action_meanings
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
 from filtergym.envs.contract.parameters import Limits, field_limits
@@ -44,7 +46,9 @@ def _actions(cls: type[Task]) -> list[str]:
     rows = []
     for control in cls.controls:
         role = " (default)" if control == cls.controls[0] else ""
-        rows.append((f"`{control}`{role}", _space(make_model(cls, control)), cls.actions.get(control, "")))
+        rows.append(
+            (f"`{control}`{role}", _space(make_model(cls, control)), action_meanings(cls).get(control, ""))
+        )
     return markdown_table(("control", "space", "meaning"), rows)
 
 
@@ -162,7 +166,7 @@ def causes_table() -> str:
     """Make the table of what evaluations of all environments split costs by, in Markdown."""
     rows = []
     for cls in catalogue().values():
-        causes = cls(cls.Parameters()).causes
+        causes = Causes.of(cls(cls.Parameters())).causes
         rows.append((cls.__name__, "; ".join(f"`{cause.name}`, {cause.phrase}" for cause in causes)))
     rows.append(("all", "`start`, the start of the track; `other`, what remains"))
     return "\n".join(markdown_table(("environment", "causes"), rows))

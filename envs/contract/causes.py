@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from .companions import find_companion
 from .observation import Array
 
 LARGE_ERROR = 4.0
@@ -123,6 +124,19 @@ def _is_outlier(moment: Moment) -> Array | None:
 
 MISSED = Cause("missed", "where a measurement is missed", _is_missed)
 OUTLIER = Cause("outlier", f"on outliers beyond {LARGE_ERROR:g} stated sigma", _is_outlier)
+
+
+class Causes(NamedTuple):
+    """Circumstances by which an evaluation splits what estimates cost."""
+
+    causes: tuple[Cause, ...] = (MISSED,)
+    start: int = 10
+    """How many measurements are the start of a track, which is one cause more."""
+
+    @classmethod
+    def of(cls, task: Any) -> "Causes":
+        """Causes of a task, by default missed measurements."""
+        return find_companion(task, cls) or cls()
 
 
 def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy
 
+from .companions import find_companion
 from .parameters import quote_shortened, read_numbers
 
 if TYPE_CHECKING:
@@ -172,6 +173,17 @@ class LiveInput:
     def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
         """Numbers that stand for what was not received; zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
+
+
+class LiveReader(NamedTuple):
+    """How values that come one by one become measurements of a problem."""
+
+    input: type[LiveInput] = LiveInput
+
+    @classmethod
+    def of(cls, task: Any) -> "LiveReader":
+        """Reader of a task, or of a class of tasks; by default that of the arrays by their names."""
+        return find_companion(task, cls) or cls()
 
 
 def _listed(values: Mapping[str, Any]) -> str:

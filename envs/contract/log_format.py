@@ -116,5 +116,8 @@ class LogFormat:
     """How the rows are measurements as they stand; None where more is done to them."""
     noise_hint: str = ""
     """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
+    decision_interval: int | None = None
+    """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
+    measurement is lost."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""

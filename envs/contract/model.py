@@ -13,7 +13,8 @@ import gymnasium
 import numpy
 
 from ...filters.angles import unwrap
-from .causes import Moment, cause_number
+from .causes import Causes, Moment, cause_number
+from .companions import LoopRecords, PictureMaker, find_companion, trained_banks
 from .draws import Draws
 from .filter import Filter, Input
 from .observation import Array, Blocks, Field, Reader
@@ -51,7 +52,7 @@ class Model:
     def __init__(self, task: Task, control: str) -> None:
         self.task = task
         self.control = control
-        self._take_filter({**task.banks, **task.trained_banks}[control](task, control))
+        self._take_filter({**task.banks, **trained_banks(task)}[control](task, control))
 
     def _take_filter(self, filter: Filter) -> None:
         self.filter = filter
@@ -121,7 +122,8 @@ class Model:
 
     def picture(self) -> Any:
         """Return the :class:`~.rendering.Picture` made for an episode of this task; None for the general one."""
-        return self.task.picture(self) if self.task.recording is None else None
+        maker = find_companion(self.task, PictureMaker)
+        return None if maker is None or self.task.recording is not None else maker.make(self)
 
     def truth_for_filter(self, truth: Any) -> Any:
         """Truth as the filter is given it: None unless it ``knows`` something."""
@@ -203,7 +205,7 @@ class Model:
 
     def causes(self, episode: Episode) -> Array:
         """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
-        return cause_number(self.task.causes, self.moment(episode))
+        return cause_number(Causes.of(self.task).causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""
@@ -250,4 +252,5 @@ class Model:
             **self.filter.records(episode.filter, episode.measurement),
             **self.task.world.records(episode.truth),
         }
-        return {**kept, **self.task.records(self, episode, kept)}
+        further = find_companion(self.task, LoopRecords)
+        return kept if further is None else {**kept, **further.report(self, episode, kept)}

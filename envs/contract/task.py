@@ -26,8 +26,10 @@ gives the initial estimate, :meth:`Filter.start` takes it. A reset is ``begin``,
 environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
 real measurement that is not acted on.
 
-A :class:`Task` is what an author declares, with its parameters, the constants computed of them and its world. What runs
-is a :class:`~.model.Model`: a task with a filter in the loop.
+A :class:`Task` is what an author declares; :class:`~.task_base.TaskBase` holds what follows from it, the parameters,
+the constants computed of them and its world. What goes with a problem beside its declaration, such as the format of its
+logs or its picture, is a companion, see :mod:`~.companions`. What runs is a :class:`~.model.Model`: a task with a filter
+in the loop.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
@@ -38,28 +40,17 @@ returns is given to the next :meth:`World.advance`. Each filter then flies a tru
 """
 
 import ast
-import functools
-import importlib
 import inspect
 import re
 import textwrap
-from abc import ABC
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
-import numpy
-
-from ...filters.angles import shorten
-from ...filters.array_namespace import lane_arrays, stack_nested
-from .causes import MISSED, Cause
-from .draws import Draws
 from .filter import Bank
-from .live_input import LiveInput
-from .log_format import LogFormat
 from .observation import Array
+from .task_base import TaskBase
 from .world import World
 
 
@@ -70,6 +61,8 @@ class Component(NamedTuple):
     unit: str
     period: float | None = None
     """Of an angle, in its unit: errors are the shortest differences. None: it is no angle."""
+    group: str = ""
+    """Of components taken together, such as ``position``: the root of their summed squares; empty where alone."""
 
 
 @dataclass(frozen=True)
@@ -93,20 +86,6 @@ class Scenario:
     """A :class:`~.recording.Recording` that is replayed in place of a simulated world."""
 
 
-class NoiseLayout(NamedTuple):
-    """How many random numbers an episode takes.
-
-    At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
-    ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
-    ``row_uniforms`` uniform ones. Each is a function of the episode's identity, see :mod:`.episode_noise`.
-    """
-
-    uniforms: int
-    initial_normals: int
-    normals: int
-    row_uniforms: int = 0
-
-
 class PaperPolicy(NamedTuple):
     """The paper's algorithm as a constant action."""
 
@@ -114,11 +93,27 @@ class PaperPolicy(NamedTuple):
     action: tuple[float, ...]
 
 
-class Task(ABC):
+class Reward(NamedTuple):
+    """What an estimate costs, and how agents are rewarded for it."""
+
+    cost: str
+    """What the cost is and its unit, in words."""
+    kind: str = "cost"
+    """Of the reward that agents get unless another one is asked for, see :mod:`.reward`."""
+    unit: float = 1.0
+    """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
+    tracks rule that mean, something between them and the median."""
+    log_unit: float | None = None
+    """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below ``unit``;
+    None where it is the same."""
+
+
+class Task(TaskBase):
     """One estimation problem for N independent episodes; see the module's description.
 
     Subclasses declare the class attributes below and compute in :meth:`set_up` the constants that world and
-    banks share. Their class docstring is the environment's documentation.
+    banks share. Their class docstring is the environment's documentation. What follows from the declaration stands in
+    :class:`~.task_base.TaskBase`.
     """
 
     id: ClassVar[str]
@@ -126,206 +121,32 @@ class Task(ABC):
     interface: ClassVar[int] = 1
     """Raised whenever fields or actions come to mean something else under the same names: agents that were trained
     before are then refused."""
-    paper_source: ClassVar[str]
-    """Reference of the paper."""
     Parameters: ClassVar[type]
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
     World: ClassVar[type[World]]
+    """Truth and sensors."""
     banks: ClassVar[Mapping[str, type[Bank]]]
     """What the action can steer, and the bank that it steers; the first is the default."""
-    controls: ClassVar[tuple[str, ...]]
-    """Names of ``banks``."""
-    trained_banks: ClassVar[Mapping[str, type[Bank]]] = {}
-    """Filters that a network of their own steers, by the algorithm that trains it: learned estimators. An environment
-    steers them like any bank, to train them; no other policy acts in them."""
-    actions: ClassVar[Mapping[str, str]] = {}
-    """What an action means under each control, in words."""
-    reach: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Parameters that say how far an action reaches, or how long it holds, by control or trained bank. A learned policy
-    keeps those that it was trained with: under others the same numbers would be other actions."""
-    recorded_decision_interval: ClassVar[int | None] = None
-    """Measurements for which an action holds in a recording that names no number; None: as by default. With one no
-    measurement is lost."""
-    feedback_words: ClassVar[str] = ""
-    """What a filter may report to steer the world beside its estimate, in words for a program that competes; empty where
-    all that steers follows from the estimate."""
-    measurement_words: ClassVar[str] = ""
-    """What the numbers of a measurement are, in a sentence for those who fill in arrays; empty where names say it."""
-    log_format: ClassVar[LogFormat | None] = None
-    """Tables of real measurements that can be read; None where they cannot."""
-    live_input: ClassVar[type[LiveInput]] = LiveInput
-    """Makes measurements of values that come one by one."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
+    reward: ClassVar[Reward]
+    """What an estimate costs, and how agents are rewarded for it."""
     components: tuple[Component, ...]
-    """What is estimated. This and the four attributes below may be set for each instance."""
-    groups: Mapping[str, tuple[str, ...]] = {}
-    """Names for several components taken together, such as ``position``: the root of their summed squares."""
+    """What is estimated. This and the two attributes below may be set for each instance."""
     modes: tuple[str, ...] = ()
     """Names of the hypotheses of the bank; their probabilities are recorded when a bank reports them."""
-    cost_description: ClassVar[str]
-    """What the cost is and its unit, in words."""
-    reward_unit: float = 1.0
-    """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
-    tracks rule that mean, something between them and the median."""
-    lost_cost: float | None = None
-    """Mean cost of an episode beyond which its track counts as lost; None where that is not said."""
-    log_reward_unit: float | None = None
-    """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below
-    ``reward_unit``; None where it is the same."""
-    causes: tuple[Cause, ...] = (MISSED,)
-    """Circumstances by which an evaluation splits what estimates cost, see :mod:`.causes`; each instance may have its
-    own."""
-    start_measurements: ClassVar[int] = 10
-    """How many measurements are the start of a track, which is one cause more."""
-    reward: ClassVar[str] = "cost"
-    """Kind of reward that agents get unless another one is asked for, see :mod:`.reward`."""
     paper_policy: PaperPolicy
-
-    parameters: Any
-    horizon: int
-    """Measurements acted on in one episode."""
-    decision_interval: int
-    """Measurements for which one action holds."""
-    recording: Any
-    """The :class:`~.recording.Recording` that is replayed in place of a simulated world; None where there is none."""
-    has_truth: bool
-    """Whether true values are known: a recording may lack them, and then there are no errors and no costs."""
-    has_whole_truth: bool
-    """Whether every component's is, at every measurement: a recording may lack some, which are NaN. What they would be
-    compared with is then left out of errors, and rewards, which need all, are zero."""
-    flights: tuple[int, ...] = ()
-    """Where every episode flies one of several, measurements acted on in each of them, all multiples of
-    ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
-    world: Any
-    """The :class:`~.world.World`, simulated or replayed."""
-    noise: NoiseLayout
+    companions: tuple[Any, ...] = ()
+    """Objects that go with the problem, each found by its type (:func:`~.companions.find_companion`), such as the
+    format of its logs or its picture. The first of a type counts, so that an instance may put another one in front."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if hasattr(cls, "banks"):
             cls.controls = tuple(cls.banks)
 
-    def __init__(
-        self, parameters: Any, xp: ModuleType = numpy, device: Any = None, recording: Any = None
-    ) -> None:
-        self.parameters = parameters
-        self.recording = recording
-        self.has_truth = recording is None or recording.truth is not None
-        self.has_whole_truth = recording is None or recording.has_whole_truth
-        self.horizon = parameters.horizon
-        self.decision_interval = parameters.decision_interval
-        self.xp = xp
-        self.device = device
-        self.set_up()
-        self.closes_loop = recording is None and self.is_closed_loop()
-        """Whether an estimate decides what is measured next."""
-        if recording is None:
-            self.world = self.World(self)
-        else:
-            self.flights = recording.lengths_within(self.horizon, self.decision_interval)
-            self.world = recording.world(self)
-        self.noise = self._noise_layout()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Task":
-        """Share the task: nothing in it changes."""
-        return self
-
-    def __reduce__(self) -> Any:
-        """Pickle what it is made of; a module, its array namespace, cannot be."""
-        return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
-
-    def on(self, xp: ModuleType, device: Any = None) -> "Task":
-        """Return the same problem on other arrays."""
-        return type(self)(self.parameters, xp, device, self.recording)
-
-    @functools.cached_property
-    def periods(self) -> dict[int, float]:
-        """Periods of the components that are angles, by their numbers."""
-        return {i: one.period for i, one in enumerate(self.components) if one.period is not None}
-
-    def subtract(self, estimate: Array, truth: Array) -> Array:
-        """Estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
-        return shorten(estimate - truth, self.periods)
-
-    def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
-        """Compute the constants that world and banks share."""
-
-    def _noise_layout(self) -> NoiseLayout:
-        world = self.world
-        average = 0.5 + self.xp.zeros((1, 8), dtype=self.xp.float64, device=self.device)
-        draws = Draws.counting(average, self.xp)
-        world.begin(draws, self.xp.concat([0.0 * average] * world.initial_normals))
-        return NoiseLayout(draws.used, world.initial_normals, world.normals, world.row_uniforms)
-
-    @property
-    def interval(self) -> float | None:
-        """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
-        the start of the track; None where they come at times of their own, or the times are not known.
-
-        It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
-        """
-        seconds: float | None = self._sampling_interval()
-        if seconds is not None and self.recording is not None:
-            return seconds if self.recording.has_interval(seconds) else None
-        return seconds
-
-    def _sampling_interval(self) -> float | None:
-        """What the parameters say of the time between measurements, s; None where it differs."""
-        return getattr(self.parameters, "sampling_interval", None)
-
-    def picture(self, model: Any) -> Any:
-        """Return the :class:`~.rendering.Picture` that draws an episode of a model of this task; None for the general
-        one.
-        """
-        return None
-
-    def explain_loss(self, mean: Array, covariance: Array, measurement: Any) -> str:
-        """Explain in a sentence why a filter lost an episode at a measurement; empty where the task cannot.
-
-        Args:
-            mean: last valid estimate, ``(C, N)``.
-            covariance: of it, ``(C, C, N)``.
-            measurement: that the filter took in, of N lanes.
-        """
-        return ""
-
-    @classmethod
-    def scenario_of_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario in which every episode flies one of some flights; few tasks can.
-
-        Args:
-            flights: a :class:`~.trajectory.Trajectory`, or :class:`~.flights.Flights`.
-            keywords: of ``gym.make``, beside the scenario.
-
-        Raises:
-            ValueError: if they cannot be flown, as by default.
-        """
-        raise ValueError(f"{cls.id} does not take flights as scenario")
-
-    def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
-
-        Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
-        """
-        return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
-
-    def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Measurements acted on in each episode, ``(N,)``.
-
-        Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``.
-        """
-        if not self.flights:
-            return numpy.full(uniforms.shape[1], self.horizon)
-        return numpy.asarray(self.flights)[self.flight_of(uniforms)]
-
-    def is_closed_loop(self) -> bool:
-        """Whether an estimate gives something back to the simulated world; by default where :meth:`feedback` is
-        written.
-        """
-        return type(self).feedback is not Task.feedback
+    def set_up(self) -> None:
+        """Compute the constants that world and banks share; most tasks have some, none must."""
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Any:
         """Report what an estimate gives back to the world, in a closed loop. A filter may give back something else, see
@@ -338,29 +159,8 @@ class Task(ABC):
         """
         return None
 
-    def records(self, model: Any, episode: Any, kept: dict[str, Array]) -> dict[str, Array]:
-        """Report what else an evaluation keeps of each measurement, beside what filter and world report; here nothing.
-
-        Args:
-            model: :class:`~.model.Model` of this task.
-            episode: after the action.
-            kept: what filter and world report, see :meth:`.Filter.records`.
-        """
-        return {}
-
-    def constant(self, values: Any) -> Array:
-        """Turn numbers into a float64 array of the task's namespace and device; nested lists may hold arrays ``(N,)``
-        beside numbers, where episodes differ, and then get a last axis of N.
-        """
-        if isinstance(values, list | tuple):
-            arrays = lane_arrays(values)
-            if arrays:
-                return stack_nested(values, 0.0 * sum(arrays[1:], arrays[0]), self.xp)
-        return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
-
-
-def _remake(cls: type[Task], parameters: Any, namespace: str, device: Any, recording: Any) -> Task:
-    return cls(parameters, importlib.import_module(namespace), device, recording)
+    def _writes_feedback(self) -> bool:
+        return type(self).feedback is not Task.feedback
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:

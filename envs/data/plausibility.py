@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
+from ..contract.companions import find_companion
+from ..contract.log_format import LogFormat
+
 if TYPE_CHECKING:
     from ..contract.task import Task
     from .recording import Recording
@@ -314,7 +317,8 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
     world: Any = task.world  # a RecordedWorld
     # Latitude and longitude have a known unit, and their receiver may stand.
     known_unit = "latitude" in recording.columns
-    moving = task.log_format is not None and task.log_format.targets_move and not known_unit
+    log_format = find_companion(task, LogFormat)
+    moving = log_format is not None and log_format.targets_move and not known_unit
     seen, sigma = world.all_observations()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]

@@ -14,6 +14,7 @@ import numpy
 
 from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
+from ..contract.companions import find_companion
 from ..contract.live_input import LARGEST
 from ..contract.log_format import LogFormat, TrackLog
 from ..contract.task import Component, Task
@@ -322,7 +323,7 @@ def read_columns(
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
     """
-    log_format = cls.log_format
+    log_format = find_companion(cls, LogFormat)
     if log_format is None:
         measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
@@ -521,7 +522,7 @@ def _side_by_side(
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = _true_columns(task, first)
-    log_format: Any = cls.log_format
+    log_format: Any = find_companion(cls, LogFormat)
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
     components = [TRUTH + component.name.lower() for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]

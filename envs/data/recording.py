@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy
 
+from ..contract.companions import find_companion
+from ..contract.log_format import LogFormat
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario, Task, named_arrays
 from ..contract.world import World
@@ -199,7 +201,8 @@ class Recording:
                 f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
             )
         named = {**self.parameters, **keywords}
-        own = cls.recorded_decision_interval or defaults["decision_interval"]
+        log_format = find_companion(cls, LogFormat)
+        own = (log_format and log_format.decision_interval) or defaults["decision_interval"]
         interval = freeze(named.get("decision_interval", own))
         check("decision_interval", interval, *field_limits(cls.Parameters)["decision_interval"])
         longest, shortest = int(self.lengths.max()), int(self.lengths.min())

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
+from ..contract.companions import find_companion
+from ..contract.log_format import LogFormat
 from ..contract.task import Task
 from .flight_tables import netcdf_attribute_names, open_netcdf
 from .foreign_files import MOST_NUMBERS
@@ -186,12 +188,13 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
     """Let the tracks start from their first measurements."""
-    if cls.log_format is None:
+    log_format = find_companion(cls, LogFormat)
+    if log_format is None:
         raise ValueError(
             f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
         )
     try:
-        start = cls.log_format.start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
+        start = log_format.start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
     except KeyError as error:
         raise ValueError(f"it lacks {error.args[0]}") from error
     if start.used:

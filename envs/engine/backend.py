@@ -6,6 +6,7 @@ from typing import Any
 import numpy
 
 from ...compiler.namespace import NotTraceable
+from ..contract.companions import trained_banks
 from ..contract.model import Model
 from ..contract.parameters import Limits, check
 from ..contract.task import Task
@@ -46,7 +47,7 @@ def make_model(
     check("threads", threads, int, Limits(at_least=1))
     xp, device = array_backend(backend, device)
     control = cls.controls[0] if control is None else control
-    if not isinstance(control, str) or control not in (*cls.controls, *cls.trained_banks):
+    if not isinstance(control, str) or control not in (*cls.controls, *trained_banks(cls)):
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, get_origin
 import gymnasium
 import numpy
 
-from ..contract.causes import MOST_CAUSES, RESERVED
+from ..contract.causes import MOST_CAUSES, RESERVED, Causes
+from ..contract.companions import action_meanings, trained_banks
 from ..contract.failures import explain_errors
 from ..contract.model import Episode, Model
 from ..contract.task import Task
@@ -46,7 +47,7 @@ def _check_contract(cls: Any) -> None:
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__
     declared = [n for n, hint in Task.__annotations__.items() if get_origin(hint) is ClassVar]
-    missing = [n for n in declared if not hasattr(cls, n) and n != "controls"]  # the names of its banks
+    missing = [n for n in declared if not hasattr(cls, n)]
     if missing:
         raise ValueError(f"{name} lacks the class attributes {', '.join(missing)} of a task")
     if not ID.fullmatch(cls.id):
@@ -67,8 +68,9 @@ def _check_contract(cls: Any) -> None:
     )
     if not {"horizon", "decision_interval"} <= fields:
         raise ValueError(f"{name}.Parameters needs to be a dataclass with horizon and decision_interval")
-    if cls.actions.keys() - cls.banks.keys():
-        raise nearest(f"control in actions of {name}", min(cls.actions.keys() - cls.banks.keys()), cls.banks)
+    strange = action_meanings(cls).keys() - cls.banks.keys()
+    if strange:
+        raise nearest(f"control in actions of {name}", min(strange), cls.banks)
     for key, scenario in cls.scenarios.items():
         if key != scenario.name:
             raise ValueError(f"scenario {scenario.name!r} of {name} stands in the table as {key!r}")
@@ -78,7 +80,7 @@ def _check_contract(cls: Any) -> None:
                 f"scenario {scenario.name!r} of {name} sets unknown parameters {', '.join(sorted(unknown))}"
             )
     expected = [n for n in Task.__annotations__ if n not in declared and not hasattr(Task, n)]
-    for control in (*cls.controls, *cls.trained_banks):
+    for control in (*cls.controls, *trained_banks(cls)):
         with explain_errors(f"{name} cannot be made with control {control!r}"):
             model = Model(cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters)), control)
         missing = [attribute for attribute in expected if not hasattr(model.task, attribute)]
@@ -112,7 +114,7 @@ def _check_action(model: Model) -> None:
 
 def _check_causes(model: Model) -> None:
     """Raise ValueError for causes that a table could not tell apart."""
-    names = [cause.name for cause in model.task.causes]
+    names = [cause.name for cause in Causes.of(model.task).causes]
     twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
     if twice or len(names) > MOST_CAUSES:
         what = f"the name {twice[0]!r}" if twice else f"{len(names)} of them"
@@ -197,7 +199,7 @@ def _check_episodes(model: Model) -> None:
     for name, values in ask("context", model.context, episode).items():
         check(f"context {name!r}", values)
     _check_causes(model)
-    for cause in model.task.causes:
+    for cause in Causes.of(model.task).causes:
         holds = ask(f"cause {cause.name!r}", cause.holds, model.moment(episode))
         if holds is not None:
             check(f"cause {cause.name!r}", holds, ())

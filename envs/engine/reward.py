@@ -12,11 +12,11 @@
   positive where the agent does better than the paper.
 * ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
   action of the same control is charged on the same noise, both in units of the paper's average, or where few lost
-  tracks rule that, of an ordinary episode (``Task.log_reward_unit``). It is zero where the agent does nothing, the
+  tracks rule that, of an ordinary episode (``Reward.log_unit``). It is zero where the agent does nothing, the
   difference of small charges, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
   of the charge, do not hide what an action changes in all others.
 
-:attr:`.Task.reward` says which is the default.
+:attr:`.Reward.kind` of the task says which is the default.
 
 What an evaluation compares is the cost, neither compressed nor in another unit.
 """
@@ -37,7 +37,7 @@ COMPRESSED_BEYOND = 30.0
 def compress(model: Model, charged: Array) -> Array:
     """Charge in units of the paper's average one, compressed, ``(N,)``."""
     return COMPRESSED_BEYOND * model.task.xp.log1p(
-        charged * (1.0 / (COMPRESSED_BEYOND * model.task.reward_unit))
+        charged * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
     )
 
 
@@ -53,7 +53,7 @@ def cost_reward(model: Model, state: Any) -> Array:
 
 def log_cost_reward(model: Model, state: Any) -> Array:
     """Minus ``log(1 + x)`` of the charge x in units of an ordinary one, ``(N,)``."""
-    unit = model.task.log_reward_unit or model.task.reward_unit
+    unit = model.task.reward.log_unit or model.task.reward.unit
     return -model.task.xp.log1p(model.charge(state) * (1.0 / unit))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy
 
+from ..contract.companions import FlightScenarios, find_companion
 from ..contract.parameters import quote_shortened
 from ..contract.task import Scenario, Task
 from ..data.flight_tables import FLIGHT_SUFFIXES
@@ -119,7 +120,7 @@ def read_recording(
 
     Args:
         path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.log_format`, or of a log of
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :class:`.LogFormat`, or of a log of
             a receiver (:mod:`.receiver_logs`), ``.pos``, ``.nmea``, ``.ulg`` or ``.bag``, for ManeuveringTarget. A
             folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
             broken one is left out and named in the notes.
@@ -225,7 +226,11 @@ def find_scenario(
         )
     scenario = read_files(cls, scenario)
     if isinstance(scenario, (Trajectory, Flights)):
-        return cls.scenario_of_flights(scenario, keywords or {})
+        of_flights = find_companion(cls, FlightScenarios)
+        if of_flights is None:
+            raise ValueError(f"{cls.id} does not take flights as scenario")
+        found: Scenario = of_flights.make(scenario, keywords or {})
+        return found
     if isinstance(scenario, Recording):
         return scenario.scenario(cls, keywords or {})
     if not isinstance(scenario, str):

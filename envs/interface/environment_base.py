@@ -55,7 +55,7 @@ class EnvBase:
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
         self.options = options
-        self.reward_kind = self._class.reward if options.reward is None else options.reward
+        self.reward_kind = self._class.reward.kind if options.reward is None else options.reward
         if self.reward_kind not in REWARDS:
             raise nearest("reward", self.reward_kind, REWARDS)
         self._rewards_only = not (options.detailed_info or options.privileged)

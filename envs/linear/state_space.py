@@ -11,7 +11,7 @@ filters may believe others. Functions are traced once, on vectors of symbols, an
 (:mod:`..compiler.vector_functions`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,12 +20,14 @@ import numpy
 from ...compiler.vector_functions import VectorFunction
 from ...filters.small_matrices import apply
 from ...filters.smoothing import semidefinite_root
-from ..contract.causes import MISSED, OUTLIER
+from ..contract.causes import MISSED, OUTLIER, Causes
+from ..contract.companions import Actions, ArrayMeanings, LostTracks, TrainedBanks
 from ..contract.draws import Draws, category, draw_between
 from ..contract.filter import Initial
+from ..contract.live_input import LiveReader
 from ..contract.observation import Array
 from ..contract.parameters import TaskParameters, parameter
-from ..contract.task import Component, PaperPolicy, Scenario, Task
+from ..contract.task import Component, PaperPolicy, Reward, Scenario, Task
 from ..contract.world import World
 from .equations import Equations, Measurement, Passage, StateSpaceDefinition, usual_sensor_noise
 from .inputs import InputCourses
@@ -320,7 +322,7 @@ class StateSpace(Task):
 
     ## Action Space
 
-    What each control means stands in ``actions``; zero is the filter as written.
+    What each control means stands in ``Actions``; zero is the filter as written.
 
     ## Observation Space
 
@@ -345,18 +347,9 @@ class StateSpace(Task):
     """
 
     definition: ClassVar[StateSpaceDefinition]
-    paper_source = "none: a model of one's own"
     Parameters = StateSpaceParameters
     World = StateSpaceWorld
-    live_input = StateSpaceInput
-    causes = (MISSED, OUTLIER)
-    cost_description = "weighted squared error of the components"
-    reward = "log-relative"
-    reach: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "noise": ("noise_decades",),
-        "gain": ("gain_factor",),
-        "evidence": ("evidence_scale",),
-    }
+    reward = Reward("weighted squared error of the components", "log-relative")
 
     def set_up(self) -> None:
         """Put the models that the filters believe on the task's arrays."""
@@ -366,13 +359,18 @@ class StateSpace(Task):
         self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
         self.transition = self.constant([list(row) for row in own.transition])
 
-    def explain_loss(self, mean: Array, covariance: Array, measurement: Measurement) -> str:
-        """Name the function of the filters' first model that is not finite near an estimate."""
-        return self.believed[0].explain_loss(mean, covariance, measurement)
-
     def _sampling_interval(self) -> float | None:
         """Return the time between measurements, s; None where it differs."""
         return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
+
+
+REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}
+"""Parameters that say how far an action reaches, by control."""
+
+
+def _explain_loss(task: StateSpace, mean: Array, covariance: Array, measurement: Measurement) -> str:
+    """Name the function of the filters' first model that is not finite near an estimate."""
+    return task.believed[0].explain_loss(mean, covariance, measurement)
 
 
 def state_space_attributes(
@@ -404,13 +402,17 @@ def state_space_attributes(
     several = len(definition.channels) > 1
     return {
         "definition": definition,
-        **({"causes": (*silence_causes(definition.channels), OUTLIER)} if several else {}),
-        "measurement_words": definition.measurement_words,
-        "log_format": state_space_log_format(definition, defaults),
         "components": components,
         "banks": banks,
-        "actions": actions,
-        "trained_banks": {"kalman-net": KalmanNetBank},
+        "companions": (
+            Actions(actions, REACH),
+            TrainedBanks({"kalman-net": KalmanNetBank}),
+            state_space_log_format(definition, defaults),
+            LiveReader(StateSpaceInput),
+            Causes((*(silence_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
+            LostTracks(explain=_explain_loss),
+            ArrayMeanings(measurement=definition.measurement_words),
+        ),
         "scenarios": {
             "random": Scenario("random", "The model as it is given.", defaults, training=True),
             **{

@@ -88,4 +88,5 @@ LOG_FORMAT = LogFormat(
     predict=predict_fix,
     predicted=tuple(Predicted(axis, "m", "position") for axis in AXES),
     longest_interval=5.0,
+    decision_interval=1,
 )

@@ -11,7 +11,12 @@ it with white noise, and where the scenario says so with a coloured error e besi
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
 """
 
-from ..contract.task import Component, PaperPolicy, Task
+from typing import Any
+
+from ..contract.causes import Causes
+from ..contract.companions import Actions, LostTracks, Paper, TrainedBanks
+from ..contract.live_input import LiveReader
+from ..contract.task import Component, PaperPolicy, Reward, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES
@@ -47,7 +52,7 @@ class LooselyCoupledNavigation(Task):
 
     ### Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge. An action holds for
+    What each control means stands in ``Actions``. Values outside the box are taken at its edge. An action holds for
     ``decision_interval`` measurements, ten by default.
 
     Without a measurement the gain is zero, whatever the action; under ``noise`` the covariance still grows by
@@ -98,41 +103,8 @@ class LooselyCoupledNavigation(Task):
 
     id = ID
     interface = 4
-    paper_source = (
-        "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
-        "navigation complexes (in Russian)"
-    )
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
-    log_format = LOG_FORMAT
-    recorded_decision_interval = 1
-    live_input = PositionInput
-    actions = {
-        "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
-        "`receiver_scale` to the power of r times a positive, `receiver_reduction` to that of a negative action for the "
-        "receiver, `process_scale` for the coloured and the white rate error, r = 0.1 (`noise_reach`); **0 is the paper's "
-        "augmented filter**",
-        "gain": "gain of this sample, logarithmic from the settled gain of the paper's reduced tuning (0.042, "
-        "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
-        "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
-        "hypotheses": "factors r^a in the bank over faults at this fix: odds that the receiver is pulled off (r = 1.05), "
-        "that all noises are as modelled (1.05), probability of the receiver's highest level (1.5); variance of the fix "
-        "(1.25), process noise of the INS and of the receiver's coloured error (2 each); **0 is the estimator "
-        "`fault-bank`**",
-        "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
-        "weights": "weights of the three estimates, normalised; all zero is uniform",
-    }
-    reach = {
-        "noise": (
-            "noise_reach",
-            "receiver_scale",
-            "receiver_reduction",
-            "process_scale",
-            "decision_interval",
-        ),
-        "gain": ("smallest_gain",),
-        "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
-    }
     banks = {
         "noise": NoiseBank,
         "gain": GainBank,
@@ -140,19 +112,56 @@ class LooselyCoupledNavigation(Task):
         "mode": SchemeBank,
         "weights": SchemeBank,
     }
-    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     modes = SCHEMES
-    causes = CAUSES
-    start_measurements = 50
-    cost_description = "squared error of position over the nominal variance of a measurement"
-    # No better than single measurements throughout; more axes cost more.
-    lost_cost = 1.0
-    reward_unit = 0.16
     # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
-    reward = "log-relative"
-    log_reward_unit = 0.02
+    reward = Reward(
+        "squared error of position over the nominal variance of a measurement",
+        "log-relative",
+        unit=0.16,
+        log_unit=0.02,
+    )
     paper_policy = PaperPolicy("gain", (0.0,))
+    companions: tuple[Any, ...] = (
+        Paper(
+            "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
+            "navigation complexes (in Russian)"
+        ),
+        Actions(
+            {
+                "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
+                "`receiver_scale` to the power of r times a positive, `receiver_reduction` to that of a negative action for the "
+                "receiver, `process_scale` for the coloured and the white rate error, r = 0.1 (`noise_reach`); **0 is the paper's "
+                "augmented filter**",
+                "gain": "gain of this sample, logarithmic from the settled gain of the paper's reduced tuning (0.042, "
+                "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
+                "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
+                "hypotheses": "factors r^a in the bank over faults at this fix: odds that the receiver is pulled off (r = 1.05), "
+                "that all noises are as modelled (1.05), probability of the receiver's highest level (1.5); variance of the fix "
+                "(1.25), process noise of the INS and of the receiver's coloured error (2 each); **0 is the estimator "
+                "`fault-bank`**",
+                "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
+                "weights": "weights of the three estimates, normalised; all zero is uniform",
+            },
+            {
+                "noise": (
+                    "noise_reach",
+                    "receiver_scale",
+                    "receiver_reduction",
+                    "process_scale",
+                    "decision_interval",
+                ),
+                "gain": ("smallest_gain",),
+                "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
+            },
+        ),
+        TrainedBanks({"kalman-net": KalmanNetBank}),
+        LOG_FORMAT,
+        LiveReader(PositionInput),
+        Causes(CAUSES, start=50),
+        # No better than single measurements throughout; more axes cost more.
+        LostTracks(1.0),
+    )
 
     parameters: LooselyCoupledNavigationParameters
 
@@ -160,11 +169,11 @@ class LooselyCoupledNavigation(Task):
         """Name the axes, and find the action of the settled gain."""
         p = self.parameters
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
-        self.components = tuple(Component(name, "m") for name in names)
-        self.groups = {} if p.axes == 1 else {"position": names}
+        group = "position" if p.axes > 1 else ""
+        self.components = tuple(Component(name, "m", group=group) for name in names)
         action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
-        self.lost_cost = float(p.axes)
+        self.companions = (LostTracks(float(p.axes)), *type(self).companions)
 
 
 TASK = LooselyCoupledNavigation

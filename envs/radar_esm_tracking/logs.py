@@ -128,4 +128,5 @@ LOG_FORMAT = LogFormat(
     predict=predict_radar,
     predicted=(Predicted("range", "m", "range"), Predicted("range_rate", "m/s", "range rate")),
     longest_interval=60.0,
+    decision_interval=1,
 )

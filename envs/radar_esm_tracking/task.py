@@ -11,9 +11,12 @@ import numpy
 
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
+from ..contract.causes import Causes
+from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
+from ..contract.live_input import LiveReader
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Task
+from ..contract.task import Component, PaperPolicy, Reward, Task
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
@@ -23,6 +26,24 @@ from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
+
+
+def _picture(model: Model) -> Any:
+    """Return what draws an episode; imported here, because it brings matplotlib."""
+    from .picture import PICTURE
+
+    return PICTURE(model)
+
+
+def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
+    """Report the variances, and the weight of the true class where there are weights."""
+    task: Any = model.task
+    covariance = model.covariance(episode)
+    own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(task.components)}
+    if "mode_probability" in kept and task.recording is None:
+        is_true = one_hot(episode.truth.target_class, task.classes, task.xp)
+        own["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
+    return own
 
 
 class RadarEsmTracking(Task):
@@ -60,7 +81,7 @@ class RadarEsmTracking(Task):
 
     ## Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge. An action holds for
+    What each control means stands in ``Actions``. Values outside the box are taken at its edge. An action holds for
     ``decision_interval`` scans, four by default: from one ESM decision to the next.
 
     ## Observation Space
@@ -107,23 +128,9 @@ class RadarEsmTracking(Task):
 
     id = ID
     interface = 4
-    paper_source = (
-        "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "
-        "recognition of the target's class (in Russian)"
-    )
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
-    log_format = LOG_FORMAT
-    recorded_decision_interval = 1
-    live_input = ScanInput
-    actions = {
-        "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
-        "mode": "the class that is believed",
-        "weights": "class probabilities, normalised; all zero is uniform",
-    }
-    reach = {"evidence": ("evidence_scale", "decision_interval")}
     banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
-    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = (
         Component("range", "m"),
@@ -131,18 +138,37 @@ class RadarEsmTracking(Task):
         Component("acceleration", "m/s^2"),
     )
     modes: tuple[str, ...] = ("S0", "S1", "S2")
-    cost_description = (
-        "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
-        "and acceleration_scale"
-    )
-    # Errors of three of the scales throughout.
-    lost_cost = 9.0
-    reward_unit = 0.3
     # The noise of the track is most of the cost, and no weight changes it; a logarithm, because a few mistaken classes
     # would hide what an action changes in all other episodes.
-    reward = "log-relative"
-    log_reward_unit = 0.05
+    reward = Reward(
+        "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
+        "and acceleration_scale",
+        "log-relative",
+        unit=0.3,
+        log_unit=0.05,
+    )
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
+    companions: tuple[Any, ...] = (
+        Paper(
+            "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "
+            "recognition of the target's class (in Russian)"
+        ),
+        Actions(
+            {
+                "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
+                "mode": "the class that is believed",
+                "weights": "class probabilities, normalised; all zero is uniform",
+            },
+            {"evidence": ("evidence_scale", "decision_interval")},
+        ),
+        TrainedBanks({"kalman-net": KalmanNetBank}),
+        LOG_FORMAT,
+        LiveReader(ScanInput),
+        PictureMaker(_picture),
+        # Errors of three of the scales throughout.
+        LostTracks(9.0),
+        LoopRecords(_records),
+    )
 
     parameters: RadarEsmTrackingParameters
 
@@ -151,7 +177,7 @@ class RadarEsmTracking(Task):
         p = self.parameters
         self.classes, self.types = len(p.manoeuvrability), len(p.recognition)
         self.modes = p.class_names
-        self.causes = causes_of(p.class_names)
+        self.companions = (Causes(causes_of(p.class_names)), *type(self).companions)
         self.paper_policy = PaperPolicy("evidence", (0.0,) * self.classes)
         models, _ = self.design_models(p)
         self.models = class_fusion.Models(*(self.constant(matrix) for matrix in models))
@@ -174,21 +200,6 @@ class RadarEsmTracking(Task):
         )
         starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
         return models, numpy.stack(starts, axis=-1)
-
-    def picture(self, model: Model) -> Any:
-        """Return what draws an episode; imported here, because it brings matplotlib."""
-        from .picture import PICTURE
-
-        return PICTURE(model)
-
-    def records(self, model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-        """Report the variances, and the weight of the true class where there are weights."""
-        covariance = model.covariance(episode)
-        own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(self.components)}
-        if "mode_probability" in kept and self.recording is None:
-            is_true = one_hot(episode.truth.target_class, self.classes, self.xp)
-            own["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
-        return own
 
 
 TASK = RadarEsmTracking

@@ -21,9 +21,12 @@ from typing import Any
 import numpy
 
 from ...filters import gnss_ins, satellites
+from ..contract.causes import Causes
+from ..contract.companions import Actions, ArrayMeanings, LostTracks, Paper, PictureMaker, TrainedBanks
+from ..contract.live_input import LiveReader
 from ..contract.model import Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Task
+from ..contract.task import Component, PaperPolicy, Reward, Task
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
@@ -33,6 +36,13 @@ from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import NavigationWorld
+
+
+def _picture(model: Model) -> Any:
+    """Return what draws an episode; imported here, because it brings matplotlib."""
+    from .picture import PICTURE
+
+    return PICTURE(model)
 
 
 class TightlyCoupledNavigation(Task):
@@ -55,7 +65,7 @@ class TightlyCoupledNavigation(Task):
 
     ## Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge.
+    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
 
     The weights are used for the combination and as the prior of the next mixing.
 
@@ -99,36 +109,8 @@ class TightlyCoupledNavigation(Task):
 
     id = ID
     interface = 3
-    paper_source = (
-        "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "
-        "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"
-    )
     Parameters = TightlyCoupledNavigationParameters
     World = NavigationWorld
-    live_input = ReceiverInput
-    feedback_words = (
-        "state that the tracking loops expect at the next measurement, in the order of the components; by default the "
-        "estimate, extrapolated as in a manoeuvre"
-    )
-    actions = {
-        "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
-        "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "
-        "positive action; and Huber's robust update of pseudoranges and of rates, beyond 1.345 standard deviations over a "
-        "positive action; **0 is the paper's algorithm**",
-        "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
-        "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
-        "positive action, 3 to that of a negative one; under the paper's probabilities, for "
-        "faults that no weight can cure; **0 is the paper's algorithm**",
-        "hypotheses": "factors r^a in the bank over motion and faults at every measurement: probability that a manoeuvre has "
-        "begun (r = 4), that one goes on (1.05), odds that the error of a pseudorange is another one (4), probability of a "
-        "rate's highest noise level (1.5); process noise of the motion (2), variance of pseudoranges (2), of rates (2), of "
-        "accelerometers (4); **0 is the estimator `fault-hypotheses`**",
-        "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
-        "paper's algorithm**",
-        "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
-        "filter that switches its model",
-        "weights": "weights of the three filters, normalised; all zero is uniform",
-    }
     banks = {
         "robust": RobustBank,
         "gain": NoiseBank,
@@ -137,42 +119,71 @@ class TightlyCoupledNavigation(Task):
         "mode": HypothesisBank,
         "weights": HypothesisBank,
     }
-    trained_banks = {"kalman-net": KalmanNetBank}
-    reach = {
-        "robust": ("noise_reach", "noise_scale", "noise_reduction"),
-        "gain": ("noise_scale", "noise_reduction"),
-        "kalman-net": ("noise_scale", "noise_reduction"),
-    }
     scenarios = SCENARIOS
     components = (
-        *(Component(f"position_{axis}", "m") for axis in ("east", "north", "up")),
+        *(Component(f"position_{axis}", "m", group="position") for axis in ("east", "north", "up")),
         Component("clock_bias", "m"),
-        *(Component(f"velocity_{axis}", "m/s") for axis in ("east", "north", "up")),
+        *(Component(f"velocity_{axis}", "m/s", group="velocity") for axis in ("east", "north", "up")),
         Component("clock_drift", "m/s"),
-        *(Component(f"acceleration_{axis}", "m/s^2") for axis in ("east", "north", "up")),
-        *(Component(f"{angle}_error", "rad") for angle in ("heading", "pitch", "roll")),
+        *(
+            Component(f"acceleration_{axis}", "m/s^2", group="acceleration")
+            for axis in ("east", "north", "up")
+        ),
+        *(Component(f"{angle}_error", "rad", group="attitude") for angle in ("heading", "pitch", "roll")),
         *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
-    groups = {
-        "position": ("position_east", "position_north", "position_up"),
-        "velocity": ("velocity_east", "velocity_north", "velocity_up"),
-        "acceleration": ("acceleration_east", "acceleration_north", "acceleration_up"),
-        "attitude": ("heading_error", "pitch_error", "roll_error"),
-    }
     modes = HYPOTHESES
-    causes = CAUSES
-    start_measurements = 100
-    cost_description = (
-        "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
-        "a single-epoch fix"
-    )
-    # Five times the errors of a single-epoch fix throughout.
-    lost_cost = 25.0
-    reward_unit = 10.0
-    log_reward_unit = 0.1
     # A few lost tracks rule the mean, and who does nothing pays for them, too.
-    reward = "log-relative"
+    reward = Reward(
+        "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
+        "a single-epoch fix",
+        "log-relative",
+        unit=10.0,
+        log_unit=0.1,
+    )
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
+    companions = (
+        Paper(
+            "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "
+            "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"
+        ),
+        Actions(
+            {
+                "robust": "noise as under `gain`, by r = 0.3 times the action (`noise_reach`), and what is done with single readings: "
+                "how noisy accelerometers are taken to be while they repeat their last reading exactly, 300 to the power of a "
+                "positive action; and Huber's robust update of pseudoranges and of rates, beyond 1.345 standard deviations over a "
+                "positive action; **0 is the paper's algorithm**",
+                "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
+                "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
+                "positive action, 3 to that of a negative one; under the paper's probabilities, for "
+                "faults that no weight can cure; **0 is the paper's algorithm**",
+                "hypotheses": "factors r^a in the bank over motion and faults at every measurement: probability that a manoeuvre has "
+                "begun (r = 4), that one goes on (1.05), odds that the error of a pseudorange is another one (4), probability of a "
+                "rate's highest noise level (1.5); process noise of the motion (2), variance of pseudoranges (2), of rates (2), of "
+                "accelerometers (4); **0 is the estimator `fault-hypotheses`**",
+                "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
+                "paper's algorithm**",
+                "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
+                "filter that switches its model",
+                "weights": "weights of the three filters, normalised; all zero is uniform",
+            },
+            {
+                "robust": ("noise_reach", "noise_scale", "noise_reduction"),
+                "gain": ("noise_scale", "noise_reduction"),
+                "kalman-net": ("noise_scale", "noise_reduction"),
+            },
+        ),
+        TrainedBanks({"kalman-net": KalmanNetBank}),
+        LiveReader(ReceiverInput),
+        PictureMaker(_picture),
+        Causes(CAUSES, start=100),
+        # Five times the errors of a single-epoch fix throughout.
+        LostTracks(25.0),
+        ArrayMeanings(
+            feedback="state that the tracking loops expect at the next measurement, in the order of the components; by default the "
+            "estimate, extrapolated as in a manoeuvre"
+        ),
+    )
 
     parameters: TightlyCoupledNavigationParameters
 
@@ -180,6 +191,7 @@ class TightlyCoupledNavigation(Task):
         """List the sensors, tabulate the satellites and discretise the models."""
         p, constant = self.parameters, self.constant
         T = p.sampling_interval
+        self.closes_loop = bool(p.aperture)
         self.satellites = len(p.satellites)
         self.sensors = p.sensors
         each = [s for s in self.sensors for _ in range(s.readings.start, s.readings.stop)]
@@ -225,19 +237,9 @@ class TightlyCoupledNavigation(Task):
             self.xp.take(self._satellite_velocity, row, axis=2),
         )
 
-    def is_closed_loop(self) -> bool:
-        """Whether tracking loops have an aperture."""
-        return bool(self.parameters.aperture)
-
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
         """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
-
-    def picture(self, model: Model) -> Any:
-        """Return what draws an episode; imported here, because it brings matplotlib."""
-        from .picture import PICTURE
-
-        return PICTURE(model)
 
 
 TASK = TightlyCoupledNavigation

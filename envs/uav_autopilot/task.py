@@ -19,9 +19,12 @@ takes the control in force, ``B U`` of (8) and (10), command included. Reading: 
 
 from typing import Any
 
+from ..contract.causes import Causes
+from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
+from ..contract.live_input import LiveReader
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import PaperPolicy, Task
+from ..contract.task import PaperPolicy, Reward, Task
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
@@ -32,6 +35,18 @@ from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParamet
 from .plant import design
 from .scenarios import SCENARIOS
 from .world import AircraftWorld, Measurement, Start
+
+
+def _picture(model: Model) -> Any:
+    """Return what draws an episode; imported here, because it brings matplotlib."""
+    from .picture import PICTURE
+
+    return PICTURE(model)
+
+
+def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
+    """Report what is fed back: the control that follows from the estimate."""
+    return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
 class UavAutopilot(Task):
@@ -55,7 +70,7 @@ class UavAutopilot(Task):
 
     ## Action Space
 
-    What each control means stands in ``actions``. Values outside the box are taken at its edge.
+    What each control means stands in ``Actions``. Values outside the box are taken at its edge.
 
     ## Observation Space
 
@@ -103,46 +118,51 @@ class UavAutopilot(Task):
 
     id = ID
     interface = 5
-    paper_source = (
-        "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
-        "unmanned aircraft using optimal Kalman filter"
-    )
     Parameters = UavAutopilotParameters
     World = AircraftWorld
-    live_input = SensorInput
-    actions = {
-        "noise": "the process noise Q of the filter is scaled by 10^(1.5 r a) (`process_decades`), the standard deviation of "
-        "each sensor by 10^(0.8 r a) (`sensor_decades`), r = 0.2 (`noise_reach`), in the update by the measurement that "
-        "was just shown; **0 is the paper's filter**",
-        "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
-        "update by the measurement that was just shown; **0 is the paper's filter**",
-        "hypotheses": "factors r^a in the bank over levels at this measurement: probability of the highest level of the "
-        "gusts (r = 1.1), that all noise is as designed (1.25), the process noise (2), the variance of each sensor (1.5); "
-        "**0 is the estimator `level-bank`**",
-        "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
-        "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
-    }
-    reach = {
-        "noise": ("noise_reach", "process_decades", "sensor_decades"),
-        "gain": ("gain_decades",),
-        "kalman-net": ("process_decades", "sensor_decades"),
-    }
     banks = {"noise": NoiseBank, "gain": GainBank, "hypotheses": HypothesesBank, "mode": ModeBank}
-    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
-    causes = CAUSES
-    start_measurements = 20
-    cost_description = (
-        "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
-        "variance of the output's sensor"
-    )
-    # A loop that is off by ten times its sensor's error throughout.
-    lost_cost = 100.0
-    reward_unit = 1.5
     # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
-    reward = "relative"
+    reward = Reward(
+        "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
+        "variance of the output's sensor",
+        "relative",
+        unit=1.5,
+    )
     paper_policy = PaperPolicy("gain", (0.0,))
+    companions = (
+        Paper(
+            "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
+            "unmanned aircraft using optimal Kalman filter"
+        ),
+        Actions(
+            {
+                "noise": "the process noise Q of the filter is scaled by 10^(1.5 r a) (`process_decades`), the standard deviation of "
+                "each sensor by 10^(0.8 r a) (`sensor_decades`), r = 0.2 (`noise_reach`), in the update by the measurement that "
+                "was just shown; **0 is the paper's filter**",
+                "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
+                "update by the measurement that was just shown; **0 is the paper's filter**",
+                "hypotheses": "factors r^a in the bank over levels at this measurement: probability of the highest level of the "
+                "gusts (r = 1.1), that all noise is as designed (1.25), the process noise (2), the variance of each sensor (1.5); "
+                "**0 is the estimator `level-bank`**",
+                "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
+                "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
+            },
+            {
+                "noise": ("noise_reach", "process_decades", "sensor_decades"),
+                "gain": ("gain_decades",),
+                "kalman-net": ("process_decades", "sensor_decades"),
+            },
+        ),
+        TrainedBanks({"kalman-net": KalmanNetBank}),
+        LiveReader(SensorInput),
+        PictureMaker(_picture),
+        Causes(CAUSES, start=20),
+        # A loop that is off by ten times its sensor's error throughout.
+        LostTracks(100.0),
+        LoopRecords(_records),
+    )
 
     parameters: UavAutopilotParameters
 
@@ -170,12 +190,6 @@ class UavAutopilot(Task):
         """Return what was left to the plant too, s."""
         return float(self.parameters.value("sampling_interval"))
 
-    def picture(self, model: Model) -> Any:
-        """Return what draws an episode; imported here, because it brings matplotlib."""
-        from .picture import PICTURE
-
-        return PICTURE(model)
-
     def autopilot(self, estimate: Array, command: Array) -> Array:
         """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
         return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
@@ -187,10 +201,6 @@ class UavAutopilot(Task):
     def readings_of(self, state: Array) -> Array:
         """Measured coordinates of ``(n, N)``, ``(m, N)``."""
         return self.xp.stack([state[i] for i in self.measured])
-
-    def records(self, model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
-        """Report what is fed back: the control that follows from the estimate."""
-        return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
 TASK = UavAutopilot

@@ -17,7 +17,9 @@ from ...compiler.functions import Function, empty_lanes, leaves, map_arrays, rou
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ...compiler.sequence import CallSequence, moving_array
+from ...envs.contract.companions import find_companion
 from ...envs.contract.filter import Filter, Input
+from ...envs.contract.log_format import LogFormat
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.data.recorded_world import fill_arrays, measure_once
@@ -105,7 +107,7 @@ def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
     """Initial estimate of a window, and the number of its first measurement."""
     own = {name: values[span.episode] for name, values in recording.initial.items()}
-    log_format = type(task).log_format
+    log_format = find_companion(task, LogFormat)
     if log_format is None or span.first <= warm_up:
         return own, 0
     first = span.first - warm_up

@@ -14,6 +14,8 @@ from typing import Any
 import numpy
 
 from ...compiler.functions import leaves, map_arrays, round_up_lanes
+from ...envs.contract.companions import LostTracks, find_companion
+from ...envs.contract.live_input import LiveReader
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
@@ -70,7 +72,7 @@ class OnlineFilter:
         self.name, self.tracks, self.watch, self._lag = name, tracks, watch, _check_lag(lag)
         self.task = model.task
         world: Any = self.task.world
-        self.input = self.task.live_input(self.task, world.initial, world.measurement, tracks)
+        self.input = LiveReader.of(self.task).input(self.task, world.initial, world.measurement, tracks)
         self._policy: SteppingPolicy | None = None
         if kind == "policy":
             self._policy = SteppingPolicy(
@@ -300,10 +302,13 @@ class OnlineFilter:
         n = len(near.mean)
         mean, covariance = near.mean.reshape(n, -1), near.covariance.reshape(n, n, -1)
         words: list[str] = numpy.atleast_1d(found.lost).tolist()
+        lost = find_companion(self.task, LostTracks)
+        if lost is None or lost.explain is None:
+            return found.lost
         for i, fault in enumerate(words):
             track = numpy.array([i])
             given = select_lanes(measurement, track)
-            reason = fault and self.task.explain_loss(mean[..., track], covariance[..., track], given)
+            reason = fault and lost.explain(self.task, mean[..., track], covariance[..., track], given)
             words[i] = f"the estimate is not finite: {reason}" if reason else fault
         return self._each(words)
 

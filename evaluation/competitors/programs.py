@@ -13,8 +13,8 @@ The protocol is version 1; docs/programs.md says the same to whoever writes a pr
 As ``json`` a message is a line, as ``float64`` a frame of little-endian numbers without a head: for every track its
 fields, or mean and covariance, row by row. So thousands of tracks are one message.
 
-Where the task has ``feedback_words``, the hello offers it, and a program that answers ``"feedback": true`` gives after
-mean and covariance what else steers the world.
+Where the task says what feedback means (:class:`.ArrayMeanings`), the hello offers it, and a program that answers
+``"feedback": true`` gives after mean and covariance what else steers the world.
 """
 
 import json
@@ -32,6 +32,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ...compiler.functions import leaves
+from ...envs.contract.companions import array_meanings
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, field_words
 from .kinds import Competitor, Kind
@@ -219,9 +220,10 @@ class ProgramEstimator:
         self.count = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
         self.feedback, self._steering = None, None
-        if self.task.closes_loop and self.task.feedback_words:
+        meaning = array_meanings(self.task).feedback
+        if self.task.closes_loop and meaning:
             shape = self.task.feedback(initial.mean, initial.covariance, initial).shape[:-1]
-            self._steering = Field("feedback", shape, "float64", self.task.feedback_words)
+            self._steering = Field("feedback", shape, "float64", meaning)
         try:
             own = self.program.environment
             variables = {**os.environ, "PATH": search_path()} if own is None else dict(own)
@@ -290,7 +292,9 @@ class ProgramEstimator:
             "numbers": numbers,
             "formats": ["json", "float64"],
             "environment": self.task.id,
-            "components": [component._asdict() for component in self.task.components],
+            "components": [
+                {"name": own.name, "unit": own.unit, "period": own.period} for own in self.task.components
+            ],
             "groups": {name: list(parts) for name, parts in self.task.groups.items()},
             "initial": [own._asdict() for own in self._fields],
             "measurement": [own._asdict() for own in measured],

@@ -13,6 +13,7 @@ import gymnasium
 import numpy
 
 from ...compiler.native import optimised_code
+from ...envs.contract.companions import lost_cost
 from ...envs.contract.model import Model
 from ...envs.contract.parameters import check_integer, quote_shortened
 from ...envs.contract.task import Scenario, Task
@@ -26,7 +27,7 @@ from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
-from ..storage.dataset import FAULTS, group_of_each
+from ..storage.dataset import FAULTS
 from .kept import DRAWN_PREFIX, Kept, limits
 from .named_axes import recording_coords, with_named_axes
 from .parallel import Workers, check_workers
@@ -372,7 +373,7 @@ class Plan(NamedTuple):
             notes="\n".join(self.scenario.notes),
             recorded=int(self.scenario.recording is not None),
             truth=int(task.has_truth),
-            lost_cost=float(task.lost_cost or 0.0),
+            lost_cost=float(lost_cost(task) or 0.0),
         )
 
 
@@ -405,9 +406,6 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         if kinds[name] == "smoother":
             check_open_loop(model, f"smoother {name!r}")
     first = next(iter(models.values()))
-    group_of_each(
-        [c.name for c in first.task.components], first.task.groups
-    )  # refused now, not when all is done
     if chosen.recording is not None:
         _check_truth_available(kinds, chosen.name)
         episodes = len(first.task.flights)  # nothing is random: each once

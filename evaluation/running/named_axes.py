@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
+from ...envs.contract.causes import Causes
 from ...envs.contract.model import Model
 from ...envs.data.recording import Recording
 from ..statistics.cause_split import VARIABLE
-from ..storage.dataset import group_of_each, keywords_as_text, whole_number, window_coords
+from ..storage.dataset import keywords_as_text, whole_number, window_coords
 from .kept import DRAWN_PREFIX
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ MEANINGS = {
     "log_likelihood": ("nat", "log-density of the measurement as it was predicted, in its units"),
     "mode_probability": ("1", "probability of each hypothesis"),
     "action": ("1", "action as the filter got it, normalised to its space"),
-    "charge": ("1", "minus the reward `cost`: normalised to reward_unit, and compressed"),
+    "charge": ("1", "minus the reward `cost`: normalised to the unit of the reward, and compressed"),
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }
@@ -159,7 +160,7 @@ def with_named_axes(
             stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
-        variables[key] = (dims, stacked, _attributes(key, model.task.cost_description))
+        variables[key] = (dims, stacked, _attributes(key, model.task.reward.cost))
     coords: dict[str, Any] = {
         "policy": names,
         "kind": ("policy", [kinds[n] for n in names]),
@@ -169,7 +170,7 @@ def with_named_axes(
         "time": times,
         "component": components,
         "unit": ("component", [c.unit for c in model.task.components]),
-        "group": ("component", group_of_each(components, model.task.groups)),
+        "group": ("component", [one.group for one in model.task.components]),
     }
     if model.task.interval is not None:
         about = {"units": "s", "long_name": "since the start of the track"}
@@ -183,10 +184,10 @@ def with_named_axes(
     if "mode_probability" in variables:
         coords["mode"] = list(model.task.modes)
     if VARIABLE in variables:
-        causes = model.task.causes
+        causes = Causes.of(model.task).causes
         coords["cause"] = [cause.name for cause in causes]
         coords["cause_phrase"] = ("cause", [cause.phrase for cause in causes])
-        coords["start_measurements"] = model.task.start_measurements
+        coords["start_measurements"] = Causes.of(model.task).start
     if actions:
         coords["action_name"] = list(dict.fromkeys(sum(actions.values(), ())))
     return xarray.Dataset(
@@ -198,6 +199,6 @@ def with_named_axes(
             "keywords": keywords_as_text(plan.experiment.keywords),
             "split": plan.experiment.split,
             "seed": whole_number(plan.experiment.seed),
-            "cost": model.task.cost_description,
+            "cost": model.task.reward.cost,
         },
     )

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
+from ...envs.contract.companions import find_companion
+from ...envs.contract.log_format import LogFormat
 from ...envs.contract.task import Task
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
         dataset: of an evaluation with tracks.
         task: of the recording.
     """
-    log_format = type(task).log_format
+    log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in dataset:
         return dataset
     innovations = []
@@ -54,7 +56,7 @@ def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
         run: one competitor's part of an evaluation with tracks.
         task: of the recording.
     """
-    log_format = type(task).log_format
+    log_format = find_companion(task, LogFormat)
     if log_format is None or log_format.predict is None or "estimate" not in run:
         return None
     estimate = run["estimate"].transpose("component", "episode", "time").values

@@ -6,7 +6,7 @@ remains in words: see the functions of this module for what they mean.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -133,21 +133,6 @@ def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
         if group:
             found.setdefault(group, []).append(name)
     return {group: tuple(names) for group, names in found.items()}
-
-
-def group_of_each(components: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
-    """Group that each component belongs to; empty where it belongs to none.
-
-    Raises:
-        ValueError: if one belongs to several.
-    """
-    found = []
-    for component in components:
-        mine = [group for group, parts in groups.items() if component in parts]
-        if len(mine) > 1:
-            raise ValueError(f"component {component!r} belongs to several groups: {', '.join(mine)}")
-        found.append(mine[0] if mine else "")
-    return found
 
 
 def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:

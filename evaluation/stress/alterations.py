@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.contract.causes import Causes
 from ...filters.smoothing import semidefinite_root
 from .streams import Stream
 
@@ -188,7 +189,7 @@ def _restart(stream: Stream, generator: numpy.random.Generator) -> Stream:
             told[name] = before if isinstance(value, type(before)) else getattr(before, name, value)
     begun = initial._replace(mean=stream.truth[SETTLED - 1] + errors, **told)
     later = stream.select(numpy.arange(SETTLED, len(stream)))
-    return _cut(replace(later, initial=begun).renumbered(), stream.task.start_measurements, 1)
+    return _cut(replace(later, initial=begun).renumbered(), Causes.of(stream.task).start, 1)
 
 
 def _rounded(stream: Stream, generator: numpy.random.Generator) -> Stream:

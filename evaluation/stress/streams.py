@@ -12,6 +12,7 @@ import gymnasium
 import numpy
 
 from ...compiler.functions import map_arrays
+from ...envs.contract.live_input import LiveReader
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task
 from ..running.rollout import start_lanes
@@ -124,7 +125,7 @@ class Stream:
 
     def renumbered(self) -> "Stream":
         """Return the stream with its measurements counted from 1 on, where they are counted."""
-        counter = type(self.task).live_input.counter
+        counter = LiveReader.of(self.task).input.counter
         values = getattr(self.measurements, counter, None)
         if values is None:
             return self

@@ -12,6 +12,8 @@ from rich.table import Table
 from ..agents.envelope import departure
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
+from ..envs.contract.companions import find_companion
+from ..envs.contract.log_format import LogFormat
 from ..envs.data.flights import names_flights, read_flights
 from ..envs.data.plausibility import LOUD
 from ..envs.data.recording import Recording
@@ -218,7 +220,7 @@ def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool
         data: of :func:`find_data`.
         names: of competitors.
     """
-    log_format = problem.task.log_format
+    log_format = find_companion(problem.task, LogFormat)
     if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
         return False
     return data.seconds.size * len(set(names)) <= MOST_PREDICTIONS

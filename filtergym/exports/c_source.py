@@ -24,7 +24,8 @@ from ..compiler.c_text import (
     identifier,
     literal,
 )
-from ..envs.contract.log_format import PlainRows
+from ..envs.contract.companions import array_meanings, find_companion
+from ..envs.contract.log_format import LogFormat, PlainRows
 from ..envs.data.recorded_tables import TIME
 from ..evaluation.storage.files import whole_files
 from .c_filter import FilterText
@@ -384,7 +385,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
             f"more than {WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
             + ("export it in double" if scalar is FLOAT else "please report it")
         )
-    log_format = request.problem.task.log_format
+    log_format = find_companion(request.problem.task, LogFormat)
     writer = Writer(
         request.name,
         traced,
@@ -448,7 +449,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
     return [
         f"{request.name} of {request.problem.id}, in {precision}, for one track. {first}".strip(),
         *([f"With parameters of the task: {parameters}."] if parameters else []),
-        *([request.problem.task.measurement_words] if request.problem.task.measurement_words else []),
+        *([meaning] if (meaning := array_meanings(request.problem.task).measurement) else []),
         f"Made by: {command}" if command else "Made by filtergym.",
         "",
         "No allocation, nothing but math.h. Compare it with the filter that was judged:",

@@ -13,6 +13,7 @@ import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import OBSERVATION_LIMIT, StoredPolicy
+from ..envs.contract.companions import action_meanings
 from ..envs.contract.model import Model
 from ..envs.engine.backend import make_model
 from ..evaluation.storage.files import whole_file
@@ -155,7 +156,7 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
         "fields": json.dumps([field.name for field in fields]),
         "units": json.dumps([field.unit for field in fields]),
         "descriptions": json.dumps([field.description for field in fields]),
-        "action": model.task.actions.get(header["control"], ""),
+        "action": action_meanings(model.task).get(header["control"], ""),
         "action_space": json.dumps(limits),
         "memory": "zeros at the start of a track; then what the last step returned",
         "parameters": json.dumps(stored.task_keywords),

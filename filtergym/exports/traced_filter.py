@@ -21,6 +21,7 @@ from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
 from ..compiler.program import Graph, Program, Result, Steps, program
+from ..envs.contract.companions import array_meanings
 from ..envs.contract.filter import Filter, Input
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task, field_words
@@ -86,7 +87,7 @@ class FilterSteps:
         steers: bool = False,
     ) -> None:
         self.filter, self.masked, self.decider = filter, masked, decider
-        self.steers = steers and bool(filter.task.feedback_words) and filter.task.closes_loop
+        self.steers = steers and bool(array_meanings(filter.task).feedback) and filter.task.closes_loop
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
         """Its state after a measurement, and its answer."""

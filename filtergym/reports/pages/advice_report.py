@@ -12,6 +12,8 @@ import xarray
 
 from ...baselines.advice import Advice
 from ...baselines.fitting import DROP
+from ...envs.contract.companions import find_companion
+from ...envs.contract.log_format import LogFormat
 from ...envs.contract.task import Task
 from ...evaluation.competitors.likelihood import Span
 from ...evaluation.running.metrics import chi_square_band
@@ -166,9 +168,10 @@ def _track(
     its two axes, else the main component.
     """
     measured = received(run.isel(policy=0), task)
-    if measured is None or task.log_format is None:
+    log_format = find_companion(task, LogFormat)
+    if measured is None or log_format is None:
         return {}
-    group = task.log_format.predicted[0].group
+    group = log_format.predicted[0].group
     components = list(task.groups.get(group, (group,)))[:2]
     if not {*components} <= {one.name for one in task.components}:
         return {}  # a sensor of a model of one's own need not be named as a component

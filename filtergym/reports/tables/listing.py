@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from ...baselines.problem import Problem
 from ...compiler.library import fastest
 from ...compiler.native import processor
+from ...envs.contract.companions import Paper, find_companion
 from ...envs.contract.task import Task
 from ...envs.engine.backend import make_model
 from ...envs.engine.catalogue import USER_TASKS, parameter_names
@@ -47,7 +48,7 @@ def environment_lines(problem: Problem, width: int) -> Iterator[str]:
     yield problem.name
     yield _hang(" ", summary_of(cls), width)
     rows = {
-        "paper": [cls.paper_source] if cls.paper_source else [],
+        "paper": [paper.source] if (paper := find_companion(cls, Paper)) else [],
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
         "estimators": list(known.estimators),
