@@ -43,7 +43,7 @@ def estimates(model, episode):
     [
         ("ManeuveringTarget", "imm", {}),
         ("ManeuveringTarget", "adaptive", {"decision_interval": 3}),
-        ("ManeuveringTarget", "hard-imm", {}),
+        ("UavAutopilot", "over-smoothed", {}),
         ("RadarEsmTracking", "forgetting-joint-type", {}),
         ("LooselyCoupledNavigation", "augmented-gain-mehra", {}),
         ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
