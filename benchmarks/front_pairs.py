@@ -43,7 +43,7 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "UavAutopilot": (
         1000,
-        ("sage-husa-tuned", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
+        ("sage-husa", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
     ),
 }
 """Episodes, and the classical competitors that are best in some time, by environment."""

@@ -26,7 +26,7 @@ agents_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo sac kalman-ne
 agents_TightlyCoupledNavigation := bptt ppo bptt-small bptt-linear kalman-net
 
 shipped_ManeuveringTarget := bptt bptt-small bptt-linear ppo kalman-net student
-shipped_UavAutopilot := bptt bptt-small bptt-linear ppo kalman-net
+shipped_UavAutopilot := bptt bptt-small ppo kalman-net
 shipped_RadarEsmTracking := bptt bptt-small bptt-linear ppo kalman-net
 shipped_LooselyCoupledNavigation := bptt bptt-small bptt-linear ppo kalman-net
 # Its kalman-net loses every track of the scenario `paper`, and is trained but not shipped.
