@@ -35,7 +35,7 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "RadarEsmTracking": (
         2000,
-        ("quasi-optimal", "leaky-tuned", "forgetting-joint-type-tuned", "exact-bayes-9", "exact-bayes"),
+        ("quasi-optimal", "leaky", "forgetting-joint-type-tuned", "exact-bayes-9", "exact-bayes"),
     ),
     "TightlyCoupledNavigation": (
         400,
