@@ -39,7 +39,7 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "TightlyCoupledNavigation": (
         400,
-        ("multi-hypothesis", "stuck-check", "fixed-robust-tuned", "huber-stuck-check", "fault-hypotheses"),
+        ("multi-hypothesis", "fixed-robust-tuned", "huber-stuck-check", "fault-hypotheses"),
     ),
     "UavAutopilot": (
         1000,

@@ -48,7 +48,7 @@ def estimates(model, episode):
         ("LooselyCoupledNavigation", "augmented-gain-mehra", {}),
         ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
         ("UavAutopilot", "innovation-adaptive", {}),
-        pytest.param("TightlyCoupledNavigation", "stuck-check", {}, marks=pytest.mark.slow),
+        pytest.param("TightlyCoupledNavigation", "nis-adaptive", {}, marks=pytest.mark.slow),
         *(
             pytest.param(
                 file.parent.name.removesuffix("-v0"),
