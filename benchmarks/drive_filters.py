@@ -25,7 +25,6 @@ COMPETITORS = (
     "augmented",
     "augmented-gain",
     "augmented-sage-husa",
-    "augmented-variational-bayes-tuned",
     "best-constant",
     "bptt",
     "bptt-linear",

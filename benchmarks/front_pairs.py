@@ -35,15 +35,15 @@ CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
     ),
     "RadarEsmTracking": (
         2000,
-        ("quasi-optimal", "leaky-tuned", "forgetting-joint-type-tuned", "exact-bayes-9", "exact-bayes"),
+        ("quasi-optimal", "leaky", "forgetting-joint-type-tuned", "exact-bayes-9", "exact-bayes"),
     ),
     "TightlyCoupledNavigation": (
         400,
-        ("multi-hypothesis", "stuck-check", "fixed-robust-tuned", "huber-stuck-check", "fault-hypotheses"),
+        ("multi-hypothesis", "fixed-robust-tuned", "huber-stuck-check", "fault-hypotheses"),
     ),
     "UavAutopilot": (
         1000,
-        ("sage-husa-tuned", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
+        ("sage-husa", "gust-imm-tuned", "level-bank-3", "level-bank-4", "level-bank"),
     ),
 }
 """Episodes, and the classical competitors that are best in some time, by environment."""

@@ -30,7 +30,7 @@ CASES = (
     ("ManeuveringTarget", "random", ("semi-markov", "bptt")),
     ("ManeuveringTarget", "clutter", ("semi-markov-pda",)),
     ("LooselyCoupledNavigation", "random", ("fault-bank", "kalman-net")),
-    ("TightlyCoupledNavigation", "random", ("fault-hypotheses", "bptt-small", "stuck-check")),
+    ("TightlyCoupledNavigation", "random", ("fault-hypotheses", "bptt-small")),
 )
 """Environment, scenario and competitors, each beside the paper's algorithm."""
 STATISTICS = ("geometric mean of ratios", "lost tracks", "ratio of means")

@@ -299,8 +299,8 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path):
             read_artefact(path, PROBLEM)
     # A policy steers a control, which no log has.
     uav = problem_of("filtergym/UavAutopilot-v0")
-    path.write_text(json.dumps(table | {"environment": uav.id, "filter": "fixed-best"}))
-    with pytest.raises(ValueError, match="has no filter 'fixed-best' that can be fitted"):
+    path.write_text(json.dumps(table | {"environment": uav.id, "filter": "innovation-adaptive"}))
+    with pytest.raises(ValueError, match="has no filter 'innovation-adaptive' that can be fitted"):
         read_artefact(path, uav)
 
 

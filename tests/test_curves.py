@@ -20,6 +20,7 @@ from filtergym.evaluation.storage.dataset import windows_of
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"
+PILOT = "filtergym/UavAutopilot-v0"
 NAMES = ["imm", "adaptive", "kalman-imm", "known-turn", "known-input-bound"]
 POSITION = ["position_x", "position_y"]
 
@@ -154,7 +155,7 @@ def test_an_action_is_told_as_the_box_bounds_it():
     found = evaluate(TARGET, {"bold": Bold}, "paper", 3, horizon=4)
     assert (found["action"].values == 1.0).all()
     assert found["action_name"].values.tolist() == ["gain"]
-    assert "action" not in evaluate(TARGET, ["hard-imm"], "paper", 2, horizon=4)  # it names a mode
+    assert "action" not in evaluate(PILOT, ["over-smoothed"], "paper-noise", 2, horizon=4)  # it names a mode
     assert "action" not in curves_of(evaluate(TARGET, ["known-turn"], "paper", 2, horizon=4))
 
 

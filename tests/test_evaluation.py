@@ -166,7 +166,7 @@ def test_shipped_values_are_used_unless_there_are_ones_own(tmp_path, monkeypatch
     # Not closer: 1 - 0.9 is not the 0.1 of the untuned transition matrix.
     np.testing.assert_allclose(*dataset["cost"].values, rtol=1e-9)
     with pytest.raises(ValueError, match="filtergym tune"):
-        problem_of(ENV).tuned_values.values("hard-imm")
+        problem_of(ENV).tuned_values.values("zero")
 
 
 def test_searches_that_end_together_lose_no_values(tmp_path):

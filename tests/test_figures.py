@@ -45,7 +45,7 @@ NAMES = [
     "known-input-bound",
     "kalman-imm",
     "fixed-high",
-    "hard-imm",
+    "adaptive-rearm",
     "bptt",
 ]
 
@@ -114,7 +114,7 @@ def test_kinds_always_look_the_same(curves):
     assert look["imm"]["color"] == COLOURS[0]
     assert look["bptt"]["linewidth"] > look["imm"]["linewidth"]
     # Whoever else is there, the paper's algorithm, references and bounds keep their looks.
-    for other in (["adaptive", "known-turn", "imm"], ["known-input-bound", "imm", "hard-imm"]):
+    for other in (["adaptive", "known-turn", "imm"], ["known-input-bound", "imm", "adaptive-rearm"]):
         assert all(
             looks(curves, other)[name][key] == look[name][key]
             for name in set(other) & set(look)

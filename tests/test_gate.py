@@ -413,7 +413,6 @@ def test_what_was_around_an_agent_is_around_it_again(monkeypatch, tmp_path):
             {"residual_to": "kalman-imm"},
             "of kind estimator and has no actions that could be corrected",
         ),
-        ("ppo", {"residual_to": "hard-imm"}, "a residual action is added: control 'mode' has Discrete"),
         ("ppo", {"residual_to": "adaptive", "control": "gains"}, "made for control 'gain', but the environ"),
         ("ppo", {"residual_to": "imm-tuned"}, "acts under parameters of its own"),
         ("ppo", {"gated": True, "control": "mode"}, "has no constant action that is the paper's"),
@@ -425,6 +424,15 @@ def test_training_around_what_cannot_be(algorithm, around, message):
 
     with pytest.raises(ValueError, match=message):
         new_run(problem_of(ID), RunOptions(algorithm, **around))
+
+
+def test_a_policy_that_chooses_a_hypothesis_has_no_residual():
+    pytest.importorskip("sb3_contrib")
+    from filtergym.agents.training_run import RunOptions, new_run
+
+    problem = problem_of("filtergym/UavAutopilot-v0")
+    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
+        new_run(problem, RunOptions("ppo", residual_to="over-smoothed"))
 
 
 def test_gradient_through_the_gate_is_that_of_torch():

@@ -292,7 +292,7 @@ def test_the_estimator_with_noise_as_reported_is_the_augmented_filter_of_the_ban
 
 def test_a_policy_with_estimated_noise_reports_what_its_filter_does_where_the_gain_can():
     """After the first samples, in which the receiver's noise is large against what is to be corrected."""
-    names = [f"augmented{way}-{rule}" for rule in RULES for way in ("", "-gain")]
+    names = [f"augmented{way}-{rule}" for rule in ("mehra", "sage-husa") for way in ("", "-gain")]
     error = evaluate(ID, names, "jamming", 4)["error"]
     for estimator, policy in zip(names[::2], names[1::2], strict=True):
         apart = (error.sel(policy=estimator) - error.sel(policy=policy)).values

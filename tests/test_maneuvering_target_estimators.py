@@ -13,11 +13,7 @@ from scipy.stats import multivariate_normal
 
 from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.maneuvering_target.adaptive_estimators import (
-    SageHusa,
-    VariationalBayes,
-    VariationalBayesPrediction,
-)
+from filtergym.baselines.maneuvering_target.adaptive_estimators import SageHusa, VariationalBayes
 from filtergym.baselines.maneuvering_target.estimators import (
     KalmanInteractingMultipleModel,
     KalmanTurnInteractingMultipleModel,
@@ -239,24 +235,6 @@ def test_variational_bayes_equals_the_papers_recursion(model):
             z, R, dt = yield x, P
 
     compare(model, VariationalBayes(model.task, acceleration, rho, shape), track)
-
-
-def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(model):
-    acceleration, tau = 0.6, 2.0
-
-    def track(x, P):
-        z, R, dt = yield
-        while True:
-            F = transition(dt)
-            before, nominal = F @ x, F @ P @ F.T + acceleration**2 * unit_noise(dt)
-            estimated = nominal
-            for _ in range(VariationalBayesPrediction.iterations):
-                x, P, _ = kalman_update(before, estimated, z, R)
-                if z is not None:
-                    estimated = (tau * nominal + P + np.outer(x - before, x - before)) / (tau + 1)
-            z, R, dt = yield x, P
-
-    compare(model, VariationalBayesPrediction(model.task, acceleration, tau), track)
 
 
 def test_constant_acceleration_equals_naive_loops(model):

@@ -13,7 +13,6 @@ from filtergym.filters import (
     noise_adaptation,
     ordered_sums,
     polar,
-    predicted_covariance,
     small_matrices,
     unscented,
 )
@@ -90,7 +89,6 @@ CALLS = [
     (ordered_sums.ordered_sum, (MU,)),
     (ordered_sums.weighted_sum, (MU, COVARIANCES)),
     (polar.cartesian_variances, (1e4 * Z2, 100.0, 0.004)),
-    (predicted_covariance.update, (X4, P4, Z2, H24, R2, 2.0, 3)),
     (small_matrices.product, (P4, P4)),
     (small_matrices.apply, (P4, X4)),
     (small_matrices.transpose, (P4,)),

@@ -216,13 +216,6 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
         lanes.decide(action)
 
 
-def test_most_probable_names_the_largest():
-    dataset = evaluate(ID, ["quasi-optimal", "most-probable"], "random", 50)
-    largest = dataset["mode_probability"].sel(policy="quasi-optimal").values.argmax(axis=-1)
-    named = dataset["mode_probability"].sel(policy="most-probable").values
-    numpy.testing.assert_array_equal(named, numpy.eye(3)[largest])
-
-
 def test_policies_fit_other_numbers_of_classes_and_types():
     two = {
         "manoeuvrability": (0.03, 0.1), "acceleration_sigma": (3.0, 20.0), "prior": (0.3, 0.7),

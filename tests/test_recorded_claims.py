@@ -48,11 +48,11 @@ def test_tuned_estimators_of_maneuvering_targets_come_in_their_order():
     costs = {
         name: found["metrics"]["cost"][0] for name, found in competitors.items() if name.endswith("-tuned")
     }
-    semi_markov = [costs.pop("semi-markov-tuned"), costs.pop("semi-markov-vague-tuned")]
+    semi_markov = costs.pop("semi-markov-vague-tuned")
     few = [costs.pop(name) for H in (15, 9, 5, 3) if (name := f"semi-markov-{H}-tuned") in costs]
     assert few == sorted(few)
     turning = costs.pop("kalman-imm-turn-tuned")
-    assert max(semi_markov) < 0.95 * turning
+    assert semi_markov < 0.95 * turning
     assert turning < min(costs.values())
     for name, cost in costs.items():
         assert cost <= competitors[name.removesuffix("-tuned")]["metrics"]["cost"][0], name

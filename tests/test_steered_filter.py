@@ -44,12 +44,12 @@ def estimates(model, episode):
     [
         ("ManeuveringTarget", "imm", {}),
         ("ManeuveringTarget", "adaptive", {"decision_interval": 3}),
-        ("ManeuveringTarget", "hard-imm", {}),
+        ("UavAutopilot", "over-smoothed", {}),
         ("RadarEsmTracking", "forgetting-joint-type", {}),
         ("LooselyCoupledNavigation", "augmented-gain-mehra", {}),
         ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
         ("UavAutopilot", "innovation-adaptive", {}),
-        pytest.param("TightlyCoupledNavigation", "stuck-check", {}, marks=pytest.mark.slow),
+        pytest.param("TightlyCoupledNavigation", "nis-adaptive", {}, marks=pytest.mark.slow),
         *(
             pytest.param(
                 file.parent.name.removesuffix("-v0"),

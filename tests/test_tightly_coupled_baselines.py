@@ -241,37 +241,6 @@ def test_nis_adaptive_listens_to_the_hypothesis_that_is_content():
     assert policy.predict(quiet)[0][0] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
 
 
-def test_stuck_check_switches_stuck_accelerometers_off():
-    model = make_model(ID, "gain", rate_fault_probability=0.0, stick_probability=1.0, horizon=200)
-    actions = []
-
-    class Watched(policies.StuckCheck):
-        def act(self, observation, state, start):
-            action, state = super().act(observation, state, start)
-            actions.append(action[:, 2])
-            return action, state
-
-    states = [episode for episode, _ in rollout(model, Watched(model), episode_seeds("test", 5, 8))]
-    stuck = numpy.stack([s.truth.disturbances["stuck"].now for s in states]) > 0.0
-    assert stuck.any()
-    # A decision is told of the measurements since the last one; the first of one.
-    first = [max(0, (k - 1) * model.task.decision_interval + 1) for k in range(len(actions))]
-    told = [stuck[i : k * model.task.decision_interval + 1].any(axis=0) for k, i in enumerate(first)]
-    assert ((numpy.stack(actions) == 1.0) == told).all()
-
-
-def test_fallback_says_nothing_of_other_sensors():
-    model = make_model(ID, "gain")
-    check, fallback = policies.StuckCheck(model), policies.StuckCheckFallback(model)
-    bad = observed(model, average_nis=math.log1p(30.0))
-    assert (check.predict(bad)[0][0] > 0.0).tolist() == [True, False, True, True]
-    action, _ = fallback.predict(bad)
-    assert action[0] == pytest.approx([0.0, 0.0, check.predict(bad)[0][0, 2], 0.0], abs=0.0)
-    assert (action[1] == 0.0).all()
-    repeated = observed(model, average_nis=math.log1p(30.0), accelerometers_repeat=0.1)
-    assert fallback.predict(repeated)[0].tolist() == [[0.0, 0.0, 1.0, 0.0], [0.0] * 4]
-
-
 # --- estimators
 
 
@@ -292,9 +261,9 @@ def test_huber_without_thresholds_is_the_paper():
         assert (dataset[name][0] == dataset[name][1]).all()
 
 
-def constant(values):
+def constant(values, name="robust"):
     class Constant(policies.ConstantPolicy):
-        control = "robust"
+        control = name
         action = values
 
     return Constant
@@ -317,9 +286,8 @@ def test_robust_is_between_the_paper_and_hubers_update():
         "robust": constant((0.0,) * 5 + (1.0, 1.0)),
         "ranges and rates": RangesAndRates,
         "noisy": constant((0.2, -0.3, 0.5, 0.1, 0.0, 0.0, 0.0)),
-        "gain": lambda task: policies.FixedGain(task, (0.06, -0.09, 0.15, 0.03)),
+        "gain": constant((0.06, -0.09, 0.15, 0.03), "gain"),
     }
-    others["gain"].control = "gain"
     error = evaluate(ID, others, episodes=8, horizon=100, backend="numpy", **OPEN_LOOP)["error"]
     # Exact but where a threshold of 1e9 deviations, or the covariance of what is steered, comes in.
     for one, other in (
@@ -394,9 +362,9 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
 
 
 def test_tuning_counts_decisions():
-    # 16 candidates on 256 episodes of 60 decisions, each 10 measurements.
-    with pytest.raises(ValueError, match="give 245760 steps"):
-        tune(problem_of(ID), "sticky", Search(245_759))
+    # 32 candidates on 256 episodes of 60 decisions, each 10 measurements.
+    with pytest.raises(ValueError, match="give 491520 steps"):
+        tune(problem_of(ID), "fixed-robust", Search(491_519))
 
 
 # --- metrics

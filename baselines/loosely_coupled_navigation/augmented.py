@@ -7,6 +7,7 @@ reported; when the report changes it begins anew. One receiver measures all axes
 mean square.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
@@ -24,16 +25,20 @@ LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "vari
 """Of the arguments of each rule: the least, those without tuning, the largest."""
 
 
-def with_rules(host: type, name: str, description: str) -> tuple[dict[str, Variant], dict[str, Tunable]]:
+def with_rules(
+    host: type, name: str, description: str, rules: Iterable[str] = RULES
+) -> tuple[dict[str, Variant], dict[str, Tunable]]:
     """Return a policy or an estimator with each rule for the receiver's noise, and what is tuned in it, by name.
 
     Args:
         host: its class, which takes the task, a rule, and the arguments of the rule.
         name: of the host, to which that of the rule is added.
         description: of the host, to which that of the rule is added.
+        rules: names of the rules for the receiver's noise; default: all.
     """
     variants, tunables = {}, {}
-    for rule, (cls, words) in RULES.items():
+    for rule in rules:
+        cls, words = RULES[rule]
         untuned = {value: start for value, (_, start, _) in LIMITS[rule].items()}
         variants[f"{name}-{rule}"] = Variant(host, f"{description} {words}.", rule=cls, **untuned)
         tunables[f"{name}-{rule}"] = tunable(variants[f"{name}-{rule}"], **LIMITS[rule])

@@ -66,14 +66,12 @@ class PlainWhite(FixedGain):
 class BestConstant(FixedGain):
     """The constant gain of least mean square error under the modelled noise levels, exact."""
 
-    def __init__(self, model: Model, gain: float | None = None) -> None:
-        if gain is None:
-            p = model.task.parameters
-            levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
-            K = ins_gnss.best_constant_gain(*levels)
-            growth = K * K * p.receiver_intensity * p.sampling_interval
-            gain = float(ins_gnss.steady_state_gain(growth, p.receiver_variance))
-        super().__init__(model, gain)
+    def __init__(self, model: Model) -> None:
+        p = model.task.parameters
+        levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
+        K = ins_gnss.best_constant_gain(*levels)
+        growth = K * K * p.receiver_intensity * p.sampling_interval
+        super().__init__(model, float(ins_gnss.steady_state_gain(growth, p.receiver_variance)))
 
 
 # --- the plain scheme with a gain that varies
@@ -155,8 +153,8 @@ class InnovationAdaptive(TimeVarying):
     begins with the reported noise as its first values.
     """
 
-    def __init__(self, model: Model, intensity: float | None = None, window: float = 0.25) -> None:
-        super().__init__(model, intensity)
+    def __init__(self, model: Model, window: float = 0.25) -> None:
+        super().__init__(model)
         self.rate = -math.expm1(-self.task.parameters.sampling_interval / window)
 
     def noise(
@@ -228,7 +226,7 @@ class AugmentedGain(TimeVarying):
 
 
 POLICIES_BY_RULE, TUNABLE_POLICIES = with_rules(
-    AugmentedGain, "augmented-gain", "`augmented-gain` with the receiver's noise"
+    AugmentedGain, "augmented-gain", "`augmented-gain` with the receiver's noise", ("mehra", "sage-husa")
 )
 ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
     AugmentedEstimator, "augmented", "The augmented filter, receiver noise"
@@ -257,12 +255,8 @@ TUNABLE_BANKS = {
     "fault-bank-vague": tunable(ESTIMATORS["fault-bank-vague"], **_RATES, longest=(1.0, 3.0, 5.0)),
 }
 """Each candidate runs alone: values decide how many measurements a hypothesis lasts."""
-_INTENSITY = (-2.0, math.log10(0.36), 1.0)
 
 TUNABLE = {
-    "best-constant": tunable(BestConstant, log10_gain=(-3.0, math.log10(0.0462), -0.5)),
-    "time-varying": tunable(TimeVarying, log10_intensity=_INTENSITY),
-    "innovation-adaptive": tunable(InnovationAdaptive, log10_intensity=_INTENSITY, window=(0.05, 0.25, 2.0)),
     **TUNABLE_POLICIES,
     **TUNABLE_ESTIMATORS,
     **{name: replace(bank, in_lanes=False) for name, bank in TUNABLE_BANKS.items()},
@@ -299,7 +293,6 @@ BASELINES = Baselines(
     score_reference="matched",
     tunable=TUNABLE,
     alarm=FusionAlarm,
-    best_constant="best-constant",
     compared=("augmented",),
     benchmark=(
         "plain-reduced",

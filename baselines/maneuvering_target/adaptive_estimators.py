@@ -5,11 +5,11 @@ A scan that missed the target says nothing of any noise: what is estimated holds
 
 from typing import NamedTuple
 
-from ...envs.contract.filter import Initial, Input, Likelihood, Track
+from ...envs.contract.filter import Initial, Input, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.banks import SHORTEST
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...filters import kalman, noise_adaptation, predicted_covariance
+from ...filters import kalman, noise_adaptation
 from .estimators import KalmanModel
 
 
@@ -124,36 +124,3 @@ class VariationalBayes(KalmanModel):
         nominal = self.update_estimate(predicted, measurement._replace(variance=before.variance * variance))
         told = self.likelihood(measurement, *nominal[2:])
         return MeasurementNoiseTrack(result.mean, result.covariance, told, noise)
-
-
-class VariationalBayesPrediction(KalmanModel):
-    """A Kalman filter that estimates the covariance of its prediction by variational Bayes (Huang and others 2018).
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration in the nominal prediction, m/s^2.
-        strength: measurements for which the nominal prediction's covariance stands.
-    """
-
-    iterations = 10
-
-    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, strength: float = 3.0) -> None:
-        super().__init__(task)
-        self.variance, self.strength = acceleration**2, strength
-
-    def update(self, state: Track, given: Input) -> Track:
-        """Predict, and update state and predicted covariance together."""
-        measurement = given.measurement
-        F, unit = self.motion(measurement.interval)
-        predicted = Initial(*kalman.predict(state.mean, state.covariance, F, self.variance * unit))
-        result = predicted_covariance.update(
-            *predicted,
-            measurement.position,
-            self.H,
-            self.identity * measurement.variance,
-            self.strength,
-            self.iterations,
-        )
-        estimate = self.where_detected(measurement, Initial(result.mean, result.covariance), predicted)
-        nominal = self.update_estimate(predicted, measurement)
-        return Track(estimate.mean, estimate.covariance, self.likelihood(measurement, *nominal[2:]))

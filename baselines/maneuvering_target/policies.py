@@ -13,7 +13,7 @@ from ...envs.contract.model import Model
 from ...envs.maneuvering_target.banks import GainBank
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
-from ..table import Baselines, PaperAction, Tunable, tunable
+from ..table import Baselines, PaperAction, tunable
 from .alarm import RadarAlarm
 from .log_families import log_families
 from .metrics import METRICS
@@ -55,22 +55,6 @@ class SteadyStateInteractingMultipleModel(InteractingMultipleModel):
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"likelihood_covariance": "steady-state"}
-
-
-class HardInteractingMultipleModel(InteractingMultipleModel):
-    """Believe the most probable mode only.
-
-    With all weight on one mode the bank mixes every filter into the same state with the same covariance, so
-    both modes explain the next measurement equally well and the transition probabilities decide: the first
-    mode is believed for ever. On this bank of process-noise-free filters it *is* ``fixed-low``.
-    """
-
-    control = "mode"
-    traceable = True
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the mode of largest posterior probability."""
-        return numpy.argmax(self.probabilities(observation), axis=1), None
 
 
 class ZeroEvidence(PaperAction):
@@ -168,12 +152,9 @@ def _make_tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callab
     return {"gains": _gains(values), "transition": transition}, InteractingMultipleModel
 
 
-def _tunable_adaptive(cls: type[AdaptiveGain]) -> Tunable:
-    def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-        false_alarm, ramp = 10.0 ** values["log10_false_alarm"], values["ramp_scans"]
-        return {"gains": _gains(values)}, lambda model: cls(model, false_alarm, ramp)
-
-    return tunable(cls, apply, **_GAINS, log10_false_alarm=(-5.0, -3.0, -0.5), ramp_scans=(1.0, 7.0, 20.0))
+def _make_tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+    false_alarm, ramp = 10.0 ** values["log10_false_alarm"], values["ramp_scans"]
+    return {"gains": _gains(values)}, lambda model: RearmingAdaptiveGain(model, false_alarm, ramp)
 
 
 _GAINS = {"low": (0.05, 0.3, 0.5), "high": (0.4, 0.7, 0.95)}
@@ -186,8 +167,13 @@ TUNABLE = {
         stay_low=(0.5, 0.9, 0.999),
         stay_high=(0.3, 0.9, 0.999),
     ),
-    "adaptive": _tunable_adaptive(AdaptiveGain),
-    "adaptive-rearm": _tunable_adaptive(RearmingAdaptiveGain),
+    "adaptive-rearm": tunable(
+        RearmingAdaptiveGain,
+        _make_tuned_adaptive,
+        **_GAINS,
+        log10_false_alarm=(-5.0, -3.0, -0.5),
+        ramp_scans=(1.0, 7.0, 20.0),
+    ),
     "fixed-best": tunable(FixedBest, alpha=(0.05, 0.65, 0.95)),
     **TUNABLE_ESTIMATORS,
 }
@@ -201,7 +187,6 @@ BASELINES = Baselines(
         "imm": InteractingMultipleModel,
         "imm-steady-state": SteadyStateInteractingMultipleModel,
         "zero": ZeroEvidence,
-        "hard-imm": HardInteractingMultipleModel,
         "adaptive": AdaptiveGain,
         "adaptive-rearm": RearmingAdaptiveGain,
         "fixed-low": FixedLow,
@@ -230,7 +215,6 @@ BASELINES = Baselines(
         "fixed-low",
         "fixed-high",
         "fixed-best",
-        "hard-imm",
         "random",
         "known-turn",
         *(name for name in ESTIMATORS if name not in LEFT_OUT),

@@ -18,7 +18,7 @@ from ...envs.maneuvering_target.semi_markov import (
     training_prior,
 )
 from ..table import Tunable, Variant, tunable, without_logarithms
-from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
+from .adaptive_estimators import SageHusa, VariationalBayes
 from .data_association import (
     InteractingMultipleModelDataAssociation,
     ProbabilisticDataAssociation,
@@ -64,7 +64,6 @@ ESTIMATORS = {
     "unscented-turn": UnscentedTurn,
     "sage-husa": SageHusa,
     "variational-bayes": VariationalBayes,
-    "variational-bayes-prediction": VariationalBayesPrediction,
 }
 
 
@@ -160,21 +159,4 @@ TUNABLE = {
     "semi-markov-vague": _semi_markov(SEMI_MARKOV_VAGUE, VAGUE),
     "semi-markov-vague-pda": _semi_markov(SEMI_MARKOV_VAGUE_DATA_ASSOCIATION, VAGUE),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
-    "sage-husa": tunable(
-        SageHusa,
-        log10_acceleration=(-1.5, log10(1.0), 1.0),
-        forgetting=(0.3, 0.9, 0.99),
-        log10_least=(-2.0, log10(0.1), 0.7),
-    ),
-    "variational-bayes": tunable(
-        VariationalBayes,
-        log10_acceleration=(-1.5, log10(2.775), 1.0),
-        forgetting=(0.5, 0.95, 1.0),
-        log10_shape=(-0.3, log10(5.0), 3.0),
-    ),
-    "variational-bayes-prediction": tunable(
-        VariationalBayesPrediction,
-        log10_acceleration=(-1.5, log10(1.0), 1.0),
-        log10_strength=(-1.0, log10(3.0), 2.0),
-    ),
 }

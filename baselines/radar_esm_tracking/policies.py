@@ -4,7 +4,6 @@ Equation numbers and readings are those of the task's paper (Ivanov, Seliverstov
 """
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -29,13 +28,13 @@ class QuasiOptimal(PaperAction):
 
 
 class FixedWeights(ConstantPolicy):
-    """One combination of the filters, never changed; uniform unless it is told otherwise."""
+    """The uniform combination of the filters, never changed."""
 
     control = "weights"
 
-    def __init__(self, model: Model, weights: tuple[float, ...] | None = None) -> None:
+    def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.action = weights or (1.0,) * len(self.task.modes)
+        self.action = (1.0,) * len(self.task.modes)
 
 
 class _Posterior(Policy):
@@ -102,21 +101,6 @@ class Ungated(_Posterior):
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Prior, radar, and all decisions."""
         return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation, 1.0)
-
-
-class MostProbable(_Posterior):
-    """The most probable class (8) alone, in place of the combination (11)."""
-
-    control = "mode"
-    traceable = True
-
-    def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
-        """Prior, radar and ESM, as the paper's algorithm has them."""
-        return self.log_prior + self.radar(observation) + self.log_esm @ self.counts(observation)
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the class."""
-        return numpy.argmax(self.log_posterior(observation), axis=0), None
 
 
 class JointType(_Posterior):
@@ -199,13 +183,6 @@ class Leaky(_Posterior):
         return imm.log_probabilities(predicted) + self.esm * (self.log_esm @ usable.T)
 
 
-def _make_fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    weights = tuple(values[name] for name in ("S0", "S1", "S2"))
-    return {}, lambda model: FixedWeights(model, weights)
-
-
-_COUNTS = {"refused": (0.0, 0.0, 1.0), "esm": (0.0, 1.0, 1.0)}
-
 ESTIMATORS = {
     "exact-bayes": Variant(
         ExactBayes,
@@ -245,13 +222,11 @@ TUNABLE = {
         redrawn=(0.01, VAGUE.redrawn, 0.9),
         log10_outliers=(-4.0, math.log10(VAGUE.outliers), -0.7),
     ),
-    "fixed-weights": tunable(
-        FixedWeights, _make_fixed_weights, S0=(0.0, 1.0, 1.0), S1=(0.0, 1.0, 1.0), S2=(0.0, 1.0, 1.0)
-    ),
-    "leaky": tunable(Leaky, log10_leak=(-6.0, -2.0, -0.5), esm=(0.0, 1.0, 1.0)),
-    "joint-type": tunable(JointType, **_COUNTS),
     "forgetting-joint-type": tunable(
-        ForgettingJointType, log10_change=(-6.0, math.log10(0.002), -0.5), **_COUNTS
+        ForgettingJointType,
+        log10_change=(-6.0, math.log10(0.002), -0.5),
+        refused=(0.0, 0.0, 1.0),
+        esm=(0.0, 1.0, 1.0),
     ),
 }
 
@@ -263,7 +238,6 @@ BASELINES = Baselines(
         "forgetting-joint-type": ForgettingJointType,
         "leaky": Leaky,
         "ungated": Ungated,
-        "most-probable": MostProbable,
         "radar-only": RadarOnly,
         "esm-only": EsmOnly,
         "non-adaptive": Variant(
@@ -282,7 +256,6 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="exact-bayes-vague",
     alarm=ClassAlarm,
-    best_constant="fixed-weights",
     physical=("rmse", "acceleration"),
     benchmark=(
         "quasi-optimal",
@@ -290,7 +263,6 @@ BASELINES = Baselines(
         "forgetting-joint-type",
         "leaky",
         "ungated",
-        "most-probable",
         "radar-only",
         "esm-only",
         "non-adaptive",

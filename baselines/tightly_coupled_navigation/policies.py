@@ -5,7 +5,6 @@ those of the task.
 """
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -23,7 +22,7 @@ from ...envs.tightly_coupled_navigation.satellite_faults import SatelliteFaults
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import SensorAlarm
-from .estimators import EFFICIENT, Huber, HuberStuckCheck
+from .estimators import Huber, HuberStuckCheck
 from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 
@@ -49,21 +48,6 @@ class Sticky(MultiHypothesis):
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
-
-
-class FixedGain(ConstantPolicy):
-    """The paper's probabilities over sensors whose noise is taken to be larger or smaller, always.
-
-    Args:
-        model: in which it acts.
-        action: of the control "gain"; by default the accelerometers are as good as switched off.
-    """
-
-    control = "gain"
-
-    def __init__(self, model: Model, action: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0)) -> None:
-        super().__init__(model)
-        self.action = action
 
 
 class FixedRobust(ConstantPolicy):
@@ -138,56 +122,7 @@ class NisAdaptive(Policy):
         return numpy.clip(numpy.stack(action, axis=1), -1.0, 1.0), None
 
 
-class StuckCheck(NisAdaptive):
-    """Accelerometers that repeat their last reading exactly are switched off; otherwise as told by the NIS.
-
-    Noise never repeats itself, so a reading that does is a stuck sensor for certain; until the decision after it sticks
-    the filter trusts it.
-    """
-
-    traceable = True
-
-    def __init__(self, model: Model, threshold: float = 3.0, rates: float = 0.0) -> None:
-        super().__init__(model, threshold, rates, accelerometers=0.0)
-        self.repeat = model.reader("accelerometers_repeat")
-        self.switch = [sensor.name for sensor in self.task.sensors].index("accelerometers")
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Look whether any reading of the last decision has repeated the one before it."""
-        action, _ = super().act(observation, None, start)
-        stuck = self.repeat(observation) > 0.0
-        return numpy.where(stuck & self._switched(action), 1.0, action), None
-
-    def _switched(self, action: numpy.ndarray) -> numpy.ndarray:
-        """Which component of the action is that of the accelerometers, ``(A,)``."""
-        return numpy.arange(action.shape[1]) == self.switch
-
-
-class StuckCheckFallback(StuckCheck):
-    """`stuck-check` that falls back to the paper's action wherever the accelerometers give no cause for another.
-
-    Under `stuck-check` an excess of the pseudoranges makes them noisier. Between houses it comes from errors that last,
-    which are then believed all the same, and the dynamics with them.
-    """
-
-    traceable = True
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Keep what is said of the accelerometers."""
-        action, _ = super().act(observation, state, start)
-        return action * self._switched(action), None
-
-
 # --- what can be tuned
-
-
-def _make_fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    # The other two groups change nothing that can be measured.
-    return {}, lambda model: FixedGain(model, tuple(values.get(s.name, 0.0) for s in model.task.sensors))
-
-
-def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    return {"transition": chain(1.0 - 10.0 ** values["log10_leave"])}, MultiHypothesis
 
 
 HYPOTHESES_ON_FAULTS = {
@@ -215,23 +150,9 @@ def _tunable_hypotheses(name: str, prior: FaultPrior) -> Tunable:
 
 
 TUNABLE = {
-    "fixed-gain": tunable(
-        FixedGain, _make_fixed_gain, rates=(-0.2, 0.0, 0.3), accelerometers=(0.0, 0.8, 1.0)
-    ),
-    "nis-adaptive": tunable(
-        NisAdaptive,
-        threshold=(0.5, 3.0, 10.0),
-        rates=(0.0, 1.0, 2.0),
-        accelerometers=(0.0, 1.0, 4.0),
-        own=(0.0, 1.0, 2.0),
-        base=(0.0, 0.0, 1.0),
-    ),
-    "stuck-check": tunable(StuckCheck, threshold=(0.5, 3.0, 10.0), rates=(0.0, 0.0, 2.0)),
     "fixed-robust": tunable(
         FixedRobust, accelerometers=(0.0, 0.0, 0.5), pseudoranges=(0.0, 1.0, 1.0), rates=(0.0, 1.0, 1.0)
     ),
-    "huber-stuck-check": tunable(HuberStuckCheck, rates=(0.5, EFFICIENT, 6.0), manoeuvre=(1.0, 4.0, 20.0)),
-    "sticky": tunable(Sticky, _sticky, log10_leave=(-6.0, -4.0, -0.5)),
     "fault-hypotheses": _tunable_hypotheses("fault-hypotheses", TRAINING),
     "fault-hypotheses-vague": _tunable_hypotheses("fault-hypotheses-vague", VAGUE),
 }
@@ -242,9 +163,6 @@ BASELINES = Baselines(
         "multi-hypothesis": MultiHypothesis,
         "sticky": Sticky,
         "nis-adaptive": NisAdaptive,
-        "stuck-check": StuckCheck,
-        "stuck-check-fallback": StuckCheckFallback,
-        "fixed-gain": FixedGain,
         "fixed-robust": FixedRobust,
         "stuck-exclusion": Variant(
             FixedRobust,
@@ -275,12 +193,10 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="stuck-exclusion",
     alarm=SensorAlarm,
-    best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
     benchmark=(
         "multi-hypothesis",
         "nis-adaptive",
-        "stuck-check",
         "singer",
         "fault-hypotheses",
         "known-mode",

@@ -13,29 +13,18 @@ import numpy
 from ...envs.contract.model import Model
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelBank, LevelPrior
-from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
-from ..table import Baselines, ConstantMode, Tunable, Variant, tunable
+from ...evaluation.competitors.kinds import Policy, RandomPolicy
+from ..table import Baselines, ConstantMode, PaperAction, Tunable, Variant, tunable
 from .alarm import AutopilotAlarm
 from .estimators import ESTIMATORS, GustInteractingMultipleModel
 from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 
 
-class FixedScale(ConstantPolicy):
-    """One Kalman filter whose process noise is the nominal one times ``10 ** log10_scale``.
-
-    A factor that the action cannot reach is taken at the edge of the action's range.
-    """
+class Kalman(PaperAction):
+    """The paper's filter, equations (10)-(12): the process noise is what the design says."""
 
     control = "gain"
-
-    def __init__(self, model: Model, log10_scale: float = 0.0) -> None:
-        super().__init__(model)
-        self.action = (min(max(log10_scale / self.task.parameters.gain_decades, -1.0), 1.0),)
-
-
-class Kalman(FixedScale):
-    """The paper's filter, equations (10)-(12): the process noise is what the design says."""
 
 
 class InnovationAdaptive(Policy):
@@ -133,11 +122,6 @@ def _tunable_bank(name: str, prior: LevelPrior) -> Tunable:
 
 
 TUNABLE = {
-    "fixed-best": tunable(
-        FixedScale,
-        lambda values: ({}, lambda model: FixedScale(model, values["log10_scale"])),
-        log10_scale=(-0.5, 0.0, 0.5),
-    ),
     "innovation-adaptive": tunable(
         InnovationAdaptive,
         _make_tuned_adaptive,
@@ -182,7 +166,6 @@ BASELINES = Baselines(
             mode=MODES.index("raw-sensors"),
         ),
         "innovation-adaptive": InnovationAdaptive,
-        "fixed-best": FixedScale,
         "random": RandomPolicy,
     },
     estimators={
@@ -196,7 +179,6 @@ BASELINES = Baselines(
     tunable=TUNABLE,
     fallback="level-bank-vague",
     alarm=AutopilotAlarm,
-    best_constant="fixed-best",
     physical=("tracking_rmse", ""),
     benchmark=(
         "kalman",

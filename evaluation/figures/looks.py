@@ -158,6 +158,6 @@ def distinguish_lines(
 
 
 def join_names(names: Sequence[str], most: int = 2) -> str:
-    """Name of a line that several share: ``imm = hard-imm``, or of more than ``most`` ``imm = hard-imm = 3 more``."""
+    """Name of a line that several share: ``imm = zero``, or of more than ``most`` ``imm = zero = 3 more``."""
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])
