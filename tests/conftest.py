@@ -12,6 +12,7 @@ import os
 import re
 import resource
 import sys
+import tempfile
 from pathlib import Path
 
 import hypothesis
@@ -90,6 +91,20 @@ def _resident():
     """Resident memory of this process, MB; 0 where Linux does not tell it."""
     status = Path("/proc/self/statm")
     return int(status.read_text().split()[1]) * resource.getpagesize() // 2**20 if status.is_file() else 0
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _temporary_folder(tmp_path_factory):
+    """Give this process a temporary folder of its own, and fail if something is left in it after the last test."""
+    folder = tmp_path_factory.mktemp("temporary", numbered=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(folder))
+        # Stable-Baselines3 makes a folder there for every model that learns without a logger, and leaves it.
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("stable-baselines3")))
+        patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
+        yield
+    left = sorted(path.name for path in folder.iterdir())
+    assert not left, f"tests have left these in the temporary folder: {left}"
 
 
 def pytest_generate_tests(metafunc):
