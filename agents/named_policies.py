@@ -7,7 +7,7 @@ from typing import Any
 from ..baselines.problem import Problem
 from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
-from ..envs.data.flights import is_folder
+from ..envs.logs.flights import is_folder
 from ..evaluation.competitors.kinds import Competitor, Source
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path

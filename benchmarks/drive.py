@@ -7,7 +7,7 @@
 The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
 4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/data/strapdown.py`` has them.
+1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/logs/strapdown.py`` has them.
 2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
    nothing later, and the position of RTK; then it runs free. Windows do not overlap.
 3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.
@@ -36,7 +36,7 @@ from typing import Any
 import numpy
 import xarray
 
-from filtergym.envs.data.strapdown import GRAVITY, AidedInertial, aid, align, free_windows, tangent_plane
+from filtergym.envs.logs.strapdown import GRAVITY, AidedInertial, aid, align, free_windows, tangent_plane
 from filtergym.envs.loosely_coupled_navigation.task import TASK
 
 SOURCE = "https://github.com/rtklibexplorer/GNSS_IMU, commit 8235ee6c5f349db529bf43ad556a3769b346b5a1, data/drive_0708"

@@ -18,7 +18,7 @@ import pandas
 
 from filtergym import tidy_records
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.data.flights import TRAFFIC, Flights, flight_of, read_flights, traffic_samples
+from filtergym.envs.logs.flights import TRAFFIC, Flights, flight_of, read_flights, traffic_samples
 from filtergym.names import find_competitors
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -24,7 +24,7 @@ from filtergym.baselines.advice import FittedLog, fit_all
 from filtergym.baselines.fitted_filters import families_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.data.recording import Recording
-from filtergym.envs.engine.scenario_choice import read_recording
+from filtergym.envs.logs.reading import read_recording
 
 ID = "filtergym/ManeuveringTarget-v0"
 SIGMA, STATED, T = 1.0, 0.5, 0.5

@@ -18,7 +18,7 @@ import numpy
 
 import filtergym
 from filtergym.envs.data.recording import Recording
-from filtergym.envs.engine.scenario_choice import read_recording
+from filtergym.envs.logs.reading import read_recording
 from filtergym.papers.grid import markdown_table
 
 ID = "filtergym/ManeuveringTarget-v0"

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from .baselines.table import Baselines
     from .envs.contract.filter import Likelihood
     from .envs.contract.task import Task
-    from .envs.data.flights import Flights, read_flights
     from .envs.data.recording import Recording
     from .envs.data.trajectory import Trajectory
-    from .envs.engine.scenario_choice import read_recording
     from .envs.linear.inputs import Input
     from .envs.linear.sensors import Sensor
+    from .envs.logs.flights import Flights, read_flights
+    from .envs.logs.reading import read_recording
     from .evaluation.competitors.kinds import FunctionPolicy
     from .functions import evaluate, make_policy, record, tidy_records
     from .live import online
@@ -45,7 +45,7 @@ __all__ = [
     "tidy_records",
 ]
 MODULES = {
-    "Flights": "envs.data.flights",
+    "Flights": "envs.logs.flights",
     "FunctionPolicy": "evaluation.competitors.kinds",
     "Input": "envs.linear.inputs",
     "Likelihood": "envs.contract.filter",
@@ -55,8 +55,8 @@ MODULES = {
     "evaluate": "functions",
     "make_policy": "functions",
     "online": "live",
-    "read_flights": "envs.data.flights",
-    "read_recording": "envs.engine.scenario_choice",
+    "read_flights": "envs.logs.flights",
+    "read_recording": "envs.logs.reading",
     "record": "functions",
     "state_space": "own_models",
     "tidy_records": "functions",

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from .baselines.problem import Problem, import_problem
-from .companions import PREFIXES, SOURCES, load
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
 from .evaluation.competitors.kinds import Competitor, Source, check_competitor
+from .extensions import PREFIXES, SOURCES, load
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """``module:Class`` of a user."""

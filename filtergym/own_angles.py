@@ -16,6 +16,8 @@ STEPS = ((0.01, 1001), (1.0, 1001))
 """Steps, and how many, by which a component of the state is moved to find jumps: 10 rad and 1,000 degrees."""
 EXACT = 1e-3
 """Share of a turn by which a jump may differ from one."""
+HALVINGS = 30
+"""Of the distance over which a jump is confirmed."""
 
 
 def find_periods(
@@ -101,7 +103,24 @@ def _jumping_rows(function: VectorFunction, given: numpy.ndarray, n: int) -> dic
                 change = numpy.diff(function.value(points, numpy), axis=1)
                 usual = 0.5 * (change[:, :-2] + change[:, 2:])
                 jump = numpy.abs(change[:, 1:-1] - usual)
-                for unit, period in PERIODS.items():
-                    rows = (numpy.abs(jump - period) < EXACT * period).any(axis=1)
-                    found |= dict.fromkeys(numpy.flatnonzero(rows).tolist(), unit)
+            for unit, period in PERIODS.items():
+                near = numpy.abs(jump - period) < EXACT * period
+                for row in numpy.flatnonzero(near.any(axis=1)).tolist():
+                    at = int(numpy.argmax(near[row])) + 1
+                    if _jumps_by(function, row, points[:, at], points[:, at + 1], period):
+                        found[row] = unit
     return found
+
+
+def _jumps_by(
+    function: VectorFunction, row: int, low: numpy.ndarray, high: numpy.ndarray, period: float
+) -> bool:
+    """Whether a row of a function jumps by a turn between two points ``(n,)``: a step of a smooth function that is as
+    large by chance vanishes with the distance.
+    """
+    for _ in range(HALVINGS):
+        points = numpy.stack([low, 0.5 * (low + high), high], axis=1)
+        with numpy.errstate(all="ignore"):
+            first, second = numpy.abs(numpy.diff(function.value(points, numpy)[row]))
+        low, high = (points[:, 0], points[:, 1]) if first > second else (points[:, 1], points[:, 2])
+    return bool(abs(max(first, second) - period) < EXACT * period)

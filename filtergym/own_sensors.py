@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy
 
+from .envs.contract.log_format import RECORDING, TIME, TRUTH
 from .envs.contract.parameters import quote_shortened
-from .envs.data.recorded_tables import RECORDING, TIME, TRUTH
 from .envs.linear.sensors import Channel, Sensor
 from .filters.angles import PERIODS
 from .own_equations import Function, NoiseBlock, check_array, further_arguments, trace_measurement

@@ -22,7 +22,8 @@ from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.companions import find_companion
 from filtergym.envs.contract.log_format import LogFormat
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.engine.scenario_choice import make_task, read_recording
+from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.envs.logs.reading import read_recording
 from filtergym.evaluation.competitors import likelihood as likelihood_module
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Estimate

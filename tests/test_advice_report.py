@@ -18,7 +18,8 @@ from filtergym.baselines import advice as advice_module
 from filtergym.baselines.advice import FittedLog, advise
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.engine.scenario_choice import make_task, read_recording
+from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.envs.logs.reading import read_recording
 from filtergym.evaluation.running.metrics import chi_square_band
 from filtergym.reports.tables.advice import advice_rows, further_sentences, verdict
 

@@ -19,7 +19,8 @@ from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.filter import Initial
-from filtergym.envs.engine.scenario_choice import make_task, read_recording
+from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.envs.logs.reading import read_recording
 from filtergym.envs.maneuvering_target.logs import scale_noise
 from filtergym.envs.maneuvering_target.world import Measurement
 from filtergym.exports.c_source import FLAGS, export_c

@@ -9,7 +9,7 @@ import xarray
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
 
 from filtergym import evaluate, read_recording
-from filtergym.envs.data import strapdown
+from filtergym.envs.logs import strapdown
 
 ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("drive", ROOT / "benchmarks" / "drive.py")

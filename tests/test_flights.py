@@ -18,9 +18,9 @@ from models import make_model
 
 from filtergym import Flights, Trajectory, evaluate, tidy_records
 from filtergym.__main__ import main
-from filtergym.envs.data import flight_tables
-from filtergym.envs.data.flight_cleaning import fit_parabolas
-from filtergym.envs.data.flights import read_flights
+from filtergym.envs.logs import flight_tables
+from filtergym.envs.logs.flight_cleaning import fit_parabolas
+from filtergym.envs.logs.flights import read_flights
 from filtergym.evaluation.running.metrics import flight_records
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.filters.geodesy import east_north

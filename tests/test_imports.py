@@ -27,7 +27,7 @@ ROOMS = (
 )
 """The last two are not installed, so nothing in the package may import them."""
 INNER_ROOMS = {
-    "envs": ("contract", "data", "drawing", "engine", "interface", "linear", *folders().values()),
+    "envs": ("contract", "data", "drawing", "engine", "interface", "linear", "logs", *folders().values()),
     "evaluation": ("storage", "statistics", "competitors", "running", "stress", "figures"),
     "filtergym/reports": ("tables", "pages"),
 }
@@ -66,7 +66,7 @@ def imported_rooms(file: Path) -> Iterator[str]:
     for (first, *rest), _ in imports_of(file):
         if first in PAGES:
             yield "docs/make"
-        elif first == "filtergym":
+        elif first == "filtergym" and rest[:1] != ["extensions"]:  # a table of names, which every room may read
             room = "filtergym/papers" if rest[:1] == ["papers"] else "".join(rest[:1])
             yield room if room in ROOMS else "filtergym"
 

@@ -9,9 +9,9 @@ import pymap3d
 import pytest
 
 from filtergym import evaluate, read_recording, tidy_records
-from filtergym.envs.data.flight_tables import seconds
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
+from filtergym.envs.logs.flight_tables import seconds
 from filtergym.evaluation.storage.estimates import write_estimates
 
 TARGET = "filtergym/ManeuveringTarget-v0"

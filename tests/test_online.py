@@ -12,7 +12,7 @@ import filtergym
 from filtergym.baselines.problem import import_problem
 from filtergym.envs.contract.task import named_arrays
 from filtergym.envs.engine.backend import make_model
-from filtergym.envs.engine.scenario_choice import read_recording
+from filtergym.envs.logs.reading import read_recording
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.competitors.online_state import History
 from filtergym.evaluation.running.evaluate import control_of

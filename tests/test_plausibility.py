@@ -9,8 +9,8 @@ import pytest
 from test_recording import table
 
 from filtergym import evaluate, read_recording, record
-from filtergym.envs.data.plausibility import check_extents
 from filtergym.envs.engine.catalogue import catalogue
+from filtergym.envs.logs.plausibility import check_extents
 from filtergym.evaluation.storage.dataset import notes_of
 from filtergym.reports.tables.advice import reading_lines
 

@@ -18,7 +18,7 @@ SHOWN = {
 }
 """What pages of the reference show, with the kind of directive and its options."""
 ELSEWHERE = {
-    "Flights": "filtergym.envs.data.flights",
+    "Flights": "filtergym.envs.logs.flights",
     "Likelihood": "filtergym.envs.contract.filter",
     "Recording": "filtergym.envs.data.recording",
     "Trajectory": "filtergym.envs.data.trajectory",

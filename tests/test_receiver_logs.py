@@ -252,7 +252,7 @@ def test_what_holds_no_sentence_is_refused(pynmea2, tmp_path):
 
 
 def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
-    monkeypatch.setattr("filtergym.envs.data.flight_tables.MOST_ROWS", COUNT - 1)
+    monkeypatch.setattr("filtergym.envs.logs.flight_tables.MOST_ROWS", COUNT - 1)
     rows = [(round(1e6 * time), *place, 2.0, 3) for time, place in zip(TIME, places().T, strict=True)]
     pytest.importorskip("pyulog", reason="not installed: pip install 'filtergym[logs]'")
     for path in (

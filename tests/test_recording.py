@@ -17,11 +17,11 @@ from filtergym.baselines.problem import problem_of
 from filtergym.commands.evaluation import causal_competitors
 from filtergym.envs.contract.companions import find_companion
 from filtergym.envs.contract.log_format import LogFormat
-from filtergym.envs.data.recorded_tables import Columns
 from filtergym.envs.data.recorded_world import measure_once
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.episode_noise import uniforms_of_seeds
 from filtergym.envs.engine.lanes import Lanes
+from filtergym.envs.logs.recorded_tables import Columns
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.evaluation.running.metrics import chi_square_band
 from filtergym.evaluation.running.seeds import episode_seeds

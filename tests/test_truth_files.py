@@ -5,7 +5,7 @@ import pandas
 import pytest
 
 from filtergym import read_recording
-from filtergym.envs.data.truth_files import LONGEST_GAP, offset_note
+from filtergym.envs.logs.truth_files import LONGEST_GAP, offset_note
 
 ID = "filtergym/ManeuveringTarget-v0"
 COUNT = 80

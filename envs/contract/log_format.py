@@ -7,9 +7,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 if TYPE_CHECKING:
-    from ..data.recorded_tables import Columns
+    from ..logs.recorded_tables import Columns
 
 
+TIME = ("time", "timestamp", "seconds")
+"""Names of the column of times."""
+RECORDING = "recording"
+"""Name of the column that names the recording of each row."""
+TRUTH = "truth_"
+"""Begins the names of columns of true values."""
 NO_DEVIATIONS = "no column states deviations"
 """How whoever assumes deviations begins to say so."""
 UNITS = {"azimuth_sigma": "degrees"}

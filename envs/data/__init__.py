@@ -1,5 +1,5 @@
-"""What comes from outside: recordings, flights, tables, logs of receivers, truth in files of its own.
+"""What comes from outside: recordings and trajectories that take the place of a simulated world, and the one door, with
+limits, for foreign files.
 
-Knows the contract. Begin with :mod:`.recording`, what every log becomes; :mod:`.recorded_tables` reads tables,
-:mod:`.receiver_logs` the formats of receivers, :mod:`.flights` trajectories that a simulation flies again.
+Knows the contract. Begin with :mod:`.recording`, what every log becomes. The readers of logs stand in :mod:`..logs`.
 """

@@ -14,6 +14,7 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,10 +28,11 @@ from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario, Task, named_arrays
 from ..contract.world import World
 from .recorded_world import RecordedWorld, Tables, measure_once
+from .scenario_data import ScenarioData
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(ScenarioData):
     """Recorded episodes of one environment, E of them; the longest has T measurements.
 
     Args:
@@ -177,6 +179,10 @@ class Recording:
 
     # --- as a scenario
 
+    def fields(self) -> dict[str, Any]:
+        """Return its fields by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
         """Measurements acted on in each episode, whole decisions, none beyond the horizon."""
         lengths = numpy.minimum(self.lengths, horizon)
@@ -290,9 +296,7 @@ class Recording:
     @property
     def dataset(self) -> Any:
         """As it stands in a file, an :class:`xarray.Dataset`."""
-        from .recording_files import dataset_of
-
-        return dataset_of(self)
+        return _dataset_of(self)
 
     def write(self, path: Any) -> None:
         """Write a NetCDF file that every reader of NetCDF takes, ``read_recording`` reads and ``scenario`` names."""
@@ -324,6 +328,47 @@ class Recording:
             (ends - self.rows).astype(float),
             (ends - 1).astype(float),
         )
+
+
+def _dataset_of(recording: Recording) -> Any:
+    """Return a recording as it stands in a file."""
+    import xarray
+
+    there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
+    variables: dict[str, Any] = {
+        "seconds": (("episode", "time"), recording.seconds, {"units": "s"}),
+        "length": ("episode", numpy.asarray(recording.lengths)),
+    }
+    for name, values in recording.measurements.items():
+        axes = [f"{name}_axis{i}" for i in range(values.ndim - 2)]
+        nothing = numpy.nan if values.dtype.kind == "f" else values.dtype.type(0)
+        shaped = there.reshape(*there.shape, *[1] * (values.ndim - 2))
+        variables[name] = (("episode", "time", *axes), numpy.where(shaped, values, nothing))
+    for name, values in recording.initial.items():
+        axes = {"mean": ["component"], "covariance": ["component", "other_component"]}.get(
+            name, [f"initial_{name}_axis{i}" for i in range(values.ndim - 1)]
+        )
+        variables[f"initial_{name}"] = (("episode", *axes), values)
+    if recording.started is not None and recording.started.any():
+        variables["started"] = ("episode", numpy.asarray(recording.started, dtype=float), {"units": "s"})
+    if recording.truth is not None:
+        variables["truth"] = (
+            ("episode", "time", "component"),
+            numpy.where(there[..., None], recording.truth, numpy.nan),
+        )
+    told = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
+    coords: dict[str, Any] = {"recording": ("episode", numpy.array(recording.names, dtype=str))}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time)
+    return xarray.Dataset(
+        variables,
+        coords=coords,
+        attrs={
+            "environment": recording.environment,
+            "parameters": json.dumps({**recording.typical, **recording.parameters}),
+            **told,
+        },
+    )
 
 
 def recording_from(fields: Mapping[str, Any]) -> Recording:
@@ -437,3 +482,13 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
 def _first(values: numpy.ndarray) -> int:
     """Place of the first row that is not finite."""
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
+
+
+def differing(parameters: Any) -> dict[str, Any]:
+    """Parameters of a task that differ from the defaults, without the horizon."""
+    found = {}
+    for each in dataclasses.fields(parameters):
+        value = getattr(parameters, each.name)
+        if each.name != "horizon" and value != each.default:
+            found[each.name] = value
+    return found

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy
 
+from .scenario_data import FlightData
+
 MOST_SAMPLES = 20_000
 """Of a flight, 33 h of scans 6 s apart; more are taken for a mistake of units or an outlier among the times."""
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(FlightData):
     """Positions and velocities of a flight at given times.
 
     Args:
@@ -55,6 +57,10 @@ class Trajectory:
             raise ValueError(
                 f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s"
             )
+
+    def fields(self) -> dict[str, Any]:
+        """Return its fields by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def duration(self) -> float:

@@ -1,6 +1,5 @@
 """How a task is made from names and keywords: what a user may give as scenario."""
 
-import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -10,19 +9,12 @@ from typing import Any
 
 import numpy
 
-from ..contract.companions import FlightScenarios, find_companion
 from ..contract.parameters import quote_shortened
 from ..contract.task import Scenario, Task
-from ..data.flight_tables import FLIGHT_SUFFIXES
-from ..data.flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
-from ..data.plausibility import check_recording
-from ..data.recorded_tables import TruthFile, read_columns
-from ..data.recording import Recording, join_recordings, recording_from
-from ..data.recording_files import is_recording, names_environment, read_netcdf
-from ..data.trajectory import Trajectory, trajectory_of
-from .catalogue import check_names, import_task, nearest, task_class
+from ..data.scenario_data import ScenarioData, readers
+from .catalogue import check_names, nearest
 
-ScenarioChoice = str | Path | Trajectory | Flights | Recording | Sequence[Any] | Mapping[str, Any] | None
+ScenarioChoice = str | Path | ScenarioData | Sequence[Any] | Mapping[str, Any] | None
 """What names a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
 
 MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
@@ -30,7 +22,10 @@ MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
 
 
 def _is_name(cls: type[Task], scenario: str) -> bool:
-    return scenario in cls.scenarios or (scenario.startswith(TRAFFIC) and "traffic" not in cls.scenarios)
+    if scenario in cls.scenarios:
+        return True
+    prefixes = [one.prefix for one in readers() if one.prefix and scenario.startswith(one.prefix)]
+    return any(prefix.removesuffix(":") not in cls.scenarios for prefix in prefixes)
 
 
 def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
@@ -50,7 +45,8 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
             return None
     elif isinstance(scenario, str) and MIXTURE.fullmatch(scenario) and not _is_name(cls, scenario):
         pairs = [part.split(":") for part in scenario.split(",")]
-        if Path(pairs[-1][1]).suffix in FLIGHT_SUFFIXES:  # of a file on a drive with a letter
+        endings = [ending for one in readers() for ending in one.endings]
+        if Path(pairs[-1][1]).suffix in endings:  # of a file on a drive with a letter
             return None
         given = {}
         for name, weight in pairs:
@@ -92,109 +88,15 @@ def read_files(cls: type[Task], scenario: Any) -> Any:
     """
     if scenario is None or (isinstance(scenario, str) and scenario in cls.scenarios):
         return scenario
-    if isinstance(scenario, Mapping):
-        if find_mixture(cls, scenario) is not None:
-            return scenario
-        if "measurements" in scenario:
-            return recording_from(scenario)
-        return flights_from(scenario) if "trajectories" in scenario else trajectory_of(scenario)
+    if isinstance(scenario, Mapping) and find_mixture(cls, scenario) is not None:
+        return scenario
     items = scenario if isinstance(scenario, list | tuple) else [scenario]
     if any(isinstance(item, str) and item in cls.scenarios for item in items):
         return scenario
-    if isinstance(scenario, str | Path) and is_recording(scenario):
-        return read_recording(scenario, cls.id)
-    return read_flights(scenario) if names_flights(scenario) else scenario
-
-
-def read_recording(
-    path: Any,
-    environment: str | None = None,
-    *,
-    speeds: tuple[float, float] = (1.0, 1000.0),
-    truth: Any = None,
-    truth_offset: float = 0.0,
-    rename: Mapping[str, str | Sequence[str]] | None = None,
-    **keywords: Any,
-) -> Recording:
-    """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
-
-    Args:
-        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :class:`.LogFormat`, or of a log of
-            a receiver (:mod:`.receiver_logs`), ``.pos``, ``.nmea``, ``.ulg`` or ``.bag``, for ManeuveringTarget. A
-            folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
-            broken one is left out and named in the notes.
-        environment: id of the environment that it is for; default: what the file says.
-        speeds: m/s; a recording whose median speed is outside is refused. The lowest holds in ManeuveringTarget only.
-        truth: path of the truth in a file of its own, a table or a log of a receiver, matched by time; a note says how
-            much of the recording has one. For tables.
-        truth_offset: s, added to the times of that file.
-        rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``; one
-            column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``.
-        **keywords: parameters of the environment that win over those of the file.
-
-    Returns:
-        What can be given as scenario: every episode replays one recording.
-
-    Raises:
-        ValueError: if it cannot be read, or does not fit the environment.
-    """
-    several = list(path) if isinstance(path, list | tuple) else [path]
-    if not several:
-        raise ValueError("name at least one file of recordings, got none")
-    cls = None if environment is None else import_task(environment)
-    if cls is not None:
-        check_names(cls, keywords)
-    files = [file for one in several for file in files_of(one)]
-    true = None if truth is None else TruthFile(Path(truth), truth_offset)
-    found: list[Recording] = []
-    left_out: list[str] = []
-    for file in files:
-        try:
-            found.append(_read_recording(file, cls, speeds, keywords, true, rename))
-            cls = cls or task_class(found[0].environment)
-        except Exception as error:  # readers raise whatever a broken file makes them stumble over
-            reason = " ".join(str(error).split()) or type(error).__name__
-            if len(files) == 1:
-                raise ValueError(f"recording {file}: {reason}") from error
-            left_out.append(f"{file.name}: left out: {reason}")
-    if not found:
-        further = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-        raise ValueError(f"nothing of {str(path)!r} can be replayed: {'; '.join(left_out[:3])}{further}")
-    if len(files) == 1:
-        return found[0]
-    name = str(path) if not isinstance(path, list | tuple) else f"{len(files)} files"
-    return join_recordings(found, name, left_out)
-
-
-def _read_recording(
-    file: Path,
-    cls: type[Task] | None,
-    speeds: tuple[float, float],
-    keywords: Mapping[str, Any],
-    truth: TruthFile | None,
-    rename: Mapping[str, str | Sequence[str]] | None,
-) -> Recording:
-    """Read one file."""
-    if not file.exists():
-        raise ValueError("there is no such file")
-    if names_environment(file):
-        if truth is not None:
-            raise ValueError(
-                "a recording in NetCDF holds its own truth: --truth is for tables and logs of receivers"
-            )
-        if rename:
-            raise ValueError("a recording in NetCDF names its own variables: --rename is for tables")
-        recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
-    elif cls is None:
-        raise ValueError(
-            "it does not say of which environment it is: give its id, as the argument environment or before --recording"
-        )
-    else:
-        recording = read_columns(file, cls, keywords, truth, rename)
-    task = make_task(cls or task_class(recording.environment), recording)
-    notes = check_recording(recording, task, speeds)
-    return dataclasses.replace(recording, notes=(*recording.notes, *notes))
+    for reader in readers():
+        if reader.takes(scenario):
+            return reader.read(scenario, cls)
+    return scenario
 
 
 def find_scenario(
@@ -225,13 +127,7 @@ def find_scenario(
             f"got {scenario!r}"
         )
     scenario = read_files(cls, scenario)
-    if isinstance(scenario, (Trajectory, Flights)):
-        of_flights = find_companion(cls, FlightScenarios)
-        if of_flights is None:
-            raise ValueError(f"{cls.id} does not take flights as scenario")
-        found: Scenario = of_flights.make(scenario, keywords or {})
-        return found
-    if isinstance(scenario, Recording):
+    if isinstance(scenario, ScenarioData):
         return scenario.scenario(cls, keywords or {})
     if not isinstance(scenario, str):
         raise ValueError(

@@ -8,9 +8,7 @@ from typing import Any
 import numpy
 from gymnasium.envs.registration import EnvSpec
 
-from ..data.flights import Flights
-from ..data.recording import Recording
-from ..data.trajectory import Trajectory
+from ..data.scenario_data import ScenarioData
 
 
 def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
@@ -29,12 +27,8 @@ def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
 
 def plain(value: Any) -> Any:
     """Return what JSON can hold in place of a keyword's value; it makes the same environment."""
-    if isinstance(value, Trajectory | Recording):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return {name: plain(item) for name, item in fields.items()}
-    if isinstance(value, Flights):
-        flown = [plain(trajectory) for trajectory in value.trajectories]
-        return {"trajectories": flown, "name": value.name, "fewest_scans": value.fewest_scans}
+    if isinstance(value, ScenarioData):
+        return {name: plain(item) for name, item in value.fields().items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, numpy.ndarray | numpy.generic):

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ...compiler.vector_functions import VectorFunction
+from ...extensions import MODEL_COMPANIONS, load_present
 from ...filters.small_matrices import apply
 from ...filters.smoothing import semidefinite_root
 from ..contract.causes import MISSED, OUTLIER, Causes
@@ -32,7 +33,6 @@ from ..contract.world import World
 from .equations import Equations, Measurement, Passage, StateSpaceDefinition, usual_sensor_noise
 from .inputs import InputCourses
 from .live import StateSpaceInput
-from .logs import state_space_log_format
 from .sensors import Receptions, SensorStates, silence_causes
 
 
@@ -407,7 +407,7 @@ def state_space_attributes(
         "companions": (
             Actions(actions, REACH),
             TrainedBanks({"kalman-net": KalmanNetBank}),
-            state_space_log_format(definition, defaults),
+            *(make(definition, defaults) for make in load_present(MODEL_COMPANIONS)),
             LiveReader(StateSpaceInput),
             Causes((*(silence_causes(definition.channels) if several else (MISSED,)), OUTLIER)),
             LostTracks(explain=_explain_loss),

@@ -1,7 +1,7 @@
 """Recordings of LooselyCoupledNavigation from a log of a raw IMU and one of fixes.
 
 The INS is aligned at a standstill, aided by the fixes, and let loose in windows one after the other (see
-``envs/data/strapdown.py``): at the start of each it has the velocity, attitude and biases that fixes have led it to
+``envs/logs/strapdown.py``): at the start of each it has the velocity, attitude and biases that fixes have led it to
 until then, and runs free from there. A window is an episode; its measurements are the positions of the INS, east and
 north, beside the fixes with the deviations that the receiver reports.
 
@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy
 
 from ...filters.geodesy import earth_fixed, east_north_up, geodetic
-from ..data.flight_tables import clock_seconds, numbers, read_table
 from ..data.recording import Recording
-from ..data.strapdown import (
+from ..logs.flight_tables import clock_seconds, numbers, read_table
+from ..logs.strapdown import (
     GRAVITY,
     AidedInertial,
     InertialErrors,
@@ -218,7 +218,7 @@ def read_columns(
 def read_inertial(
     data: Any, rate_unit: str, acceleration_unit: str, mounting: Sequence[float], delay: float
 ) -> tuple["pandas.DataFrame", str]:
-    """Return rates and specific forces forward, right and down, as ``envs/data/strapdown.py`` has them, and the clock.
+    """Return rates and specific forces forward, right and down, as ``envs/logs/strapdown.py`` has them, and the clock.
 
     Raises:
         ValueError: for unknown units, empty cells, or measurements too far apart.

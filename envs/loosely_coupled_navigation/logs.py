@@ -10,8 +10,8 @@ from typing import Any
 import numpy
 
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..data.plausibility import check_extents
-from ..data.recorded_tables import Columns
+from ..logs.plausibility import check_extents
+from ..logs.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
 
 COLUMNS = {

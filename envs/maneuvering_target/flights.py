@@ -8,8 +8,8 @@ import numpy
 
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario
-from ..data.flights import Flights, flight_of
 from ..data.trajectory import Trajectory
+from ..logs.flights import Flights, flight_of
 from .logs import FARTHEST_RANGE
 from .parameters import ManeuveringTargetParameters
 

@@ -7,7 +7,7 @@ import numpy
 
 from ...filters import polar
 from ..contract.live_input import LiveInput, Memory
-from ..data.plausibility import check_degrees
+from ..logs.plausibility import check_degrees
 from .logs import COLUMNS, FARTHEST_RANGE, two_plot_start
 from .world import Measurement, Odometry
 

@@ -21,10 +21,10 @@ from ..contract.log_format import (
     deviation_words,
     is_assumed,
 )
-from ..data.plausibility import check_bearings, scatter_of
-from ..data.recorded_tables import Columns
 from ..data.recorded_world import Feed
 from ..data.recording import Recording
+from ..logs.plausibility import check_bearings, scatter_of
+from ..logs.recorded_tables import Columns
 from .parameters import ManeuveringTargetParameters
 
 COLUMNS = {

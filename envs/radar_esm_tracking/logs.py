@@ -11,7 +11,7 @@ import numpy
 
 from ...filters.class_fusion import bearing_difference
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
-from ..data.recorded_tables import Columns
+from ..logs.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
 COLUMNS = {

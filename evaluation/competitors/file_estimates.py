@@ -14,7 +14,7 @@ import numpy
 from ...envs.contract.filter import Filter, Input, Stated
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
-from ...envs.data.flight_tables import clock_seconds, describe_time
+from ...envs.logs.flight_tables import clock_seconds, describe_time
 from ..storage.dataset import NO_ROW
 from ..storage.estimate_tables import EstimateTable, read_estimates
 from .kinds import Competitor

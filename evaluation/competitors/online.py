@@ -19,7 +19,7 @@ from ...envs.contract.live_input import LiveReader
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
-from ...envs.data.flight_tables import SINCE_1970, time_unit
+from ...envs.data.clock import SINCE_1970, time_unit
 from ...envs.engine.episode_noise import MeasurementRow
 from ...envs.engine.lanes import make_stepper
 from ...filters.array_namespace import select_nested

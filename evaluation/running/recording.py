@@ -10,8 +10,7 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task, named_arrays
 from ...envs.data.foreign_files import MOST_NUMBERS
 from ...envs.data.recorded_world import measure_once
-from ...envs.data.recording import Recording
-from ...envs.data.recording_files import differing
+from ...envs.data.recording import Recording, differing
 from ...envs.engine.backend import make_model
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files

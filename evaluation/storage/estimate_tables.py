@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.contract.parameters import quote_shortened
-from ...envs.data.flight_tables import clock_seconds, list_names, numbers, open_netcdf, read_table
 from ...envs.data.foreign_files import MOST_NUMBERS, read_content
+from ...envs.logs.flight_tables import clock_seconds, list_names, numbers, open_netcdf, read_table
 
 SUFFIXES = (".csv", ".nc", ".parquet", ".tum")
 TRACK = ("track", "recording", "episode")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy
 import xarray
 
-from ...envs.data.flight_tables import clock_seconds
+from ...envs.logs.flight_tables import clock_seconds
 from .estimate_tables import AXES
 from .files import whole_file, whole_files
 

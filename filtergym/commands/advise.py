@@ -11,7 +11,8 @@ from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
-from ..envs.engine.scenario_choice import make_task, read_recording
+from ..envs.engine.scenario_choice import make_task
+from ..envs.logs.reading import read_recording
 from ..evaluation.storage.files import writable_file, write_text
 from ..names import find_competitor, find_competitors
 from ..reports.tables.advice import (

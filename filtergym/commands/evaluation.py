@@ -14,13 +14,14 @@ from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
 from ..envs.contract.companions import find_companion
 from ..envs.contract.log_format import LogFormat
-from ..envs.data.flights import names_flights, read_flights
-from ..envs.data.plausibility import LOUD
 from ..envs.data.recording import Recording
-from ..envs.data.recording_files import is_recording
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest
-from ..envs.engine.scenario_choice import make_task, read_recording
+from ..envs.engine.scenario_choice import make_task
+from ..envs.logs.flights import names_flights, read_flights
+from ..envs.logs.plausibility import LOUD
+from ..envs.logs.reading import read_recording
+from ..envs.logs.recording_files import is_recording
 from ..evaluation.competitors.kinds import Competitor, RandomPolicy
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save

@@ -8,7 +8,7 @@ import typer
 from ..agents.export import export_run
 from ..baselines.problem import problem_of
 from ..envs.engine.catalogue import nearest
-from ..envs.engine.scenario_choice import read_recording
+from ..envs.logs.reading import read_recording
 from ..evaluation.storage.files import writable_file, writable_folder
 from .terminal import (
     Parameters,

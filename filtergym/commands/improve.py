@@ -12,7 +12,7 @@ from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune
 from ..envs.engine.catalogue import nearest
-from ..envs.engine.scenario_choice import read_recording
+from ..envs.logs.reading import read_recording
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file
 from ..evaluation.storage.store import UNFINISHED, Store

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 import numpy
 
 from ..contract.parameters import quote_shortened
-from .foreign_files import (
+from ..data.clock import SINCE_1970, time_unit
+from ..data.foreign_files import (
     MOST_NUMBERS,
     limits,
     open_foreign,
@@ -24,7 +25,7 @@ from .foreign_files import (
     read_content,
     refuse_memory,
 )
-from .foreign_parsers import MOST_COLUMNS, check_cells, check_column_names, check_rows
+from ..data.foreign_parsers import MOST_COLUMNS, check_cells, check_column_names, check_rows
 from .receiver_logs import RECEIVER_READERS, receiver_columns
 
 if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
@@ -72,8 +73,6 @@ COUNTERS = (2.0**32, 2.0**32 / 1e3, 2.0**32 / 1e6)
 """After which counters of 32 bits start again, in their unit, or in s of those of milli- and microseconds."""
 COUNTER_SHARE = 0.01
 """Of such a time, that may lie between two rows."""
-SINCE_1970 = 1e8
-"""s, from which on a time in seconds is one since 1970: a log of three years begins with zero, a date after 1973."""
 UNITS: Mapping[str, tuple[str, ...]] = {
     "time": ("s", "second", "seconds", "sec"),
     "x": ("m", "metre", "metres", "meter", "meters"),
@@ -492,14 +491,6 @@ def check_order(time: numpy.ndarray) -> None:
         elif steps[row] <= -1800.0 and (steps < 0.0).sum() <= 2:
             hint += ", or write times in UTC if the clock was changed"
         raise ValueError(f"time decreases from {before} in row {row} to {after} in row {row + 1}: {hint}")
-
-
-def time_unit(time: float) -> float:
-    """How many of a number's unit are a second: 1e9, 1e6 or 1e3 of a number that is too large for seconds since 1970.
-
-    1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
-    """
-    return next((unit for unit in (1e9, 1e6, 1e3) if time > SINCE_1970 * unit), 1.0)
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":

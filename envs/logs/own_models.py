@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy
 
 from ..contract.log_format import LogFormat, PlainRows, Predicted, TrackLog, TrackStart
-from ..data.recorded_tables import UNEVEN, Columns
-from .equations import find_invalid_noise
+from ..linear.equations import find_invalid_noise
+from .recorded_tables import UNEVEN, Columns
 
 if TYPE_CHECKING:
-    from .equations import StateSpaceDefinition
+    from ..linear.equations import StateSpaceDefinition
 
 MOST_MISSED = 1000
 """Measurements that may be missing between two rows."""

@@ -7,7 +7,6 @@ and what everyone is told of the start of the track, ``initial_mean``, ``initial
 ``environment``, ``parameters`` (JSON), ``source``, ``licence``.
 """
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,56 +17,15 @@ import numpy
 from ..contract.companions import find_companion
 from ..contract.log_format import LogFormat
 from ..contract.task import Task
+from ..data.foreign_files import MOST_NUMBERS
+from ..data.recording import Recording
 from .flight_tables import netcdf_attribute_names, open_netcdf
-from .foreign_files import MOST_NUMBERS
-from .recording import Recording
 
 if TYPE_CHECKING:
     import xarray
 
 OWN = ("seconds", "length", "truth", "started")
 """Variables that are no measurements."""
-
-
-def dataset_of(recording: Recording) -> "xarray.Dataset":
-    """Return a recording as it stands in a file."""
-    import xarray
-
-    there = numpy.arange(recording.seconds.shape[1]) < recording.rows[:, None]
-    variables: dict[str, Any] = {
-        "seconds": (("episode", "time"), recording.seconds, {"units": "s"}),
-        "length": ("episode", numpy.asarray(recording.lengths)),
-    }
-    for name, values in recording.measurements.items():
-        axes = [f"{name}_axis{i}" for i in range(values.ndim - 2)]
-        nothing = numpy.nan if values.dtype.kind == "f" else values.dtype.type(0)
-        shaped = there.reshape(*there.shape, *[1] * (values.ndim - 2))
-        variables[name] = (("episode", "time", *axes), numpy.where(shaped, values, nothing))
-    for name, values in recording.initial.items():
-        axes = {"mean": ["component"], "covariance": ["component", "other_component"]}.get(
-            name, [f"initial_{name}_axis{i}" for i in range(values.ndim - 1)]
-        )
-        variables[f"initial_{name}"] = (("episode", *axes), values)
-    if recording.started is not None and recording.started.any():
-        variables["started"] = ("episode", numpy.asarray(recording.started, dtype=float), {"units": "s"})
-    if recording.truth is not None:
-        variables["truth"] = (
-            ("episode", "time", "component"),
-            numpy.where(there[..., None], recording.truth, numpy.nan),
-        )
-    told = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
-    coords: dict[str, Any] = {"recording": ("episode", numpy.array(recording.names, dtype=str))}
-    if recording.log_time is not None:
-        coords["log_time"] = (("episode", "time"), recording.log_time)
-    return xarray.Dataset(
-        variables,
-        coords=coords,
-        attrs={
-            "environment": recording.environment,
-            "parameters": json.dumps({**recording.typical, **recording.parameters}),
-            **told,
-        },
-    )
 
 
 def is_recording(path: Any) -> bool:
@@ -206,13 +164,3 @@ def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any
         if fields["truth"] is not None:
             fields["truth"] = fields["truth"][:, start.used :]
     fields["measurements"], fields["initial"] = dict(start.measurements), dict(start.initial)
-
-
-def differing(parameters: Any) -> dict[str, Any]:
-    """Parameters of a task that differ from the defaults, without the horizon."""
-    found = {}
-    for field in dataclasses.fields(parameters):
-        value = getattr(parameters, field.name)
-        if field.name != "horizon" and value != field.default:
-            found[field.name] = value
-    return found

@@ -16,8 +16,10 @@ from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
 from ..contract.companions import find_companion
 from ..contract.live_input import LARGEST
-from ..contract.log_format import LogFormat, TrackLog
+from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog
 from ..contract.task import Component, Task
+from ..data.recorded_world import measure_once
+from ..data.recording import Recording, side_by_side
 from .flight_tables import (
     COLUMNS,
     FLIGHT_SUFFIXES,
@@ -29,16 +31,11 @@ from .flight_tables import (
     seconds,
 )
 from .plausibility import LOUD, check_degrees, check_interval, limit_notes, unknown_column_notes
-from .recorded_world import measure_once
-from .recording import Recording, side_by_side
 from .truth_files import match_truth, offset_note, read_truth
 
 if TYPE_CHECKING:
     import pandas
 
-TIME = ("time", "timestamp", "seconds")
-RECORDING = "recording"
-TRUTH = "truth_"
 GEODETIC = ("latitude", "longitude", "altitude")
 """Columns, of which the last may lack; they may be called as in flights."""
 TURN_SHARE = 0.05

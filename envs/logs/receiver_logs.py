@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters.geodesy import east_north_up, geodetic
-from .foreign_files import open_foreign, parse_apart
-from .foreign_parsers import NAVSAT, check_rows
+from ..data.foreign_files import open_foreign, parse_apart
+from ..data.foreign_parsers import NAVSAT, check_rows
 
 if TYPE_CHECKING:
     import pandas

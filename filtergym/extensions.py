@@ -5,8 +5,12 @@ refused, and everything else works.
 """
 
 import importlib
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
+
+PACKAGE = __name__.partition(".")[0]
 
 PREFIXES: Mapping[str, str] = {
     "exec:": "evaluation.competitors.programs:find_program",
@@ -18,6 +22,11 @@ PREFIXES: Mapping[str, str] = {
 other competitors of it, that returns a :class:`.evaluation.competitors.kinds.Competitor`."""
 SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_policies:LEARNED")
 """Each a :class:`.evaluation.competitors.kinds.Source`, of competitors in files and folders."""
+MODEL_COMPANIONS: Sequence[str] = ("envs.logs.own_models:state_space_log_format",)
+"""Functions of the definition of a model of one's own and of its defaults, each of which returns a companion of its
+task."""
+READERS: Sequence[str] = ("envs.logs.reading:RECORDINGS", "envs.logs.reading:FLIGHTS")
+"""Each a :class:`.envs.data.scenario_data.Reader`, in the order in which they are tried."""
 
 
 def load(place: str) -> Any:
@@ -27,10 +36,18 @@ def load(place: str) -> Any:
         ValueError: if this installation does not hold the module.
     """
     module, _, name = place.partition(":")
-    path = f"{__package__}.{module}"
+    path = f"{PACKAGE}.{module}"
     try:
         return getattr(importlib.import_module(path), name)
     except ModuleNotFoundError as error:
         if error.name != path:
             raise
         raise ValueError(f"this installation of filtergym holds no {module}") from None
+
+
+def load_present(places: Iterable[str]) -> Iterator[Any]:
+    """Import what stands at several places, without those whose module this installation does not hold."""
+    for place in places:
+        module = f"{PACKAGE}.{place.partition(':')[0]}"
+        if module in sys.modules or find_spec(module) is not None:
+            yield load(place)

@@ -22,6 +22,8 @@ import numpy
 
 from ...filters.geodesy import east_north
 from ..contract.parameters import Limits, check, quote_shortened
+from ..data.scenario_data import FlightData
+from ..data.trajectory import Trajectory, trajectory_of
 from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
 from .flight_tables import (
     FLIGHT_SUFFIXES,
@@ -35,7 +37,6 @@ from .flight_tables import (
 )
 from .plausibility import check_degrees
 from .receiver_logs import count_of
-from .trajectory import Trajectory, trajectory_of
 
 if TYPE_CHECKING:
     import pandas
@@ -53,7 +54,7 @@ class Source(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Flights:
+class Flights(FlightData):
     """A set of flights of which every episode flies one, drawn with equal probability.
 
     Args:
@@ -83,6 +84,11 @@ class Flights:
                 by_name.setdefault(flight_of(trajectory), []).append(trajectory)
             found = tuple(Source(name, tuple(pieces)) for name, pieces in by_name.items())
             object.__setattr__(self, "sources", found)
+
+    def fields(self) -> dict[str, Any]:
+        """Return its trajectories and what else makes the same set."""
+        flown = [trajectory.fields() for trajectory in self.trajectories]
+        return {"trajectories": flown, "name": self.name, "fewest_scans": self.fewest_scans}
 
     def flyable(self, interval: float, farthest: float) -> tuple[list[Trajectory], list[str]]:
         """Return the pieces that can be flown, and what is to be told of every source, a line each.

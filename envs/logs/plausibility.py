@@ -19,7 +19,7 @@ from ..contract.log_format import LogFormat
 
 if TYPE_CHECKING:
     from ..contract.task import Task
-    from .recording import Recording
+    from ..data.recording import Recording
 
 HARDEST = 100.0
 """m/s^2; no target accelerates more: ten g."""

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..contract.parameters import Limits, check, freeze
+from ..data.trajectory import Trajectory
 from .plausibility import check_speed, check_velocity, find_outliers, speeds_of
-from .trajectory import Trajectory
 
 if TYPE_CHECKING:
     import pandas
