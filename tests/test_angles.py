@@ -182,26 +182,14 @@ def test_turns_are_taken_off_exactly():
 
 
 def test_a_smooth_function_of_many_turns_takes_none_off():
-    """Of 1,001 steps of a fast sine some are a turn long by chance, for some start; a wrap is found at every start."""
-    for start in np.linspace(0.0, 1.0, 40):
+    """Of a thousand steps of a fast sine one is a turn long by chance, for some starts."""
+    wrapped = {"f": lambda x: [x[0], x[1], (x[2] + np.pi) % (2.0 * np.pi) - np.pi]}
+    smooth = {"f": lambda x: [x[0] + x[1] * np.sin(x[2]), x[1], x[2]]}
+    given = {"h": lambda x: [x[0]], "Q": np.eye(3), "R": np.eye(1), "covariance": np.eye(3)}
+    for i in range(20):
+        mean = [0.05 * i, 30.0 + 0.05 * i, 1.0]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            filtergym.state_space(
-                "tests/Smooth-v0",
-                f=lambda x: [x[0] + x[1] * np.sin(x[2]), x[1], x[2]],
-                h=lambda x: [x[0]],
-                Q=np.eye(3),
-                R=np.eye(1),
-                mean=[start, 30.0 + start, 1.0],
-                covariance=np.eye(3),
-            )
+            filtergym.state_space(f"tests/Smooth{i}-v0", **smooth, **given, mean=mean)
         with pytest.warns(UserWarning, match="f takes whole turns off x3"):
-            filtergym.state_space(
-                "tests/Wrapped-v0",
-                f=lambda x: [x[0], x[1], (x[2] + np.pi) % (2.0 * np.pi) - np.pi],
-                h=lambda x: [x[0]],
-                Q=np.eye(3),
-                R=np.eye(1),
-                mean=[start, 30.0 + start, 1.0],
-                covariance=np.eye(3),
-            )
+            filtergym.state_space(f"tests/Wrapped{i}-v0", **wrapped, **given, mean=mean)

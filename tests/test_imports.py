@@ -66,7 +66,9 @@ def imported_rooms(file: Path) -> Iterator[str]:
     for (first, *rest), _ in imports_of(file):
         if first in PAGES:
             yield "docs/make"
-        elif first == "filtergym" and rest[:1] != ["extensions"]:  # a table of names, which every room may read
+        elif first == "filtergym" and rest[:1] != [
+            "extensions"
+        ]:  # a table of names, which every room may read
             room = "filtergym/papers" if rest[:1] == ["papers"] else "".join(rest[:1])
             yield room if room in ROOMS else "filtergym"
 
