@@ -236,6 +236,19 @@ def test_list_names_everything(run):
     ):
         assert word in shown
     assert shown.count("(default)") == 2  # one control, one scenario
+    assert "clutter_density" not in shown
+    everything = run("list", "ManeuveringTarget", "--all").stdout
+    assert "clutter_density" in everything
+    assert "about the track. No training episode holds any." in " ".join(everything.split())
+
+
+def test_a_listing_fits_two_screens(run, env_id):
+    name, *lines = run("list", env_id).stdout.splitlines()
+    assert name == env_id
+    assert len(lines) < 50
+    assert max(map(len, lines)) <= 100
+    scenarios = catalogue()[env_id].scenarios
+    assert [line.split()[0] for line in lines[-len(scenarios) :]] == list(scenarios)
 
 
 def test_doctor_says_what_an_issue_needs(run, monkeypatch):

@@ -14,13 +14,16 @@ def list_environments(
     environment: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Environment ids, to be told all of each; module:id for one that a module registers.",
+            help="Environment ids, to describe each; module:id for one that a module registers.",
             autocompletion=complete_environment,
             callback=import_environments,
         ),
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Name the parameters, and describe scenarios in full.")
+    ] = False,
 ) -> None:
-    """List environments, a line each; or say of one its paper, controls, parameters, scenarios and competitors.
+    """List environments, a line each; or of one its paper, controls, competitors and scenarios.
 
     Example: filtergym list filtergym/ManeuveringTarget-v0
     """
@@ -30,11 +33,11 @@ def list_environments(
             console.print(line, highlight=False, soft_wrap=True)
         console.print()
         print_sentence(
-            "filtergym list ID says who competes in an environment, in which scenarios and parameters."
+            "filtergym list ID names the competitors and scenarios of an environment; with --all its parameters, too."
         )
         return
     for id in environment:
-        first, *lines = environment_lines(problem_of(id), console.width)
+        first, *lines = environment_lines(problem_of(id), console.width, everything)
         console.print(first, style="bold")
         for line in lines:
             console.print(line, highlight=False, soft_wrap=True)

@@ -42,9 +42,16 @@ def list_lines(tasks: Mapping[str, type[Task]], width: int | None) -> Iterator[s
         yield _hang(f"{id:<{longest}}", summary_of(cls), width)
 
 
-def environment_lines(problem: Problem, width: int) -> Iterator[str]:
-    """Describe an environment in lines of at most so many columns; the first is its id."""
-    cls, known = problem.task, problem.baselines
+def environment_lines(problem: Problem, width: int, everything: bool = False) -> Iterator[str]:
+    """Describe an environment in lines of at most so many columns; the first is its id.
+
+    Args:
+        problem: the environment and its competitors.
+        width: columns.
+        everything: names of the parameters, and whole descriptions of scenarios; else their number, and a line for each
+            scenario.
+    """
+    cls, known, parameters = problem.task, problem.baselines, parameter_names(problem.task)
     yield problem.name
     yield _hang(" ", summary_of(cls), width)
     rows = {
@@ -57,7 +64,7 @@ def environment_lines(problem: Problem, width: int) -> Iterator[str]:
         "smoothers": [f"{', '.join(known.smoothers)} (not causal: they use later measurements)"]
         if known.smoothers
         else [],
-        "parameters": parameter_names(cls),
+        "parameters": parameters if everything else [f"{len(parameters)}, named by --all"],
         "backend": [_backend(cls)],
     }
     for title, names in rows.items():
@@ -69,10 +76,18 @@ def environment_lines(problem: Problem, width: int) -> Iterator[str]:
         for name, maker in table.items():
             yield _hang(f"    {name:<22}", f"knows {maker.knows}", width)
     yield "  scenarios:"
+    longest = max(map(len, cls.scenarios), default=0)
     for scenario in cls.scenarios.values():
         role = " (default)" if scenario.name == cls.default_scenario else ""
         role += " (training)" if scenario.training else ""
-        yield _hang(f"    {scenario.name:<22}", f"{scenario.description}{role}", width)
+        head, room = f"    {scenario.name:<{longest}} ", width - len(role)
+        words = scenario.description if everything else _shorten(head, scenario.description, room)
+        yield _hang(head, f"{words}{role}", width)
+
+
+def _shorten(head: str, text: str, width: int) -> str:
+    """Return as many words of a text as fit in one line beside its head."""
+    return textwrap.shorten(text, max(width - len(head) - 1, FEWEST_COLUMNS), placeholder=" ...")
 
 
 def _hang(head: str, text: str, width: int | None) -> str:
