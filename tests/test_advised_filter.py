@@ -214,7 +214,7 @@ def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
         _, m, P = both[kept[-1]]
         one = np.ones(1)
         plot = Measurement(k * one, z[:, None], np.full((2, 1), 2500.0), one, T * one, T * one)
-        mean, covariance, memory, found = estimator.update(plot, memory)
+        mean, covariance, memory, found = estimator.update(memory, plot)
         np.testing.assert_allclose(mean[:, 0], m, rtol=1e-9)
         np.testing.assert_allclose(covariance[:, :, 0], P, rtol=1e-8, atol=1e-8)
         assert found.log_likelihood[0] == pytest.approx(np.logaddexp(both[0][0], both[1][0]), rel=1e-9)

@@ -208,7 +208,7 @@ class Last:
     def start(self, initial, N):
         return {"mean": initial.mean.copy(), "plots": 0}
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         memory["plots"] += 1
         seen = ~np.isnan(measurement.position)
         memory["mean"][:2] = np.where(seen, measurement.position, memory["mean"][:2])
