@@ -142,7 +142,7 @@ def test_without_deviations_the_file_says_which(tmp_path):
     stated = dict.fromkeys(("sigma_x", "sigma_y"), setup.deviations["sigma_x"])
     np.testing.assert_array_equal(running.update(**third, **stated).covariance, bare)
     for deviation in (0.0, -1.0):
-        with pytest.raises(ValueError, match="is a standard deviation and must be positive"):
+        with pytest.raises(ValueError, match="is a standard deviation, above zero"):
             running.update(12.0, x=0.0, y=0.0, sigma_x=deviation, sigma_y=1.0)
 
 
