@@ -164,7 +164,7 @@ def write_advised(
         "measurements": None if found is None else found.measurements,
         "log": {
             **log._asdict(),
-            "units": {key: known[key] for key in log.columns if key in known},
+            "units": {key: known[key].text for key in log.columns if key in known},
             "noise_scale": 1.0 if found is None else round_value(10.0 ** found.values.get(NOISE_SCALE, 0.0)),
             "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
             if found is not None and OUTLIER_SHARE in found.values

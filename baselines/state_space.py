@@ -368,7 +368,7 @@ class KnownModel:
         return _buffer(self.task, begun, self._told(truth))
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: Any
+        self, memory: Any, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Any, Likelihood]:
         """Predict and update with the model in force."""
         after = _in_order(memory, measurement, self.take, self._told(truth))

@@ -75,7 +75,7 @@ class Asked:
     def start(self, initial: Any, N: int) -> Any:
         return self.filter.start(initial)
 
-    def update(self, measurement: Any, memory: Any) -> tuple[Any, ...]:
+    def update(self, memory: Any, measurement: Any) -> tuple[Any, ...]:
         own, state = self.filter, self.filter.step(memory, Input(measurement))
         told = Likelihood.told(own.records(state, measurement))
         return own.mean(state), own.covariance(state), state, told
@@ -106,13 +106,13 @@ def watch_hypotheses(model: Model, estimator: Any, field: str, no_action: Any) -
             self.state = bank.start(initial)
             return estimator.start(initial, N)
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             # A bank is given some number where there is no reading, an estimator NaN.
             given = measurement._replace(**{field: np.nan_to_num(getattr(measurement, field))})
             self.state = bank.predict(self.state, given)
             scans.append((self.state, given))
             self.state = act(bank, self.state, given, no_action)
-            answers.append(estimator.update(measurement, memory))
+            answers.append(estimator.update(memory, measurement))
             return answers[-1]
 
     for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
@@ -135,8 +135,8 @@ def watch_estimator(model: Model, estimator: Any) -> tuple[Any, list[Any], list[
             given.append(initial)
             return asked.start(initial, N)
 
-        def update(self, measurement: Any, memory: Any) -> Any:
-            mean, covariance, memory, likelihood = asked.update(measurement, memory)
+        def update(self, memory: Any, measurement: Any) -> Any:
+            mean, covariance, memory, likelihood = asked.update(memory, measurement)
             given.append(measurement)
             answers.append((mean, covariance, likelihood))
             return mean, covariance, memory

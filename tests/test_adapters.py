@@ -194,7 +194,7 @@ def test_states_are_mapped_both_ways():
     class Measured(NamedTuple):
         position: np.ndarray
 
-    mean, covariance, memory = estimator.update(Measured(np.zeros((2, 3))), memory)
+    mean, covariance, memory = estimator.update(memory, Measured(np.zeros((2, 3))))
     np.testing.assert_array_equal(mean, initial.mean + 1.0)
     np.testing.assert_array_equal(covariance, initial.covariance)
 

@@ -448,10 +448,10 @@ def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):
         def start(self, initial, N):
             return self.own.start(initial, N), np.zeros(N)
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             state, age = memory
             state = state._replace(mean=state.mean + 1e3 * (age == 100.0))
-            mean, covariance, state, likelihood = self.own.update(measurement, state)
+            mean, covariance, state, likelihood = self.own.update(state, measurement)
             return mean, covariance, (state, age + 1.0), likelihood
 
     recording = read(write_log(tmp_path, count=240))

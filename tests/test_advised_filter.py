@@ -143,7 +143,7 @@ def test_without_deviations_the_file_says_which(tmp_path):
     stated = dict.fromkeys(("sigma_x", "sigma_y"), setup.deviations["sigma_x"])
     np.testing.assert_array_equal(running.update(**third, **stated).covariance, bare)
     for deviation in (0.0, -1.0):
-        with pytest.raises(ValueError, match="is a standard deviation and must be positive"):
+        with pytest.raises(ValueError, match="is a standard deviation, above zero"):
             running.update(12.0, x=0.0, y=0.0, sigma_x=deviation, sigma_y=1.0)
 
 
@@ -215,7 +215,7 @@ def test_a_share_of_outliers_is_the_likelier_of_two_kalman_filters():
         _, m, P = both[kept[-1]]
         one = np.ones(1)
         plot = Measurement(k * one, z[:, None], np.full((2, 1), 2500.0), one, T * one, T * one)
-        mean, covariance, memory, found = estimator.update(plot, memory)
+        mean, covariance, memory, found = estimator.update(memory, plot)
         np.testing.assert_allclose(mean[:, 0], m, rtol=1e-9)
         np.testing.assert_allclose(covariance[:, :, 0], P, rtol=1e-8, atol=1e-8)
         assert found.log_likelihood[0] == pytest.approx(np.logaddexp(both[0][0], both[1][0]), rel=1e-9)

@@ -174,7 +174,7 @@ class Answering:
     def start(self, initial, N):
         return initial
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return self.answer(memory.mean), memory.covariance, memory
 
 

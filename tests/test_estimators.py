@@ -29,7 +29,7 @@ class Start:
         identity = np.eye(len(initial.mean))[:, :, None]
         return initial.mean, initial.covariance + identity
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return *memory, memory
 
 
@@ -42,7 +42,7 @@ class Recording(Start):
     def estimate(self, measurement, memory):
         return memory[0]
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         mean = self.estimate(measurement, memory)
         self.said.append((measurement, mean))
         return mean, memory[1], memory
@@ -112,7 +112,7 @@ def wrong_at(step, lane, change):
         def start(self, initial, N):
             return (*super().start(initial, N), 0)
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             mean, covariance, k = memory
             k += 1
             said = mean.copy(), covariance.copy()
@@ -158,7 +158,7 @@ def test_a_lost_episode_keeps_its_last_valid_answer_to_the_end(env_id, short, st
         def start(self, initial, N):
             return (*super().start(initial, N), 0)
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             mean, covariance, k = memory
             drift = np.full(mean.shape[-1], k + 1.0)
             drift[9:] = min(k + 1, step - 1)
@@ -193,7 +193,7 @@ class Losing:
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         mean, covariance = memory[0].copy(), memory[1].copy()
         covariance[0, 1, 3] = numpy.inf
         return mean, covariance, memory
@@ -239,7 +239,7 @@ def test_lost_episodes_stand_in_table_records_and_results(command, without_figur
 RAISING = """class AtUpdate:
     def start(self, initial, N):
         return initial
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return self.gain(measurement)
     def gain(self, measurement):
         return measurement.doppler
@@ -338,3 +338,14 @@ def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkey
     assert [line for line in output.splitlines() if line.startswith("mine:Mine  ")]
     assert "mine:Mine: " in output  # why, in sentences: it is the first that is named
     sys.modules.pop("mine")
+
+
+def test_an_update_with_the_memory_last_is_refused():
+    class Old(Start):
+        def update(self, measurement, memory):
+            return *memory, memory
+
+    with pytest.raises(
+        ValueError, match=r"'old': update takes the memory first, as update\(memory, measurement\)"
+    ):
+        filtergym.evaluate(ID, {"old": Old}, episodes=1)

@@ -84,7 +84,7 @@ class Symmetric:
             "apart": (own, own),
         }
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         P = 0.5 * memory["P"] + memory["of"]
         first, second = memory["apart"]
         mean = self.xp.stack([P[0], P[3], first, second])
@@ -395,7 +395,7 @@ class Stranger:
     def start(self, initial, N):
         return {EVIL: initial.mean, "int": initial.covariance, "": 0.0 * initial.mean[0]}
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         mean, covariance, _ = memory.values()
         R = self.task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None] * measurement.variance
         there = measurement.available > 0.0

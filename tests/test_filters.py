@@ -30,7 +30,7 @@ class Kalman:
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         xp, (m, P), T = self.xp, memory, measurement.interval
         one, zero = 1.0 + 0.0 * T, 0.0 * T
         rows = [[one, zero, T, zero], [zero, one, zero, T], [zero, zero, one, zero], [zero, zero, zero, one]]
@@ -94,9 +94,9 @@ def test_what_cannot_be_traced_though_it_says_so_runs_in_python_with_a_warning()
     class Branches(InPython):
         traceable = True
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             if float(measurement.available[0]) > 0.0:
-                return super().update(measurement, memory)
+                return super().update(memory, measurement)
             return *memory, memory
 
     with pytest.warns(UserWarning, match="'mine' of filtergym/ManeuveringTarget-v0 is not compiled"):
@@ -162,8 +162,8 @@ def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_ar
 
 def test_a_user_may_return_the_log_likelihood_alone():
     class Constant(InPython):
-        def update(self, measurement, memory):
-            mean, covariance, memory, told = super().update(measurement, memory)
+        def update(self, memory, measurement):
+            mean, covariance, memory, told = super().update(memory, measurement)
             return mean, covariance, memory, told.log_likelihood
 
     found = filtergym.evaluate(TARGET, {"all": InPython, "alone": Constant}, episodes=8, horizon=10)
@@ -176,8 +176,8 @@ def test_an_answer_of_two_or_five_is_refused():
     for extra in (-1, 2):
 
         class Odd(InPython):
-            def update(self, measurement, memory, extra=extra):
-                answer = super().update(measurement, memory)
+            def update(self, memory, measurement, extra=extra):
+                answer = super().update(memory, measurement)
                 return answer[:2] if extra < 0 else (*answer, 1.0)
 
         with pytest.raises(ValueError, match=r"must return mean, covariance and memory, .* not tuple of"):
@@ -191,9 +191,9 @@ def test_a_traced_filter_that_loses_an_episode_holds_its_last_valid_answer():
         def start(self, initial, N):
             return *super().start(initial, N), 0.0 * initial.mean[0]
 
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             xp, step = self.xp, memory[2] + 1.0
-            mean, covariance, kept, told = super().update(measurement, memory[:2])
+            mean, covariance, kept, told = super().update(memory[:2], measurement)
             negative = xp.where(step == 4.0, -1.0, 1.0)
             return mean, covariance * negative, (*kept, step), told
 

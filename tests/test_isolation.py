@@ -34,7 +34,7 @@ class Honest:
         self.k = 0
         return initial.mean, initial.covariance
 
-    def update(self, m, memory):
+    def update(self, memory, m):
         self.k, self.m = self.k + 1, m
         mean, P = memory
         seen = m.available > 0
@@ -150,7 +150,7 @@ class Probe:
     def start(self, initial, N):
         return 0
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         found = np.zeros(len(ATTEMPTS))
         for i, attempt in enumerate(ATTEMPTS.values()):
             try:
@@ -196,7 +196,7 @@ class Beside:
         except PermissionError:
             return initial
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return 0.0 * memory.mean + beside.STEP + linked.STEP, memory.covariance, memory
 """
 
@@ -265,7 +265,7 @@ class Echo:
         assert initial.mean.shape == (len(self.task.components), N), initial.mean.shape
         return initial
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         assert not FIELDS or measurement._fields == tuple(FIELDS), measurement._fields
         for name, (shape, kind) in (FIELDS or {}).items():
             value = getattr(measurement, name)

@@ -295,7 +295,7 @@ def test_the_estimator_is_the_policy_in_its_bank(id, name):
     )
     memory, state, hidden = estimator.start(initial, 8), model.filter.start(initial), None
     for measurement in measurements:
-        mean, covariance, memory, likelihood = estimator.update(measurement, memory)
+        mean, covariance, memory, likelihood = estimator.update(memory, measurement)
         episode = Episode(None, measurement, model.filter.predict(state, measurement))
         action, hidden = policy.predict(model.observe(episode).T, hidden)
         state = model.act(episode, action.T.astype(float)).filter

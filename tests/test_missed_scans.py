@@ -401,7 +401,7 @@ def test_bound_gains_nothing_where_the_target_is_missed():
     expected = np.moveaxis(memory, -1, 0)
     for before, _ in said[1:]:
         m, truth = before.measurement, before.truth
-        diagonal, memory = bound.update(m, truth, memory)
+        diagonal, memory = bound.update(memory, m, truth)
         for i in range(8):
             F = transition(m.interval[i])
             P = F @ expected[i] @ F.T

@@ -35,7 +35,7 @@ class Watch:
         shape = np.eye(len(initial.mean))[:, :, None] + 0.0 * initial.mean[0]
         return initial.mean, shape
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         self.given.append(measurement)
         return *memory, memory
 
@@ -46,7 +46,7 @@ class Careless:
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         mean, covariance = memory
         position, velocity = mean[:2] + 6.0 * mean[2:], mean[2:]
         innovation = measurement.position - position
@@ -57,11 +57,11 @@ class Careless:
 class Careful(Careless):
     """The same, with the innovation of a missed scan left out."""
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         missed = measurement.available == 0
         predicted = memory[0][:2] + 6.0 * memory[0][2:]
         position = np.where(missed, predicted, measurement.position)
-        return super().update(measurement._replace(position=position), memory)
+        return super().update(memory, measurement._replace(position=position))
 
 
 def received(task, measurement, field):

@@ -209,7 +209,7 @@ class Last:
     def start(self, initial, N):
         return {"mean": initial.mean.copy(), "plots": 0}
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         memory["plots"] += 1
         seen = ~np.isnan(measurement.position)
         memory["mean"][:2] = np.where(seen, measurement.position, memory["mean"][:2])
@@ -295,6 +295,8 @@ def test_what_an_environment_needs_is_said():
     filter.update(ins=0.1, fix=0.2)
     with pytest.raises(ValueError, match="needs ins at every measurement"):
         filter.update(fix=0.2)
+    with pytest.raises(ValueError, match="sigma is a standard deviation, above zero, and track 0 has -1"):
+        filter.update(ins=0.1, fix=0.2, sigma=-1.0)
     esm = filtergym.online(ESM, "quasi-optimal")
     with pytest.raises(ValueError, match="needs range, range_rate at every scan"):
         esm.start(range=3e4)

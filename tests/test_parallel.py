@@ -55,7 +55,7 @@ class Wrong:
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         raise KeyError("nothing")
 
 

@@ -117,7 +117,7 @@ def run(command, steps=4, N=8, **limits):
     initial, measurement = given(N)
     memory, means = estimator.start(initial, N), []
     for _ in range(steps):
-        mean, covariance, memory = estimator.update(measurement, memory)
+        mean, covariance, memory = estimator.update(memory, measurement)
         assert covariance.shape == (2, 2, N)
         means.append(mean)
     return np.stack(means), estimator
@@ -237,7 +237,7 @@ def test_python_is_the_one_of_the_environment_whether_it_is_activated_or_not(tmp
 def test_a_process_cannot_go_back(hold):
     _, estimator = run(hold())
     with pytest.raises(ValueError, match="cannot go back"):
-        estimator.update(given(8)[1], 2)
+        estimator.update(2, given(8)[1])
 
 
 def test_a_lost_program_is_a_row_of_the_table(hold):

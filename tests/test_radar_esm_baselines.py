@@ -62,7 +62,7 @@ def played(model, estimator, seeds, decisions):
     memory = estimator.start(start.measurement, start.truth)
     for _ in range(decisions):
         ((episode, _),) = lanes.decide(numpy.zeros((len(seeds), model.task.classes)))
-        mean, covariance, memory, _ = estimator.update(episode.measurement, episode.truth, memory)
+        mean, covariance, memory, _ = estimator.update(memory, episode.measurement, episode.truth)
         states.append((episode, mean, covariance))
     return start.measurement, states
 

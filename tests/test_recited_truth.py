@@ -23,7 +23,7 @@ class Held:
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return *memory, memory
 
 
@@ -43,7 +43,7 @@ class Recited:
     def start(self, initial, N):
         return 0, np.concatenate([np.ones((1, N)), initial.mean])
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         k, given = memory
         mean = self.coefficients[k].T @ given
         covariance = np.repeat(np.diag(self.variance[k])[..., None], given.shape[-1], axis=-1)
@@ -104,7 +104,7 @@ def test_what_is_regular_is_recited():
     recited = learn(truth, start)
     memory = recited.start(type("Initial", (), {"mean": start.T}), 200)
     for k in range(5):
-        mean, covariance, memory = recited.update(None, memory)
+        mean, covariance, memory = recited.update(memory, None)
         # Sums of some 1e5 in least squares over 200 rows.
         np.testing.assert_allclose(mean.T, truth[:, k], rtol=1e-9, atol=1e-6)
         assert (np.diagonal(covariance) > 0.0).all()

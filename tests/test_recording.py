@@ -496,7 +496,7 @@ WRONG = [
     (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),
     (LOOSE, {"time": LOG["time"], "fix": LOG["fix"]}, "lacks the column ins"),
     (ESM, {**ECHO, "decision": [0, 7, None]}, "from 0 to 3, and row 1 has 7"),
-    (ESM, {**ECHO, "decision": [0, None, None]}, "the gate needs radar_bearing and esm_bearing"),
+    (ESM, {**ECHO, "decision": [0, None, None]}, "a decision needs radar_bearing and esm_bearing"),
     (ESM, ECHO | BEARINGS, "row 1 has a decision and lacks a bearing"),
     (TIGHT, LOG, "reads recordings from NetCDF only"),
     (UAV, LOG, "is a closed loop, in which the estimate decides"),

@@ -257,7 +257,7 @@ def test_survives_what_its_prior_rules_out():
         memory = asked.start(initial, LANES)
         for k, m in enumerate(measurements):
             moved = m._replace(position=m.position + (3e5 if k == 3 else 0.0))
-            mean, covariance, memory, likelihood = asked.update(moved, memory)
+            mean, covariance, memory, likelihood = asked.update(memory, moved)
             assert np.isfinite(mean).all()
             assert np.isfinite(likelihood.log_likelihood).all()
             assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()

@@ -148,7 +148,7 @@ class PythonSmoother:
         self.N = N
         return initial.mean, initial.covariance
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         m, P = memory
         there = measurement.available > 0.0
         m = np.where(there, np.concatenate([measurement.position, m[2:]]), m)
@@ -265,7 +265,7 @@ class Holds:
     def start(self, initial, N):
         return initial.mean, initial.covariance + 1e-3 * np.eye(len(initial.mean))[:, :, None]
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         return *memory, memory
 
 

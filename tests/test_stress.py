@@ -57,7 +57,7 @@ class Tracker:
         P = np.moveaxis(initial.covariance, -1, 0)
         return initial.mean.T.copy(), 1e-6 * P if self.mistake == "start taken for exact" else P.copy()
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         there = measurement.available[0] > 0.0
         x, P = memory
         moved = self.move(x, P, measurement.interval)
@@ -237,8 +237,8 @@ class Careless(Tracker):
     def start(self, initial, N):
         return 0, super().start(initial, N)
 
-    def update(self, measurement, memory):
-        mean, covariance, own = super().update(measurement, memory[1])
+    def update(self, memory, measurement):
+        mean, covariance, own = super().update(memory[1], measurement)
         if memory[0] == SETTLED:
             mean, covariance = self.then(mean, covariance)
         return mean, covariance, (memory[0] + 1, own)
@@ -265,9 +265,9 @@ def test_what_is_no_estimate_fails(radar, then, said):
 
 def test_what_keeps_something_to_itself_cannot_be_restored(radar):
     class Secretive(Tracker):
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             self.mistake, self.count = "", getattr(self, "count", 0) + 1
-            mean, covariance, own = super().update(measurement, memory)
+            mean, covariance, own = super().update(memory, measurement)
             return mean + self.count, covariance, own
 
     assert radar._restore("mine", Tracker).verdict == "passed"

@@ -100,7 +100,7 @@ def test_of_a_radar_a_turned_and_moved_problem_has_turned_and_moved_estimates(an
     for start, seen in ((initial, measurements), other):
         memory, track = estimator.start(start, 8), []
         for measurement in seen:
-            mean, covariance, memory, _ = estimator.update(measurement, memory)
+            mean, covariance, memory, _ = estimator.update(memory, measurement)
             track.append((mean, covariance))
         found.append(track)
     for (mean, P), (turned_mean, turned_P) in zip(*found, strict=True):

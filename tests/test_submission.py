@@ -214,7 +214,7 @@ class Stored:
         self.shown, self.k = initial.mean[:2], 0
         return initial.mean, initial.covariance
 
-    def update(self, m, memory):
+    def update(self, memory, m):
         mean, P = memory
         predicted = mean[:2] + m.interval * mean[2:]
         r = numpy.nan_to_num(m.position - predicted)

@@ -54,9 +54,9 @@ def test_bound_is_the_dense_recursion():
     seen = []
 
     class Watched(references.KnownModeBound):
-        def update(self, measurement, truth, memory):
+        def update(self, memory, measurement, truth):
             seen.append((measurement, truth))
-            return super().update(measurement, truth, memory)
+            return super().update(memory, measurement, truth)
 
     run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
     bounds = [episode.filter.own.mean for episode, _ in run]

@@ -96,7 +96,7 @@ def innovations_of_matched(plant: str, scenario: str, episodes: int) -> tuple[nu
     innovation: list[numpy.ndarray] = []
 
     class Watched(Matched):
-        def update(self, measurement: Any, truth: Any, memory: Any) -> Any:
+        def update(self, memory: Any, measurement: Any, truth: Any) -> Any:
             mean, covariance = self.predict(measurement, truth, memory)
             R, there = self.sensor_variances(truth), measurement.available
             update = self.update_covariance(mean, covariance, measurement, truth)
@@ -110,7 +110,7 @@ def innovations_of_matched(plant: str, scenario: str, episodes: int) -> tuple[nu
             )
             error = measurement.reading[shown] - mean[read].sum(axis=0)
             innovation.append(there[shown] * error / numpy.sqrt(S))
-            return super().update(measurement, truth, memory)
+            return super().update(memory, measurement, truth)
 
     for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, episodes)):
         pass
@@ -128,8 +128,8 @@ def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
     found: list[Any] = []
 
     class Watched(Matched):
-        def update(self, measurement: Any, truth: Any, memory: Any) -> Any:
-            result = super().update(measurement, truth, memory)
+        def update(self, memory: Any, measurement: Any, truth: Any) -> Any:
+            result = super().update(memory, measurement, truth)
             seen.append((measurement, truth))
             found.append(result)
             return result
@@ -387,10 +387,10 @@ def test_noise_is_estimated_from_what_a_sensor_says_beyond_what_is_predicted(pla
             return super().update(memory, innovation, P, stated, available)
 
     class Flown(Asked):
-        def update(self, measurement, memory):
+        def update(self, memory, measurement):
             predicted = design.F @ memory.mean + model.task.constant(design.B) * measurement.control
             first = len(kept)
-            answer = super().update(measurement, memory)
+            answer = super().update(memory, measurement)
             innovation, available = kept[first]
             seen = available > 0.0
             expected = measurement.reading[0] - predicted[model.task.measured[0]]

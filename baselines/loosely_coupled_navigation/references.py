@@ -116,7 +116,7 @@ class Matched(_Matched):
     kind = "reference"
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: ErrorState
+        self, memory: ErrorState, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
         """Report the INS less its estimated error."""
         memory, likelihood = self.predict_and_update(measurement, truth, memory)
@@ -128,7 +128,7 @@ class MatchedCovariance(_Matched):
 
     kind = "bound"
 
-    def update(self, measurement: Measurement, truth: Truth, memory: ErrorState) -> tuple[Array, ErrorState]:
+    def update(self, memory: ErrorState, measurement: Measurement, truth: Truth) -> tuple[Array, ErrorState]:
         """Variance of every axis, ``(A, N)``."""
         memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.ins.position + 0.0 * memory.delta, memory

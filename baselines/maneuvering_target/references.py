@@ -114,7 +114,7 @@ class KnownInputBound(ConstantVelocityModel):
         """Covariance of the start."""
         return initial.covariance
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array]:
+    def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
         """Bound after this scan: the diagonal of the covariance recursion at the true position. A scan that missed the
         target adds no information.
         """

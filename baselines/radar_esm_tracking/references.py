@@ -113,7 +113,7 @@ class Ideal(_KnownDraw):
     kind = "reference"
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: Track
+        self, memory: Track, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the class that governed the motion, and update."""
         F, Q = self.motion(truth, memory.target_class)
@@ -130,7 +130,7 @@ class KnownDrawBound(_KnownDraw):
 
     kind = "bound"
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
+    def update(self, memory: Track, measurement: Measurement, truth: Truth) -> tuple[Array, Track]:
         """Bound after this scan: the diagonal of the covariance."""
         F, Q = self.motion(truth, memory.target_class)
         P = bounds.predict_bound(memory.covariance, F, Q)

@@ -170,7 +170,7 @@ class KnownMode(_KnownMode):
         self.noises = self.process_noises((rest, line, singer))
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: Track
+        self, memory: Track, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the true hypothesis and update with the sensors that work."""
         xp, task, known = self.task.xp, self.task, gnss_ins.SIZE
@@ -214,7 +214,7 @@ class KnownModeBound(_KnownMode):
         line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, 0.0)
         self.noises = self.process_noises((rest, line, task.models[SINGER]))
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
+    def update(self, memory: Track, measurement: Measurement, truth: Truth) -> tuple[Array, Track]:
         """Bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
         track = self.predict_track(truth, memory, self.noises)

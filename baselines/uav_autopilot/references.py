@@ -28,7 +28,7 @@ class TrueState:
         """Covariance of the start, which is reported for ever: the error is zero, and that has no density."""
         return initial.covariance
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array, Array]:
+    def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Array]:
         """Put the truth in place of the estimate."""
         return truth.state, memory, memory
 
@@ -143,7 +143,7 @@ class Matched(_KnownNoise):
         return Initial(mean, self.predict_covariance(memory.covariance, truth))
 
     def update(
-        self, measurement: Measurement, truth: Truth, memory: Initial
+        self, memory: Initial, measurement: Measurement, truth: Truth
     ) -> tuple[Array, Array, Initial, Likelihood]:
         """Equations (12), (11) with the noise of this measurement."""
         n = self.n
@@ -167,7 +167,7 @@ class KnownNoiseBound(_KnownNoise):
         """Covariance of the state's own distribution at the start, packed."""
         return self.start_covariance(truth)
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array]:
+    def update(self, memory: Array, measurement: Measurement, truth: Truth) -> tuple[Array, Array]:
         """Bound after this measurement."""
         zero = self.xp.zeros_like(self.xp.concat([truth.state, truth.disturbances["bias"]])[: self.size])
         predicted = self.predict_covariance(memory, truth)

@@ -451,7 +451,7 @@ class AllBeams:
         """Start where everyone starts."""
         return self.bank.start(initial)
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Tracks) -> tuple[Array, Array, Tracks]:
+    def update(self, memory: Tracks, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Tracks]:
         """Predict and look."""
         predicted = self.bank.predict(memory, measurement)
         all_seen = self.bank.look(predicted, measurement, 1.0 + 0.0 * predicted.waited)

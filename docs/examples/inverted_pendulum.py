@@ -247,7 +247,7 @@ class KnownGusts:
         """Start where everyone starts."""
         return initial
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Initial) -> tuple[Array, Array, Initial]:
+    def update(self, memory: Initial, measurement: Measurement, truth: Truth) -> tuple[Array, Array, Initial]:
         """Kalman filter with the true noise."""
         task: Any = self.task
         Q = task.world.level(truth) ** 2 * task.Q[:, :, None]

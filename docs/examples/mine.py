@@ -13,7 +13,7 @@ class Mine:
         # N vectors and matrices side by side, so that @ multiplies each of them.
         return initial.mean.T[:, :, None], numpy.moveaxis(initial.covariance, -1, 0)
 
-    def update(self, measurement, memory):
+    def update(self, memory, measurement):
         T, (x, P) = measurement.interval[:, None, None], memory
         F, G = numpy.eye(4) + T * numpy.eye(4, k=2), numpy.eye(4, 2) * T**2 / 2 + numpy.eye(4, 2, k=-2) * T
         x, P = F @ x, F @ P @ F.mT + 2.0**2 * G @ G.mT

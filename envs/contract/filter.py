@@ -89,7 +89,7 @@ class Track(NamedTuple):
 
 
 class Filter(ABC, Generic[TaskT, Measurement, State]):
-    """What estimates.
+    """What estimates, batch last: arrays of N episodes are ``(..., N)``. Policies have the batch first.
 
     Args:
         task: the estimation problem, with the constants that world and filter share.

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy
 
+from .columns import check_deviations
 from .companions import find_companion
 from .parameters import quote_shortened, read_numbers
 
@@ -173,6 +174,40 @@ class LiveInput:
     def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
         """Numbers that stand for what was not received; zeros."""
         return numpy.where(there & numpy.isfinite(received), received, 0.0)
+
+
+class LiveValues:
+    """Values that came live, as :class:`~.columns.Readings` of several tracks.
+
+    Args:
+        input: that reads them.
+        values: by name; what did not come is None, NaN or left out.
+    """
+
+    def __init__(self, input: LiveInput, values: Mapping[str, Any]) -> None:
+        self.input, self.values = input, values
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these are given."""
+        return all(self.values.get(name) is not None for name in names)
+
+    def __getitem__(self, name: str) -> numpy.ndarray:
+        """Value of each track, ``(N,)``; NaN where none came."""
+        return self.input.read(self.values, name)
+
+    def place(self, number: int) -> str:
+        """Track of a value."""
+        return f"track {number}"
+
+    def deviations(self, name: str) -> numpy.ndarray:
+        """Standard deviations, ``(N,)``; NaN where none is stated.
+
+        Raises:
+            ValueError: if one is not above zero.
+        """
+        found = self[name]
+        check_deviations(self, name, found)
+        return found
 
 
 class LiveReader(NamedTuple):

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
+from .columns import Column
+
 if TYPE_CHECKING:
     from ..logs.recorded_tables import Columns
 
@@ -99,8 +101,8 @@ class PlainRows(NamedTuple):
 class LogFormat:
     """The tables of real measurements that an environment reads."""
 
-    columns: Mapping[str, str]
-    """Names of the columns beside ``time``, and what they hold."""
+    columns: Mapping[str, Column]
+    """The columns beside ``time``, by their names."""
     read: "Callable[[Columns], TrackLog]"
     """Makes the measurements of one track of its columns; raises :class:`ValueError` for what lacks or cannot be."""
     start: Callable[[Mapping[str, numpy.ndarray], numpy.ndarray, Any], TrackStart]

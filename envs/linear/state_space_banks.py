@@ -24,14 +24,19 @@ from ...filters.small_matrices import outer, product, transpose
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    ACTION,
     AVERAGE_OF_LOG1P,
     KEPT_AS_LOG,
-    LOG1P,
     SHARE,
     SIGNED_LOG,
     Array,
     Block,
+)
+from ..contract.standard_blocks import (
+    availability_block,
+    innovation_block,
+    last_action_block,
+    nis_block,
+    relative_likelihood_block,
 )
 from .equations import Equations
 from .state_space import Measurement, StateSpace, StateSpaceParameters
@@ -93,16 +98,16 @@ class KalmanBank(Bank[StateSpace, Measurement, Track]):
         """What every filter of one model shows."""
         parts = tuple(map(str, range(1, self.sensors + 1))) if self.sensors > 1 else ()
         return (
-            Block("innovation", lambda f, _: f.innovation, "innovations over their sigma", parts, SIGNED_LOG),
-            Block("nis", lambda f, _: f.nis, "normalised innovation squared", shown=LOG1P),
+            innovation_block(parts, text="innovations over their sigma"),
+            nis_block(),
             Block(
                 "average_nis",
                 lambda f, _: f.average,
                 "average of log(1 + nis) of a number of the measurement",
                 shown=AVERAGE_OF_LOG1P,
             ),
-            Block("available", lambda _, m: m.available, "1 where a value was received", parts, SHARE),
-            Block("last_action", lambda f, _: f.action, "action applied before", self.answers, ACTION),
+            availability_block(parts=parts),
+            last_action_block(self.answers),
         )
 
     def start(self, initial: Initial) -> Track:
@@ -372,14 +377,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
         xp, modes = self.xp, self.task.modes
         parts = tuple(map(str, range(1, self.task.definition.filters[0].h.size + 1)))
         return (
-            Block("nis", lambda f, _: f.nis, "normalised innovation squared", modes, LOG1P),
-            Block(
-                "log_likelihood",
-                lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "log-likelihoods relative to the largest",
-                modes,
-                SIGNED_LOG,
-            ),
+            nis_block(modes),
+            relative_likelihood_block(xp, modes, text="log-likelihoods relative to the largest"),
             Block(
                 "predicted_probability",
                 lambda f, _: f.log_predicted,
@@ -394,14 +393,8 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
                 modes,
                 SHARE,
             ),
-            Block(
-                "available",
-                lambda _, m: m.available,
-                "1 where a value was received",
-                parts if len(parts) > 1 else (),
-                SHARE,
-            ),
-            Block("last_action", lambda f, _: f.action, "action applied before", modes, ACTION),
+            availability_block(parts=parts if len(parts) > 1 else ()),
+            last_action_block(modes),
         )
 
     def start(self, initial: Initial) -> Mixture:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
+from ..contract.columns import Column
 from ..contract.log_format import LogFormat, PlainRows, Predicted, TrackLog, TrackStart
 from ..linear.equations import find_invalid_noise
 from .recorded_tables import UNEVEN, Columns
@@ -43,7 +44,7 @@ def state_space_log_format(definition: "StateSpaceDefinition", defaults: Mapping
     acting = {name.lower(): given.unit for name, given in definition.inputs.items()}
     interval = None if definition.world[0].timed else float(defaults.get("sampling_interval", 1.0))
     return LogFormat(
-        {**columns, **acting},
+        {name: Column(unit) for name, unit in (columns | acting).items()},
         functools.partial(_read, definition, dict(defaults)),
         _start,
         predict=functools.partial(_predict, definition) if one else None,

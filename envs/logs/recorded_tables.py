@@ -14,6 +14,7 @@ import numpy
 
 from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
+from ..contract.columns import check_deviations
 from ..contract.companions import find_companion
 from ..contract.live_input import LARGEST
 from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog
@@ -88,6 +89,10 @@ class Columns:
     def __getitem__(self, name: str) -> numpy.ndarray:
         """Column, NaN where a cell is empty."""
         return self.table[name].to_numpy()
+
+    def place(self, number: int) -> str:
+        """Row of the file that one of these rows is."""
+        return f"row {self.table.index[number]}"
 
     def only(self, rows: numpy.ndarray) -> "Columns":
         """Some rows of the same."""
@@ -257,12 +262,7 @@ class Columns:
         """
         found = self.whole(*names)
         for name in names:
-            values = self.table[name]
-            if (values <= 0.0).any():
-                row = (values <= 0.0).idxmax()
-                raise ValueError(
-                    f"{name} is a standard deviation, above zero, and row {row} has {values[row]:g}"
-                )
+            check_deviations(self, name, self[name])
         return found
 
     def interval(self) -> float:

@@ -17,15 +17,20 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    ACTION,
     KEPT_AS_LOG,
     KEPT_AS_LOG1P,
     SHARE,
-    SIGNED_LOG,
     Array,
     Block,
     Compression,
     Quantity,
+)
+from ..contract.standard_blocks import (
+    availability_block,
+    average_block,
+    innovation_block,
+    last_action_block,
+    last_weight_block,
 )
 from ..contract.task import Task
 from .parameters import AXES, LooselyCoupledNavigationParameters
@@ -134,28 +139,25 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
             return elapsed / (elapsed + p.correlation_time)
 
         return (
-            Block(
-                "innovation_over_sigma",
-                lambda f, measurement: measurement.available * f.seen.normalised,
-                "innovation over its predicted standard deviation",
+            innovation_block(
                 each,
-                SIGNED_LOG,
+                value=lambda f, measurement: measurement.available * f.seen.normalised,
+                text="innovation over its predicted standard deviation",
+                name="innovation_over_sigma",
                 over_interval="mean",
             ),
-            Block(
-                "innovation_over_reported",
-                lambda f, measurement: f.seen.innovation / measurement.reported_deviation,
-                "the innovation over the reported noise",
+            innovation_block(
                 each,
-                SIGNED_LOG,
+                value=lambda f, measurement: f.seen.innovation / measurement.reported_deviation,
+                text="the innovation over the reported noise",
+                name="innovation_over_reported",
                 over_interval="mean",
             ),
-            Block(
+            average_block(
                 "average_innovation",
                 lambda f, _: f.seen.average,
                 "short average of the innovation over its predicted standard deviation",
                 each,
-                SIGNED_LOG,
             ),
             Block(
                 "average_square",
@@ -164,12 +166,11 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 each,
                 KEPT_AS_LOG1P,
             ),
-            Block(
+            average_block(
                 "average_product",
                 lambda f, _: f.seen.average_product,
                 "short average of its product with the one before",
                 each,
-                SIGNED_LOG,
             ),
             Block(
                 "reported_noise",
@@ -177,13 +178,7 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
                 "the reported over the nominal variance of a measurement",
                 shown=KEPT_AS_DEVIATION_LOG,
             ),
-            Block(
-                "available",
-                lambda _, measurement: measurement.available,
-                "1 with a measurement, 0 without",
-                shown=SHARE,
-                over_interval="mean",
-            ),
+            availability_block("1 with a measurement, 0 without", over_interval="mean"),
             self.last_action(),
             Block("time", time, "t / (t + tau), t since the start, tau the correlation time", shown=SHARE),
         )
@@ -288,7 +283,7 @@ class NoiseBank(KalmanBucyBank):
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block("last_action", lambda f, _: f.action, "action applied before", NOISES, ACTION)
+        return last_action_block(NOISES)
 
     def start(self, initial: Initial) -> Augmented:
         """Start where INS and reference agree, with the modelled prior of the rate errors."""
@@ -379,7 +374,7 @@ class GainBank(KalmanBucyBank):
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block("last_action", lambda f, _: f.action, "action applied before", self.axes, ACTION)
+        return last_action_block(self.axes)
 
     def start(self, initial: Initial) -> Steered:
         """Start where INS and reference agree."""
@@ -466,7 +461,7 @@ class SchemeBank(KalmanBucyBank):
     def last_action(self) -> Block:
         """Block of the weights in force before."""
         names = [name.replace("-", "_") for name in SCHEMES]
-        return Block("last_weight", lambda f, _: f.weights, "weight put in force before", names, SHARE)
+        return last_weight_block(names, value=lambda f: f.weights, text="weight put in force before")
 
     def start(self, initial: Initial) -> Schemes:
         """Start all filters where INS and reference agree, with the modelled prior of the rate errors."""

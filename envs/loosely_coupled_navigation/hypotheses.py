@@ -8,7 +8,16 @@ from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
-from ..contract.observation import ACTION, BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
+from ..contract.observation import Array, Block
+from ..contract.standard_blocks import (
+    entropy_block,
+    expected_nis_block,
+    last_action_block,
+    log_density_block,
+    predicted_block,
+    prior_block,
+    probability_block,
+)
 from ..contract.task import Task
 from .banks import Innovations, KalmanBucyBank
 from .fault_bank import FaultBank, FaultState, Weighing
@@ -57,62 +66,35 @@ class HypothesesBank(SteeredBank, KalmanBucyBank):
         nominal = 0.5 * self.parameters.axes * math.log(2.0 * math.pi * self.parameters.receiver_variance)
         return (
             *super().blocks,
-            Block(
-                "squared_innovation",
-                lambda f, measurement: xp.where(measurement.available > 0.0, f.likelihood.nis, 0.0),
+            expected_nis_block(
+                xp,
+                lambda measurement: measurement.available > 0.0,
                 "the normalised innovation squared, with the noise that the bank expects",
-                shown=LOG1P,
                 over_interval="mean",
             ),
-            Block(
-                "log_likelihood",
+            log_density_block(
                 lambda f, measurement: xp.where(
                     measurement.available > 0.0, f.likelihood.log_likelihood + nominal, 0.0
                 ),
                 "the log-density of the fix, zero for the nominal one at its centre, nats",
-                shown=BOUNDED_LOG,
                 over_interval="mean",
             ),
-            Block(
-                "prior",
-                lambda f, _: f.prior,
-                "the sigma of the predicted position over the reported one",
-                shown=KEPT_AS_LOG,
-            ),
-            Block(
-                "log_predicted",
-                lambda f, _: imm.log_probabilities(f.predicted),
-                "the logarithm of the probability before the fix",
-                self.groups,
-                SIGNED_LOG,
-            ),
-            Block(
-                "probability",
-                lambda f, _: xp.clip(f.probabilities, 0.0, 1.0),
-                "probability after the fix if the action is zero",
-                self.groups,
-                SHARE,
-            ),
-            Block(
-                "level_probability",
-                lambda f, _: xp.clip(f.levels, 0.0, 1.0),
-                "likewise of the receiver's variance over the reported one",
+            prior_block(text="the sigma of the predicted position over the reported one"),
+            predicted_block(self.groups, "fix"),
+            probability_block(xp, self.groups, "probability after the fix if the action is zero"),
+            probability_block(
+                xp,
                 self.level_names,
-                SHARE,
+                "likewise of the receiver's variance over the reported one",
+                name="level_probability",
+                value=lambda f: f.levels,
             ),
-            Block(
-                "entropy",
-                lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
-                "entropy of the hypotheses then over the largest possible",
-                shown=SHARE,
-            ),
+            entropy_block(xp),
         )
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block(
-            "last_action", lambda f, _: f.action, "action applied before", tuple(self.own.settings), ACTION
-        )
+        return last_action_block(tuple(self.own.settings))
 
     def start(self, initial: Initial) -> SteeredFaults:
         """Start where the estimator starts."""

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy
 
-from ..contract.live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, LiveValues, Memory
+from .logs import COLUMNS, measure
 from .world import Measurement
 
 
@@ -14,11 +15,7 @@ class PositionInput(LiveInput):
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return what is said in metres."""
-        values = {
-            "ins": "m, position by the INS alone, one number for each axis",
-            "fix": "m, position by the receiver, likewise; left out where there is none",
-            "sigma": "m, standard deviation of each axis of the fix, as reported; default: the parameters'",
-        }
+        values = {name: COLUMNS[name].live_text for name in ("ins", "fix", "sigma")}
         return values, {"ins": "m, position by the INS at the start; default: the mean"}
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
@@ -37,15 +34,7 @@ class PositionInput(LiveInput):
         ins, fix = self.read(values, "ins", (p.axes,)), self.read(values, "fix", (p.axes,))
         if not numpy.isfinite(ins).all():
             raise ValueError(f"{self.task.id} needs ins at every measurement, {p.axes} finite numbers (m)")
-        sigma = self.read(values, "sigma")
-        there = numpy.isfinite(fix).all(axis=0)
+        sigma = LiveValues(self, values).deviations("sigma")
         number = memory["count"] + 1.0
-        measurement = Measurement(
-            number,
-            ins,
-            ins - memory["ins"],
-            numpy.where(there, fix, 0.0),
-            there.astype(float),
-            numpy.where(numpy.isfinite(sigma), sigma, p.receiver_variance**0.5),
-        )
-        return measurement, {"time": time, "count": number, "ins": ins}
+        found = measure(number, ins, memory["ins"], fix, sigma, p)
+        return Measurement(**found), {"time": time, "count": number, "ins": ins}

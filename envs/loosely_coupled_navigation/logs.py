@@ -9,17 +9,55 @@ from typing import Any
 
 import numpy
 
+from ..contract.columns import Column
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..logs.plausibility import check_extents
 from ..logs.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
 
 COLUMNS = {
-    "ins": "m, position by the INS alone; with several axes ins_x, ins_y, ins_z",
-    "fix": "m, position by the receiver, empty where there is none; with several axes fix_x, fix_y, fix_z",
-    "sigma": "m, standard deviation of each axis of the fix, as reported; optional, default: the parameters'",
-    **{f"{kind}_{axis}": "likewise" for kind in ("ins", "fix") for axis in AXES},
+    "ins": Column(
+        "m, position by the INS alone; with several axes ins_x, ins_y, ins_z",
+        live="m, position by the INS alone, one number for each axis",
+    ),
+    "fix": Column(
+        "m, position by the receiver, empty where there is none; with several axes fix_x, fix_y, fix_z",
+        live="m, position by the receiver, likewise; left out where there is none",
+    ),
+    "sigma": Column(
+        "m, standard deviation of each axis of the fix, as reported; optional, default: the parameters'"
+    ),
+    **{f"{kind}_{axis}": Column("likewise") for kind in ("ins", "fix") for axis in AXES},
 }
+
+
+def measure(
+    number: numpy.ndarray,
+    ins: numpy.ndarray,
+    before: numpy.ndarray,
+    fix: numpy.ndarray,
+    sigma: numpy.ndarray,
+    p: Any,
+) -> dict[str, numpy.ndarray]:
+    """Arrays of a measurement, of n rows of a table or of n tracks; a fix of some axes is none.
+
+    Args:
+        number: of the measurement, ``(n,)``.
+        ins: position by the INS, m, ``(axes, n)``.
+        before: the same at the measurement before.
+        fix: position by the receiver, m, ``(axes, n)``; NaN where there is none.
+        sigma: deviation that it reports, m, ``(n,)``; NaN where it reports none.
+        p: parameters.
+    """
+    there = numpy.isfinite(fix).all(axis=0)
+    return {
+        "number": number,
+        "ins": ins,
+        "increment": ins - before,
+        "fix": numpy.where(there, fix, 0.0),
+        "available": there.astype(float),
+        "reported_deviation": numpy.where(numpy.isfinite(sigma), sigma, p.receiver_variance**0.5),
+    }
 
 
 def start_track(
@@ -49,23 +87,15 @@ def read_log(columns: Columns) -> TrackLog:
     interval = columns.regular("the filters of this environment count measurements, not seconds")
     parameters = {"axes": len(ends), "sampling_interval": interval}
     fix = numpy.stack([columns[f"fix{end}"] for end in ends], axis=1)
-    # A fix of some axes is none: the receiver's measurement is one.
-    available = numpy.asarray(numpy.isfinite(fix).all(axis=1))
-    if not available[1:].any():
+    if not numpy.isfinite(fix[1:]).all(axis=1).any():
         raise ValueError("no row has a fix on every axis")
     check_extents(("ins", "fix"), ins, fix)
     given = {name: value for name, value in columns.given.items() if name not in ("axes", "horizon")}
-    nominal = LooselyCoupledNavigationParameters(**{**parameters, **given}).receiver_variance ** 0.5
-    sigma = columns.sigmas("sigma")[:, 0] if columns.has("sigma") else numpy.full(len(ins), nominal)
+    p = LooselyCoupledNavigationParameters(**{**parameters, **given})
     count = len(ins) - 1
-    measurements = {
-        "number": numpy.arange(1.0, count + 1.0),
-        "ins": ins[1:],
-        "increment": numpy.diff(ins, axis=0),
-        "fix": numpy.where(available[:, None], fix, 0.0)[1:],
-        "available": available[1:].astype(float),
-        "reported_deviation": sigma[1:],
-    }
+    sigma = columns.sigmas("sigma")[1:, 0] if columns.has("sigma") else numpy.full(count, numpy.nan)
+    made = measure(numpy.arange(1.0, count + 1.0), ins[1:].T, ins[:-1].T, fix[1:].T, sigma, p)
+    measurements = {name: numpy.ascontiguousarray(values.T) for name, values in made.items()}
     return TrackLog(
         measurements,
         {"mean": ins[0], "covariance": numpy.zeros((len(ends), len(ends)))},

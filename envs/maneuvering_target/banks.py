@@ -18,14 +18,21 @@ from ...filters.ordered_sums import weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
 from ..contract.observation import (
-    AVERAGE_OF_LOG1P,
     KEPT_AS_LOG,
-    KEPT_AS_LOG1P,
     SHARE,
-    SIGNED_LOG,
     Array,
     Block,
     Quantity,
+)
+from ..contract.standard_blocks import (
+    availability_block,
+    average_block,
+    average_log_squared_block,
+    innovation_block,
+    last_weight_block,
+    log_predicted_block,
+    log_squared_block,
+    relative_likelihood_block,
 )
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
@@ -164,12 +171,7 @@ class RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
                 f"scans since the start over {SCANS_SHOWN}, saturating at 1",
                 shown=SHARE,
             ),
-            Block(
-                "available",
-                lambda state, measurement: measurement.available,
-                "1 if the scan saw the target, 0 if not: no action has an effect then",
-                shown=SHARE,
-            ),
+            availability_block("1 if the scan saw the target, 0 if not: no action has an effect then"),
             Block(
                 "elapsed",
                 log_elapsed,
@@ -192,32 +194,12 @@ class GainBank(RadarBank):
         """Innovations, their averages, gain, and clock."""
         xp = self.xp
         return (
-            Block(
-                "innovation",
-                lambda f, _: f.innovation / xp.sqrt(f.innovation_variance),
-                "the innovation over its predicted sigma",
-                "xy",
-                SIGNED_LOG,
+            innovation_block("xy", value=lambda f, _: f.innovation / xp.sqrt(f.innovation_variance)),
+            log_squared_block(),
+            average_block(
+                "average_innovation", lambda f, _: f.average_innovation, f"its {self.average}", "xy"
             ),
-            Block(
-                "log_squared_innovation",
-                lambda f, _: f.log_squared,
-                "the normalised innovation squared",
-                shown=KEPT_AS_LOG1P,
-            ),
-            Block(
-                "average_innovation",
-                lambda f, _: f.average_innovation,
-                f"its {self.average}",
-                "xy",
-                SIGNED_LOG,
-            ),
-            Block(
-                "average_log_squared_innovation",
-                lambda f, _: f.average_log_squared,
-                f"{self.average} of log_squared_innovation",
-                shown=AVERAGE_OF_LOG1P,
-            ),
+            average_log_squared_block(self.average),
             Block(
                 "prior_share",
                 lambda f, measurement: 1.0 - measurement.variance / f.innovation_variance,
@@ -380,53 +362,25 @@ class FilterBank(RadarBank):
 
         over_sigma = "the filter's innovation over its predicted sigma"
         return (
-            Block("innovation_x", innovation_in_sigmas(0), over_sigma, each, SIGNED_LOG),
-            Block("innovation_y", innovation_in_sigmas(1), over_sigma, each, SIGNED_LOG),
-            Block(
-                "log_squared_innovation",
-                lambda f, _: f.log_squared,
-                "the normalised innovation squared",
-                each,
-                KEPT_AS_LOG1P,
-            ),
-            Block(
+            innovation_block(each, value=innovation_in_sigmas(0), text=over_sigma, name="innovation_x"),
+            innovation_block(each, value=innovation_in_sigmas(1), text=over_sigma, name="innovation_y"),
+            log_squared_block(each),
+            average_block(
                 "average_innovation_x",
                 lambda f, _: f.average_innovation[0],
                 f"{self.average} of innovation_x",
                 each,
-                SIGNED_LOG,
             ),
-            Block(
+            average_block(
                 "average_innovation_y",
                 lambda f, _: f.average_innovation[1],
                 f"{self.average} of innovation_y",
                 each,
-                SIGNED_LOG,
             ),
-            Block(
-                "average_log_squared_innovation",
-                lambda f, _: f.average_log_squared,
-                f"{self.average} of log_squared_innovation",
-                each,
-                AVERAGE_OF_LOG1P,
-            ),
-            Block(
-                "log_likelihood",
-                lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood minus the largest one, nats",
-                each,
-                SIGNED_LOG,
-            ),
-            Block(
-                "log_predicted",
-                lambda f, _: f.log_predicted,
-                "the logarithm of the predicted mode probability",
-                each,
-                SIGNED_LOG,
-            ),
-            Block(
-                "last_weight", lambda f, _: f.probabilities, "weight in force before this scan", each, SHARE
-            ),
+            average_log_squared_block(self.average, each),
+            relative_likelihood_block(xp, each),
+            log_predicted_block(each, text="the logarithm of the predicted mode probability"),
+            last_weight_block(each),
             *self.surroundings(),
         )
 

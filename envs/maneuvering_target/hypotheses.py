@@ -9,7 +9,16 @@ from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import apply, product, transpose
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
-from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block
+from ..contract.observation import BOUNDED_LOG, Array, Block
+from ..contract.standard_blocks import (
+    entropy_block,
+    expected_nis_block,
+    innovation_block,
+    log_density_block,
+    predicted_block,
+    prior_block,
+    probability_block,
+)
 from .banks import RadarBank
 from .kalman_net import FRAME, frame_of
 from .semi_markov import SemiMarkov, SemiMarkovState
@@ -69,54 +78,22 @@ class HypothesesBank(SteeredBank, RadarBank):
         xp = self.xp
         area = 2.0 * math.pi * self.parameters.range_sigma**2
         return (
-            Block(
-                "innovation",
-                lambda f, _: f.innovation,
-                "the innovation of all hypotheses together over its predicted sigma",
+            innovation_block(
                 FRAME,
-                BOUNDED_LOG,
+                text="the innovation of all hypotheses together over its predicted sigma",
+                shown=BOUNDED_LOG,
             ),
-            Block(
-                "squared_innovation",
-                lambda f, measurement: xp.where(measurement.available > 0.0, f.likelihood.nis, 0.0),
-                "the hypotheses' mean normalised innovation squared",
-                shown=LOG1P,
-            ),
-            Block(
-                "log_likelihood",
+            expected_nis_block(xp, lambda measurement: measurement.available > 0.0),
+            log_density_block(
                 lambda f, measurement: xp.where(
                     measurement.available > 0.0, f.likelihood.log_likelihood + math.log(area), 0.0
                 ),
                 "the log-density of the measurement where 2 pi range_sigma^2 is the unit of area, nats",
-                shown=BOUNDED_LOG,
             ),
-            Block(
-                "prior",
-                lambda f, _: f.prior,
-                "the sigma of the predicted position over that of the measurement",
-                FRAME,
-                KEPT_AS_LOG,
-            ),
-            Block(
-                "log_predicted",
-                lambda f, _: imm.log_probabilities(f.predicted),
-                "the logarithm of the probability before the measurement",
-                GROUPS,
-                SIGNED_LOG,
-            ),
-            Block(
-                "probability",
-                lambda f, _: xp.clip(f.probabilities, 0.0, 1.0),
-                "probability after the measurement if the action is zero",
-                GROUPS,
-                SHARE,
-            ),
-            Block(
-                "entropy",
-                lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
-                "entropy of the hypotheses then over the largest possible",
-                shown=SHARE,
-            ),
+            prior_block(FRAME),
+            predicted_block(GROUPS),
+            probability_block(xp, GROUPS, "probability after the measurement if the action is zero"),
+            entropy_block(xp),
             *self.surroundings(),
         )
 

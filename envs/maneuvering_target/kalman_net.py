@@ -35,6 +35,7 @@ from ...filters.array_namespace import namespace
 from ...filters.small_matrices import apply, outer, product, transpose
 from ..contract.filter import Bank, Initial
 from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block
+from ..contract.standard_blocks import innovation_block, prior_block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
@@ -190,13 +191,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         """Innovations and what the filter and the radar say of them, what was answered last, and the clock."""
         xp, p = self.xp, self.parameters
         return (
-            Block(
-                "innovation",
-                lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor),
-                "the innovation over its predicted sigma",
-                FRAME,
-                SIGNED_LOG,
-            ),
+            innovation_block(FRAME, value=lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor)),
             Block(
                 "correction",
                 lambda f, _: f.correction * (1.0 / (NOMINAL_ACCELERATION * p.sampling_interval)),
@@ -204,13 +199,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
                 FRAME,
                 SIGNED_LOG,
             ),
-            Block(
-                "prior",
-                lambda f, _: 0.5 * xp.log(f.prior / f.sensor),
-                "the sigma of the predicted position over that of the measurement",
-                FRAME,
-                KEPT_AS_LOG,
-            ),
+            prior_block(FRAME, value=lambda f, _: 0.5 * xp.log(f.prior / f.sensor)),
             *sensor_blocks(self, lambda f, _: f.sensor, lambda f, _: f.coupling),
             Block(
                 "acceleration",

@@ -6,9 +6,9 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, LiveValues, Memory
 from ..logs.plausibility import check_degrees
-from .logs import COLUMNS, FARTHEST_RANGE, two_plot_start
+from .logs import COLUMNS, FARTHEST_RANGE, east_north, two_plot_start
 from .world import Measurement, Odometry
 
 SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
@@ -29,9 +29,9 @@ class PlotInput(LiveInput):
         """Return columns of a log; of a second sensor speed and heading at the start, too."""
         names = VALUES if self.task.recording.origin is None else (*VALUES, *PLACE)
         if self.measurement.odometry is None:
-            return {name: COLUMNS[name] for name in names}, {}
-        at_start = {name: COLUMNS[name] for name in SECOND_SENSOR[2:]}
-        return {name: COLUMNS[name] for name in (*names, *SECOND_SENSOR)}, at_start
+            return {name: COLUMNS[name].live_text for name in names}, {}
+        at_start = {name: COLUMNS[name].live_text for name in SECOND_SENSOR[2:]}
+        return {name: COLUMNS[name].live_text for name in (*names, *SECOND_SENSOR)}, at_start
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start as if a scan had just seen the target."""
@@ -69,7 +69,7 @@ class PlotInput(LiveInput):
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
         """Velocity by the second sensor, ``(2, N)``, m/s; NaN where it says none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
-        return self.read(values, "odometry_speed") * numpy.stack([numpy.sin(heading), numpy.cos(heading)])
+        return east_north(self.read(values, "odometry_speed"), heading)
 
     def _position(self, values: Mapping[str, Any]) -> numpy.ndarray:
         if any(name in values for name in PLACE[:2]):
@@ -77,7 +77,7 @@ class PlotInput(LiveInput):
         if "range" not in values:
             return numpy.stack([self.read(values, "x"), self.read(values, "y")])
         distance, azimuth = self.read(values, "range"), numpy.radians(self.read(values, "azimuth"))
-        return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)])
+        return east_north(distance, azimuth)
 
     def _project(self, values: Mapping[str, Any]) -> numpy.ndarray:
         """Position of latitude and longitude, around the origin of the log that the filter was advised for."""
@@ -116,8 +116,9 @@ class PlotInput(LiveInput):
     def _variance(self, position: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
         """Variances of a plot: as stated with it, else as the file of the filter says, else the radar's."""
         p, usual = self.parameters, dict(self.task.recording.deviations)
-        stated = numpy.stack([self._deviation(values, "sigma_x"), self._deviation(values, "sigma_y")])
-        distance, bearing = self._deviation(values, "range_sigma"), self._deviation(values, "azimuth_sigma")
+        readings = LiveValues(self, values)
+        stated = numpy.stack([readings.deviations("sigma_x"), readings.deviations("sigma_y")])
+        distance, bearing = readings.deviations("range_sigma"), readings.deviations("azimuth_sigma")
         if "sigma_x" in usual:  # unless the plot itself states those of a radar
             default = numpy.array([[usual["sigma_x"]], [usual["sigma_y"]]])
             stated = numpy.where(numpy.isfinite(stated) | numpy.isfinite(distance), stated, default)
@@ -126,13 +127,3 @@ class PlotInput(LiveInput):
         with numpy.errstate(invalid="ignore"):
             polar_variance = polar.cartesian_variances(position, distance, numpy.radians(bearing))
         return numpy.where(numpy.isfinite(stated), stated**2, polar_variance)
-
-    def _deviation(self, values: Mapping[str, Any], name: str) -> numpy.ndarray:
-        """Return a deviation, ``(N,)``, NaN where none is stated."""
-        found = self.read(values, name)
-        if (found <= 0.0).any():
-            raise ValueError(
-                f"{name} is a standard deviation and must be positive, or None where nothing states it, got "
-                f"{float(found[found <= 0.0][0]):g}"
-            )
-        return found

@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
+from ..contract.columns import Column
 from ..contract.log_format import (
     NO_DEVIATIONS,
     LogFormat,
@@ -28,21 +29,25 @@ from ..logs.recorded_tables import Columns
 from .parameters import ManeuveringTargetParameters
 
 COLUMNS = {
-    "x": "m, east of the radar",
-    "y": "m, north of it",
-    "range": "m, in place of x and y",
-    "azimuth": "degrees clockwise from north, likewise",
-    "latitude": "degrees, in place of x and y",
-    "longitude": "degrees, likewise",
-    "altitude": "m above the ellipsoid, beside them; optional",
-    "sigma_x": "m, standard deviation of x; optional, default: the parameter range_sigma, else how positions scatter",
-    "sigma_y": "m, likewise",
-    "range_sigma": "m, standard deviation of the range; optional, default: the parameter",
-    "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
-    "odometry_x": "m, moved east since the row before, by a second sensor such as wheels and a compass; optional",
-    "odometry_y": "m, moved north, likewise",
-    "odometry_speed": "m/s, in place of both: the speed by that sensor",
-    "odometry_heading": "degrees clockwise from north, likewise",
+    "x": Column("m, east of the radar"),
+    "y": Column("m, north of it"),
+    "range": Column("m, in place of x and y"),
+    "azimuth": Column("degrees clockwise from north, likewise"),
+    "latitude": Column("degrees, in place of x and y"),
+    "longitude": Column("degrees, likewise"),
+    "altitude": Column("m above the ellipsoid, beside them; optional"),
+    "sigma_x": Column(
+        "m, standard deviation of x; optional, default: the parameter range_sigma, else how positions scatter"
+    ),
+    "sigma_y": Column("m, likewise"),
+    "range_sigma": Column("m, standard deviation of the range; optional, default: the parameter"),
+    "azimuth_sigma": Column("degrees, of the azimuth; default: the parameter bearing_sigma"),
+    "odometry_x": Column(
+        "m, moved east since the row before, by a second sensor such as wheels and a compass; optional"
+    ),
+    "odometry_y": Column("m, moved north, likewise"),
+    "odometry_speed": Column("m/s, in place of both: the speed by that sensor"),
+    "odometry_heading": Column("degrees clockwise from north, likewise"),
 }
 FINER = 10.0
 """Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
@@ -262,7 +267,12 @@ def _positions(columns: Columns) -> numpy.ndarray:
         float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
     )
     columns.notes += check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
-    return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
+    return numpy.ascontiguousarray(east_north(distance, azimuth).T)
+
+
+def east_north(length: numpy.ndarray, angle: numpy.ndarray) -> numpy.ndarray:
+    """Vector east and north, ``(2, n)``, of a length and an angle clockwise from north, rad, ``(n,)`` each."""
+    return numpy.stack([length * numpy.sin(angle), length * numpy.cos(angle)])
 
 
 def _assume_deviation(columns: Columns, position: numpy.ndarray, time: numpy.ndarray) -> float:
@@ -391,9 +401,7 @@ def _displacements(columns: Columns) -> numpy.ndarray | None:
     if not columns.has("odometry_speed"):
         return None
     heading = numpy.radians(columns["odometry_heading"])
-    velocity = columns["odometry_speed"][:, None] * numpy.stack(
-        [numpy.sin(heading), numpy.cos(heading)], axis=1
-    )
+    velocity = numpy.ascontiguousarray(east_north(columns["odometry_speed"], heading).T)
     moved = numpy.full_like(velocity, numpy.nan)
     moved[1:] = 0.5 * numpy.diff(columns.time)[:, None] * (velocity[:-1] + velocity[1:])
     return moved

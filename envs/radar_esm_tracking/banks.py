@@ -17,15 +17,20 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank
 from ..contract.observation import (
-    AVERAGE_OF_LOG1P,
     BOUNDED_LOG,
-    KEPT_AS_LOG1P,
     SHARE,
-    SIGNED_LOG,
     Array,
     Block,
     linear_scale,
     within,
+)
+from ..contract.standard_blocks import (
+    average_block,
+    average_log_squared_block,
+    innovation_block,
+    last_weight_block,
+    log_squared_block,
+    relative_likelihood_block,
 )
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start
@@ -124,38 +129,30 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         counted = within(0.0, (self.last_scan + 1) / COUNT_SHOWN)
 
         return (
-            Block(
-                "innovation_range", lambda f, _: f.innovation[0], "the whitened innovation of the range",
-                classes, SIGNED_LOG,
+            innovation_block(
+                classes, lambda f, _: f.innovation[0], "the whitened innovation of the range", "innovation_range",
             ),
-            Block(
-                "innovation_range_rate", lambda f, _: f.innovation[1],
-                "the whitened innovation of the range rate, without what the range explains", classes, SIGNED_LOG,
+            innovation_block(
+                classes, lambda f, _: f.innovation[1],
+                "the whitened innovation of the range rate, without what the range explains", "innovation_range_rate",
             ),
-            Block(
+            average_block(
                 "average_innovation_range", lambda f, _: f.average_innovation[0],
-                f"the {average} of innovation_range", classes, SIGNED_LOG,
+                f"the {average} of innovation_range", classes,
             ),
-            Block(
+            average_block(
                 "average_innovation_range_rate", lambda f, _: f.average_innovation[1],
-                f"the {average} of innovation_range_rate", classes, SIGNED_LOG,
+                f"the {average} of innovation_range_rate", classes,
             ),
-            Block(
-                "log_likelihood", lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood of this scan's radar measurement minus the largest, nats", classes, SIGNED_LOG,
+            relative_likelihood_block(
+                xp, classes, "the log-likelihood of this scan's radar measurement minus the largest, nats",
             ),
-            Block(
-                "accumulated_log_likelihood", lambda f, _: f.accumulated - xp.max(f.accumulated, axis=0),
-                "the sum of the log-likelihoods since the start minus the largest, nats", classes, BOUNDED_LOG,
+            relative_likelihood_block(
+                xp, classes, "the sum of the log-likelihoods since the start minus the largest, nats", BOUNDED_LOG,
+                "accumulated_log_likelihood", lambda f: f.accumulated,
             ),
-            Block(
-                "log_squared_innovation", lambda f, _: f.log_squared, "the normalised innovation squared",
-                classes, KEPT_AS_LOG1P,
-            ),
-            Block(
-                "average_log_squared_innovation", lambda f, _: f.average_log_squared,
-                f"{average} of log_squared_innovation", classes, AVERAGE_OF_LOG1P,
-            ),
+            log_squared_block(classes),
+            average_log_squared_block(average, classes),
             Block(
                 "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, xp),
                 "1 where the ESM decides for this emitter type; none: for nothing at this scan",
@@ -175,7 +172,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
                 "radar minus ESM bearing over the gate", over_interval="mean",
                 shown=linear_scale(1.0 / self.gate, limits=(-180.0, 180.0)),
             ),
-            Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes, SHARE),
+            last_weight_block(classes),
             Block(
                 "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * time_factor,
                 f"time since the start of the track over {TIME_SHOWN:g} s",

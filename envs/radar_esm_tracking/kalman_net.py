@@ -26,7 +26,8 @@ from ...filters import class_fusion, imm, packed_covariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.small_matrices import apply, cholesky
 from ..contract.controls import bank_probabilities
-from ..contract.observation import ACTION, KEPT_AS_LOG, Array, Block
+from ..contract.observation import KEPT_AS_LOG, Array, Block
+from ..contract.standard_blocks import last_action_block
 from .banks import ClassBank
 from .world import Measurement, Start
 
@@ -105,7 +106,7 @@ class KalmanNetBank(ClassBank):
                 self.task.modes,
                 KEPT_AS_LOG,
             ),
-            Block("last_action", lambda f, _: f.action, "last answer", self.answers, ACTION),
+            last_action_block(self.answers),
         )
 
     def start(self, initial: Start) -> Any:

@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy
 
-from ...filters.class_fusion import bearing_difference
-from ..contract.live_input import LiveInput, Memory
-from .logs import COLUMNS, start_track
+from ..contract.live_input import LiveInput, LiveValues, Memory
+from .logs import COLUMNS, read_decisions, start_track
 from .world import Measurement, Start
 
 
@@ -21,7 +20,8 @@ class ScanInput(LiveInput):
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return columns of a log, also for the start."""
-        return COLUMNS, COLUMNS
+        texts = {name: column.live_text for name, column in COLUMNS.items()}
+        return texts, texts
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start the track on its first scan; mean and covariance follow from it unless they are given."""
@@ -41,27 +41,6 @@ class ScanInput(LiveInput):
         return self._scan(scan, values), {"time": time, "count": scan}
 
     def _scan(self, scan: numpy.ndarray, values: Mapping[str, Any]) -> Measurement:
-        types = self.task.types  # type: ignore[attr-defined]
         radar = self.read_all(values, ("range", "range_rate"), "at every scan")
-        decision = self.read(values, "decision")
-        decided = numpy.isfinite(decision)
-        if not numpy.isin(decision[decided], numpy.arange(types)).all():
-            raise ValueError(
-                f"decision is the number of an emitter type from 0 to {types - 1}, got {decision}"
-            )
-        difference = self.read(values, "bearing_difference")
-        bearings = self.read(values, "radar_bearing"), self.read(values, "esm_bearing")
-        apart = numpy.where(numpy.isfinite(difference), difference, bearings[0] - bearings[1])
-        if not numpy.isfinite(apart[decided]).all():
-            raise ValueError(
-                "a decision needs radar_bearing and esm_bearing (degrees), or bearing_difference"
-            )
-        looked = self.read(values, "looked")
-        listens = scan % self.parameters.esm_period == 0
-        return Measurement(
-            scan.astype(numpy.int64),
-            radar,
-            numpy.where(numpy.isfinite(looked), looked > 0.5, listens) | decided,
-            numpy.where(decided, decision, types).astype(numpy.int64),
-            numpy.where(decided, bearing_difference(numpy.where(decided, apart, 0.0), 0.0), 0.0),
-        )
+        found = read_decisions(LiveValues(self, values), scan, self.parameters)
+        return Measurement(scan=scan.astype(numpy.int64), radar=radar, **found)

@@ -10,18 +10,23 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
+from ..contract.columns import Column, Readings, optional
 from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..logs.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
 COLUMNS = {
-    "range": "m",
-    "range_rate": "m/s, below zero where the target comes nearer",
-    "decision": "emitter type that the ESM decides for, counted from 0; empty where it heard nothing; optional",
-    "radar_bearing": "degrees, of the radar; with every decision",
-    "esm_bearing": "degrees, of the ESM, counted as the radar's; with every decision",
-    "bearing_difference": "degrees, radar minus ESM; in place of both bearings",
-    "looked": "1 where the ESM listened, else 0; optional, default: every esm_period scans, and wherever it decided",
+    "range": Column("m"),
+    "range_rate": Column("m/s, below zero where the target comes nearer"),
+    "decision": Column(
+        "emitter type that the ESM decides for, counted from 0; empty where it heard nothing; optional"
+    ),
+    "radar_bearing": Column("degrees, of the radar; with every decision"),
+    "esm_bearing": Column("degrees, of the ESM, counted as the radar's; with every decision"),
+    "bearing_difference": Column("degrees, radar minus ESM; in place of both bearings"),
+    "looked": Column(
+        "1 where the ESM listened, else 0; optional, default: every esm_period scans, and wherever it decided"
+    ),
 }
 
 
@@ -38,24 +43,10 @@ def read_log(columns: Columns) -> TrackLog:
     interval = columns.regular("the filters of this environment are tabulated by scans")
     named = {n: v for n, v in columns.given.items() if n not in ("horizon", "decision_interval")}
     p = RadarEsmTrackingParameters(**{"sampling_interval": interval, **named})
-    types, scans = len(p.recognition), numpy.arange(len(radar))
-    decision = columns["decision"] if columns.has("decision") else numpy.full(len(radar), numpy.nan)
-    decided = numpy.isfinite(decision)
-    wrong = decided & ((decision != numpy.round(decision)) | (decision < 0) | (decision >= types))
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise ValueError(
-            f"decision is the number of an emitter type from 0 to {types - 1}, and row {row} has {decision[row]:g}"
-        )
-    difference = _differences(columns, decided)
-    looked = columns.whole("looked")[:, 0] > 0.5 if columns.has("looked") else scans % p.esm_period == 0
-    raw = {
-        "scan": scans,
-        "radar": radar,
-        "looked": looked | decided,
-        "decision": numpy.where(decided, decision, types).astype(numpy.int64),
-        "bearing_difference": numpy.where(decided, difference, 0.0),
-    }
+    scans = numpy.arange(len(radar))
+    if columns.has("looked"):
+        columns.whole("looked")
+    raw = {"scan": scans, "radar": radar, **read_decisions(columns, scans, p)}
     measured = {name: values[None] for name, values in raw.items()}
     later, initial, _ = start_track(measured, columns.time[None], p)
     return TrackLog(
@@ -95,22 +86,45 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
     return TrackStart(later, initial, 1)
 
 
-def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:
-    """Radar bearing minus ESM bearing of every row, degrees."""
-    if not decided.any():
-        return numpy.zeros(len(decided))
-    if columns.has("bearing_difference"):
-        found = bearing_difference(columns["bearing_difference"], numpy.zeros(len(decided)))
-    elif columns.has("radar_bearing", "esm_bearing"):
-        found = bearing_difference(columns["radar_bearing"], columns["esm_bearing"])
-    else:
+def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
+    """Make of what radar and ESM report at some scans the arrays of a measurement beside ``scan`` and ``radar``.
+
+    Args:
+        readings: rows of a table, or values that come live; n of them.
+        scans: their numbers, ``(n,)``.
+        p: parameters.
+
+    Raises:
+        ValueError: for a decision that is none, or lacks a bearing.
+    """
+    types, count = len(p.recognition), len(scans)
+    decision = optional(readings, "decision", count)
+    decided = numpy.isfinite(decision)
+    wrong = decided & ((decision != numpy.round(decision)) | (decision < 0) | (decision >= types))
+    if wrong.any():
+        number = int(wrong.argmax())
         raise ValueError(
-            "it has decisions, and the gate needs radar_bearing and esm_bearing (degrees), or bearing_difference"
+            f"decision is the number of an emitter type from 0 to {types - 1}, and {readings.place(number)} has "
+            f"{decision[number]:g}"
         )
-    if not numpy.isfinite(found[decided]).all():
-        row = int(numpy.argmax(decided & ~numpy.isfinite(found)))
-        raise ValueError(f"row {row} has a decision and lacks a bearing")
-    return numpy.where(decided, found, 0.0)
+    difference = optional(readings, "bearing_difference", count)
+    radar, esm = (optional(readings, name, count) for name in ("radar_bearing", "esm_bearing"))
+    apart = numpy.where(numpy.isfinite(difference), difference, radar - esm)
+    lacking = decided & ~numpy.isfinite(apart)
+    if lacking.any():
+        raise ValueError(
+            f"{readings.place(int(lacking.argmax()))} has a decision and lacks a bearing: a decision needs "
+            "radar_bearing and esm_bearing (degrees), or bearing_difference"
+        )
+    looked = optional(readings, "looked", count)
+    listens = scans % p.esm_period == 0
+    return {
+        "looked": numpy.where(numpy.isfinite(looked), looked > 0.5, listens) | decided,
+        "decision": numpy.where(decided, decision, types).astype(numpy.int64),
+        "bearing_difference": numpy.where(
+            decided, bearing_difference(numpy.where(decided, apart, 0.0), 0.0), 0.0
+        ),
+    }
 
 
 def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:

@@ -21,7 +21,13 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
-from ..contract.observation import ACTION, BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity, within
+from ..contract.observation import BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity
+from ..contract.standard_blocks import (
+    clock_block,
+    last_action_block,
+    log_predicted_block,
+    relative_likelihood_block,
+)
 from ..contract.task import Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
@@ -129,14 +135,8 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
                 f"the short average of the same, over {p.averaging_measurements:g} measurements", each,
                 BOUNDED_LOG,
             ),
-            Block(
-                "log_likelihood", lambda f, y: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood minus the largest one, nats", self.hypotheses, BOUNDED_LOG,
-            ),
-            Block(
-                "log_predicted", lambda f, y: f.log_predicted,
-                "the logarithm of the predicted probability", self.hypotheses, SIGNED_LOG,
-            ),
+            relative_likelihood_block(xp, self.hypotheses, shown=BOUNDED_LOG),
+            log_predicted_block(self.hypotheses),
             Block(
                 "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
                 ("forward", "right", "down"), SIGNED_LOG, unit=f"{p.gravity:g} m/s^2",
@@ -150,11 +150,8 @@ class SatelliteBank(Bank[Task, Measurement, Any]):
             innovation("rate", rates),
             available("pseudorange", ranges),
             available("rate", rates),
-            Block(
-                "time", lambda f, y: xp.astype(y.number, xp.float64) / p.horizon,
-                "measurements so far over the horizon", shown=within(0.0, (p.horizon + 1) / p.horizon), unit="horizon",
-            ),
-            Block("last", lambda f, y: f.action, "last action", self.actions, ACTION),
+            clock_block(xp, p.horizon, unit="horizon"),
+            last_action_block(self.actions, name="last"),
         )  # fmt: skip
 
     @property

@@ -9,6 +9,7 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, SHARE, Array, Block
+from ..contract.standard_blocks import log_density_block, probability_block
 from .banks import SatelliteBank
 from .fault_hypotheses import FaultHypotheses, FaultState, Posterior
 from .parameters import HYPOTHESES
@@ -70,22 +71,19 @@ class FaultHypothesesBank(SteeredBank, SatelliteBank):
         units = task.constant([0.5 * math.log(2.0 * math.pi * r) for r in task.sensor_variance])[:, None]
         return (
             *super().blocks,
-            Block(
-                "log_density", lambda f, y: f.likelihood.log_likelihood + ordered_sum(y.available * units),
-                "the log-density of the readings in units of their nominal sigmas, nats", shown=BOUNDED_LOG,
-                over_interval="mean",
+            log_density_block(
+                lambda f, y: f.likelihood.log_likelihood + ordered_sum(y.available * units),
+                "the log-density of the readings in units of their nominal sigmas, nats", "log_density", "mean",
             ),
-            Block(
-                "probability", lambda f, y: xp.clip(f.expected, 0.0, 1.0),
-                "probability after the readings if the action is zero", self.hypotheses, SHARE,
+            probability_block(
+                xp, self.hypotheses, "probability after the readings if the action is zero", value=lambda f: f.expected,
             ),
             Block(
                 "range_error", lambda f, y: f.range_error / task.sensors[0].sigma,
                 "error of the pseudorange then over sigma", slots, BOUNDED_LOG,
             ),
-            Block(
-                "noisy_rate", lambda f, y: xp.clip(f.noisy, 0.0, 1.0),
-                "probability then that the rate is noisier than nominal", slots, SHARE,
+            probability_block(
+                xp, slots, "probability then that the rate is noisier than nominal", "noisy_rate", lambda f: f.noisy,
             ),
             Block(
                 "between_houses", lambda f, y: f.between, "1 where a C/N0 is not that of an open sky", shown=SHARE,

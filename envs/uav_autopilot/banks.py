@@ -11,7 +11,6 @@ from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
 from ..contract.filter import Bank
 from ..contract.observation import (
-    ACTION,
     KEPT_AS_LOG,
     LARGEST_LOG,
     SHARE,
@@ -20,7 +19,13 @@ from ..contract.observation import (
     Block,
     Compression,
     Quantity,
-    within,
+)
+from ..contract.standard_blocks import (
+    availability_block,
+    average_block,
+    clock_block,
+    innovation_block,
+    last_action_block,
 )
 from .parameters import UavAutopilotParameters
 from .world import Measurement, Start
@@ -86,19 +91,12 @@ class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
         sensors, horizon = self.task.sensors, self.task.horizon
         unit = 1.0 / self.task.output_sigma
         return (
-            Block(
-                "innovation",
-                lambda f, _: f.innovation,
-                "the innovation over its sigma; 0 in a dropout",
-                sensors,
-                SIGNED_LOG,
-            ),
-            Block(
+            innovation_block(sensors, text="the innovation over its sigma; 0 in a dropout"),
+            average_block(
                 "mean_innovation",
                 lambda f, _: f.mean_innovation,
                 "short average of the innovation over its sigma",
                 sensors,
-                SIGNED_LOG,
             ),
             Block(
                 "log_mean_square",
@@ -139,20 +137,10 @@ class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
                 "the mean of the variances over those of the settled filter",
                 shown=KEPT_AS_LOG,
             ),
-            Block(
-                "available",
-                lambda _, measurement: measurement.available,
-                "1 where the sensor answered, 0 in a dropout",
-                sensors,
-                SHARE,
-                over_interval="mean",
+            availability_block(
+                "1 where the sensor answered, 0 in a dropout", parts=sensors, over_interval="mean"
             ),
-            Block(
-                "time",
-                lambda _, measurement: measurement.number / horizon,
-                "measurements so far over the horizon",
-                shown=within(0.0, (horizon + 1) / horizon),
-            ),
+            clock_block(self.xp, horizon),
             self.action_block,
         )
 
@@ -326,7 +314,7 @@ class GainBank(_KalmanBank):
     """Control ``gain``: the action scales the process noise."""
 
     action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
-    action_block = Block("action", lambda f, _: f.action, "last action", shown=ACTION)
+    action_block = last_action_block(name="action")
     no_action = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
@@ -361,7 +349,7 @@ class NoiseBank(_KalmanBank):
     @property
     def action_block(self) -> Block:
         """Last action."""
-        return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors), ACTION)
+        return last_action_block(("process", *self.task.sensors), name="action")
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale the process noise by ``10 ** (noise_reach process_decades a)``."""

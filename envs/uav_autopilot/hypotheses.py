@@ -9,7 +9,15 @@ from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import ordered_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Likelihood
-from ..contract.observation import ACTION, BOUNDED_LOG, LOG1P, SHARE, SIGNED_LOG, Array, Block, within
+from ..contract.observation import Array, Block, within
+from ..contract.standard_blocks import (
+    entropy_block,
+    expected_nis_block,
+    last_action_block,
+    log_density_block,
+    predicted_block,
+    probability_block,
+)
 from .banks import AutopilotBank
 from .level_bank import LevelBank, Levels, grid
 from .world import Measurement, Start
@@ -70,7 +78,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
     @property
     def action_block(self) -> Block:
         """Last action."""
-        return Block("action", lambda f, _: f.action, "last action", tuple(self.own.settings), ACTION)
+        return last_action_block(tuple(self.own.settings), name="action")
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -81,32 +89,13 @@ class HypothesesBank(SteeredBank, AutopilotBank):
         )
         return (
             *super().blocks,
-            Block(
-                "log_likelihood",
+            log_density_block(
                 lambda f, y: xp.where(self.answered(y), f.likelihood.log_likelihood, 0.0) + math.log(unit),
                 "the log-density of the readings in units of their nominal sigmas, nats",
-                shown=BOUNDED_LOG,
             ),
-            Block(
-                "squared_innovation",
-                lambda f, y: xp.where(self.answered(y), f.likelihood.nis, 0.0),
-                "the hypotheses' mean normalised innovation squared",
-                shown=LOG1P,
-            ),
-            Block(
-                "log_predicted",
-                lambda f, _: imm.log_probabilities(f.predicted),
-                "the logarithm of the probability of the gusts' level before the readings",
-                self.names,
-                SIGNED_LOG,
-            ),
-            Block(
-                "probability",
-                lambda f, _: xp.clip(f.probabilities, 0.0, 1.0),
-                "probability after them if the action is zero",
-                self.names,
-                SHARE,
-            ),
+            expected_nis_block(xp, self.answered),
+            predicted_block(self.names, "readings", of=" of the gusts' level"),
+            probability_block(xp, self.names, "probability after them if the action is zero"),
             Block(
                 "sensor_level",
                 lambda f, _: xp.clip(f.sensor_levels, low, high),
@@ -114,12 +103,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
                 self.task.sensors,
                 within(low, high),
             ),
-            Block(
-                "entropy",
-                lambda f, _: xp.clip(f.entropy, 0.0, 1.0),
-                "entropy of the hypotheses then over the largest possible",
-                shown=SHARE,
-            ),
+            entropy_block(xp),
         )
 
     def log_trace(self, state: SteeredLevels) -> Array:

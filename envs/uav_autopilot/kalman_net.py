@@ -23,7 +23,8 @@ import gymnasium
 import numpy
 
 from ...filters import packed_covariance
-from ..contract.observation import ACTION, SIGNED_LOG, Array, Block
+from ..contract.observation import SIGNED_LOG, Array, Block
+from ..contract.standard_blocks import last_action_block
 from .banks import NoiseBank
 from .world import Measurement, Start
 
@@ -93,7 +94,7 @@ class KalmanNetBank(NoiseBank):
     @property
     def action_block(self) -> Block:
         """Last answer."""
-        return Block("action", lambda f, _: f.action, "last action", self.answers, ACTION)
+        return last_action_block(self.answers, name="action")
 
     def scaled_noise(self, scale: Array, entries: list[int] | slice) -> Array:
         """Process noise, its parts scaled by ``(L, N)``, at some packed entries, ``(entries, N)``."""

@@ -117,7 +117,7 @@ class SingleTrackEstimator(ABC):
             self._components(tracks[-1])
         return tracks
 
-    def update(self, measurement: Any, memory: list[Any]) -> tuple[Array, Array, list[Any]]:
+    def update(self, memory: list[Any], measurement: Any) -> tuple[Array, Array, list[Any]]:
         """Ask every track in turn; see :meth:`.Estimator.update`."""
         tracks, estimates = [], []
         for lane, track in enumerate(memory):

@@ -88,7 +88,7 @@ class Adapter(Filter[Task, Any, Adapted]):
 
     def ask(self, given: Input, memory: Any) -> Any:
         """Its answer to a measurement."""
-        return self.own.update(given.measurement, memory)
+        return self.own.update(memory, given.measurement)
 
     def smooth(self, measurements: Sequence[Any], states: Sequence[Adapted]) -> tuple[Array, Array]:
         """Smooth the track, of a smoother."""
@@ -109,7 +109,7 @@ class ReferenceAdapter(Adapter):
 
     def ask(self, given: Input, memory: Any) -> Any:
         """Its answer to a measurement and the truth."""
-        return self.own.update(given.measurement, given.truth, memory)
+        return self.own.update(memory, given.measurement, given.truth)
 
 
 class BoundAdapter(ReferenceAdapter):

@@ -184,8 +184,24 @@ def takes_problem(maker: Any) -> bool:
     return first is not None and (first.default is first.empty or first.name in ("task", "model"))
 
 
+def check_update_order(found: Any) -> None:
+    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement."""
+    import inspect
+
+    try:
+        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
+    except (AttributeError, TypeError, ValueError):  # without one, or compiled
+        return
+    if "memory" in names[1:]:
+        raise ValueError(
+            f"update takes the memory first, as update({', '.join(['memory', *(n for n in names if n != 'memory')])}), "
+            f"but this one is update({', '.join(names)}): change the order of its arguments"
+        )
+
+
 def make(found: Any, task: Any) -> Any:
     """Make an estimator of its class, for the task if the constructor takes it."""
+    check_update_order(found)
     if not isinstance(found, type):
         return found
     return found(task) if takes_problem(found) else found()
@@ -214,7 +230,7 @@ def main() -> None:
         return
     memory = own.start(initial, frames.lanes)
     while (measurement := frames.read("measurement")) is not None:
-        mean, covariance, memory, *_ = own.update(measurement, memory)
+        mean, covariance, memory, *_ = own.update(memory, measurement)
         C = len(hello["components"])
         mean, covariance = numpy.asarray(mean, dtype=float), numpy.asarray(covariance, dtype=float)
         for name, values, shape in (("mean", mean, (C,)), ("covariance", covariance, (C, C))):

@@ -20,7 +20,7 @@ from ...envs.contract.filter import Filter
 from ...envs.contract.model import Model
 from ...envs.contract.task import Array, Task
 from ...filters.array_namespace import host_array
-from .isolated_estimator import takes_problem
+from .isolated_estimator import check_update_order, takes_problem
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
@@ -108,7 +108,7 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
 
     Raises:
         ValueError: if it has not the methods of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
-            smoother.
+            smoother; or if its ``update`` takes the memory after the measurement.
     """
     kind = kind or kind_of(found)
     methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
@@ -119,6 +119,10 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
         raise ValueError(
             f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update{too}"
         )
+    try:
+        check_update_order(found)
+    except ValueError as error:
+        raise ValueError(f"{name!r}: {error}") from None
     return found
 
 
@@ -136,7 +140,10 @@ def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
 
 
 class Policy:
-    """Base of the classical policies: made for a model, deterministic unless it says otherwise.
+    """Base of the classical policies, batch first: observations and actions are ``(N, ...)``, as in Gymnasium.
+
+    A policy is made for a model, and deterministic unless it says otherwise. Filters have the batch last; where a
+    policy acts inside a filter, :mod:`.steered_filter` turns the axes.
 
     Subclasses set ``control`` and answer :meth:`predict`; those with memory keep it in the ``state`` that
     goes in and out, so that one object serves any number of episodes.
@@ -303,12 +310,12 @@ class RandomPolicy(Policy):
 
 
 class Estimator(Protocol):
-    """An estimator that a user brings: any object with these two methods.
+    """An estimator that a user brings, batch last: any object with these two methods, for arrays ``(..., N)``.
 
     A class is made for the task if its constructor takes an argument: ``task.parameters`` holds every constant,
     ``task.components`` what is estimated, in which unit. Nothing else of the task is needed.
 
-    N episodes are estimated side by side, batch on the last axis. N is a multiple of eight: the last episode is
+    N episodes are estimated side by side. N is a multiple of eight: the last episode is
     repeated to fill up, so that rounding in matrix products does not depend on how many there are.
     """
 
@@ -327,12 +334,12 @@ class Estimator(Protocol):
             N: number of episodes.
         """
 
-    def update(self, measurement: Any, memory: Any) -> tuple[Array, Array, Any]:
+    def update(self, memory: Any, measurement: Any) -> tuple[Array, Array, Any]:
         """Estimate after a measurement.
 
         Args:
-            measurement: the task's ``Measurement``, arrays with N as their last axis; not to be changed in place.
             memory: what the last call returned.
+            measurement: the task's ``Measurement``, arrays with N as their last axis; not to be changed in place.
 
         Returns:
             Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory. A
@@ -388,7 +395,7 @@ class Reference(Protocol):
             truth: at that time.
         """
 
-    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Array, Any]:
+    def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Array, Any]:
         """Estimate after a measurement; returns as of :meth:`Estimator.update`."""
         ...
 
@@ -405,6 +412,6 @@ class Bound(Protocol):
     def start(self, initial: Any, truth: Any) -> Any:
         """Memory at the start of the track; arguments as of :meth:`Reference.start`."""
 
-    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Any]:
+    def update(self, memory: Any, measurement: Any, truth: Any) -> tuple[Array, Any]:
         """Bound of the mean square of ``task.components``, ``(C, N)``, and the memory."""
         ...

@@ -232,7 +232,7 @@ class ProgramEstimator:
             raise ValueError(f"{self.program.command!r} cannot be started: {error.strerror}") from None
         return 0
 
-    def update(self, measurement: Any, memory: int) -> tuple[Array, Array, int]:
+    def update(self, memory: int, measurement: Any) -> tuple[Array, Array, int]:
         """Ask it; the memory is the number of measurements.
 
         Raises:
