@@ -99,8 +99,9 @@ def _temporary_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("temporary", numbered=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", str(folder))
-        # Stable-Baselines3 makes a folder there for every model that learns without a logger, and leaves it.
-        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("stable-baselines3")))
+        # Stable-Baselines3 leaves a folder of every model that learns without a logger there, Torch its cache.
+        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR"):
+            patch.setenv(variable, str(tmp_path_factory.mktemp(variable)))
         patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
         yield
     left = sorted(path.name for path in folder.iterdir())

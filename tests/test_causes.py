@@ -126,22 +126,6 @@ def test_opponents():
     assert opponent_of("a", {"a": 2.0}, ["a"]) == ""
 
 
-def test_a_summary_splits_what_a_whole_evaluation_does(records):
-    from filtergym.evaluation.running.parallel import Workers
-    from filtergym.evaluation.running.summary import combine_summaries, summaries
-    from filtergym.names import evaluation_requests
-
-    problem = problem_of(ENV)
-    requests = evaluation_requests(problem, problem.experiment(None, EPISODES, 3), NAMES)
-    with Workers(1, None) as workers:
-        found = dict(summaries(requests, workers))
-    others, curves, head = combine_summaries([found[i] for i in range(len(found))])
-    split = [r for r in others if r.metric.startswith("cause_")]
-    assert split == [r for r in records if r.metric.startswith("cause_")]
-    assert "cost_minus_best" in curves
-    assert phrases_of(head)["missed"] == "where a scan misses the target"
-
-
 def test_every_environment_says_what_its_causes_are(env_id):
     dataset = filtergym.evaluate(env_id, [problem_of(env_id).baselines.score_paper], None, 6)
     phrases = phrases_of(dataset)

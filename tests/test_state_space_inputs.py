@@ -106,18 +106,6 @@ def test_inputs_have_the_distribution_that_is_declared(make):
         np.testing.assert_allclose(told.std(), one.noise, rtol=0.05, atol=1e-15)
 
 
-def test_errors_are_as_large_as_the_covariance_says(make):
-    """The sum of normalised squared errors of M episodes is chi-square with 2 M degrees of freedom."""
-    M = 4000
-    f = lambda x, dt, u: [x[0] + dt * u[0], x[1] + dt * (u[0] - u[1])]  # noqa: E731
-    _, kept = simulate(make(f=f, h=[[1.0, 0.5]]), 10, M, jitter=0.5)
-    truth, _, mean, P = kept[-1]
-    error = mean - truth.state
-    nees = np.einsum("in,nij,jn->n", error, np.linalg.inv(np.moveaxis(P, 2, 0)), error)
-    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 2 * M)
-    assert low < nees.sum() < high
-
-
 LOADED = {
     "f": lambda x, dt, u: [x[0] - 0.1 * dt * u[0], x[1] * np.exp(-dt)],
     "h": lambda x, u: [x[0] + 0.1 * x[0] ** 2 - x[1] - 0.3 * u[0] * (1.0 + x[1]) + u[1]],
