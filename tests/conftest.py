@@ -18,6 +18,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 from models import random_actions, short_episodes
+from own_models import make_models
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
@@ -161,6 +162,15 @@ def short(env_id):
 def _random_actions():
     """Draw actions for a batch."""
     return random_actions
+
+
+@pytest.fixture
+def make(request):
+    """Make a state-space environment with a name of its own, forgotten afterwards.
+
+    Keywords that all of a file's environments have are its ``COMMON``.
+    """
+    yield from make_models(getattr(request.module, "COMMON", {}))
 
 
 @pytest.fixture

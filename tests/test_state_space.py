@@ -15,7 +15,7 @@ import pytest
 import scipy
 from contract import assert_equals_its_vector
 from models import load_module
-from own_models import forget, make_models, simulate
+from own_models import forget, simulate
 
 import filtergym
 from filtergym.baselines import catalogue as baselines
@@ -36,13 +36,7 @@ BLOCKS = re.findall(
 )
 F, H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
 Q, R = np.array([[0.25, 0.5], [0.5, 1.0]]), np.array([[1.0]])
-PLAIN = {"f": F, "h": H, "Q": Q, "R": R, "mean": [0, 1], "covariance": np.eye(2)}
-
-
-@pytest.fixture
-def make():
-    """Make an environment with a name of this test's own; forgotten afterwards."""
-    yield from make_models(PLAIN)
+COMMON = {"f": F, "h": H, "Q": Q, "R": R, "mean": [0, 1], "covariance": np.eye(2)}
 
 
 @pytest.fixture

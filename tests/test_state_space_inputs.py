@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import scipy
-from own_models import make_models, simulate
+from own_models import simulate
 
 import filtergym
 from filtergym import Input, read_recording
@@ -36,7 +36,7 @@ def noise_of(dt):
 
 NOISY = {"current": Input(1.0, 0.5, 3.0, noise=0.3), "load": Input(0.5, 0.2, 2.0)}
 N = np.diag([0.3**2, 0.0])
-CELL = {
+COMMON = {
     "f": discharge,
     "Q": noise_of,
     "h": lambda x: [x[0] + 0.1 * x[0] ** 2 - x[1]],
@@ -48,12 +48,6 @@ CELL = {
     "sampling_interval": 0.5,
 }
 FIXED = {"f": lambda x, u: discharge(x, 0.5, u), "Q": noise_of(0.5)}
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(CELL)
 
 
 def naive(mean, P, rows, N=N):
