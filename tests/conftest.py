@@ -18,6 +18,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 from models import random_actions, short_episodes
+from own_models import make_models
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
@@ -99,8 +100,9 @@ def _temporary_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("temporary", numbered=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", str(folder))
-        # Stable-Baselines3 makes a folder there for every model that learns without a logger, and leaves it.
-        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("stable-baselines3")))
+        # Stable-Baselines3 leaves a folder of every model that learns without a logger there, Torch its cache.
+        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR"):
+            patch.setenv(variable, str(tmp_path_factory.mktemp(variable)))
         patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
         yield
     left = sorted(path.name for path in folder.iterdir())
@@ -160,6 +162,15 @@ def short(env_id):
 def _random_actions():
     """Draw actions for a batch."""
     return random_actions
+
+
+@pytest.fixture
+def make(request):
+    """Make a state-space environment with a name of its own, forgotten afterwards.
+
+    Keywords that all of a file's environments have are its ``COMMON``.
+    """
+    yield from make_models(getattr(request.module, "COMMON", {}))
 
 
 @pytest.fixture

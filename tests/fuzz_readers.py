@@ -30,7 +30,6 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES, LONGEST = 20, 1024, 200_000
 ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
-NAVIGATION = "filtergym/LooselyCoupledNavigation-v0"
 MODEL = "fuzzed/Model-v0"
 TABLES = (".csv", ".json", ".json.gz", ".nc", ".parquet", ".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap")
 WHOLE = (

@@ -104,15 +104,6 @@ def test_likelihood_is_that_of_a_kalman_filter(tmp_path):
     assert found.count == seen.sum()
 
 
-def test_half_the_stated_deviation_is_twice_the_scale(tmp_path):
-    """Also of the start of the track, which is made of measurements."""
-    one, _ = likelihood_of(read(write_log(tmp_path)), "constant-velocity", noise=True)
-    other, _ = likelihood_of(read(write_log(tmp_path, stated=0.5)), "constant-velocity", noise=True)
-    assert other(np.array([[-0.5], [np.log10(2.0)]]))[0] == pytest.approx(
-        one(np.array([[-0.5], [0.0]]))[0], rel=1e-10
-    )
-
-
 @pytest.mark.parametrize("name", list(log_families()))
 def test_candidates_side_by_side_are_those_alone(tmp_path, name, monkeypatch):
     """In lanes, compiled, one by one, and with NumPy; 60 updates of an iterated filter round by 1e-9 at most."""

@@ -11,7 +11,7 @@ from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from filtergym.agents import to_sb3
 
@@ -82,15 +82,6 @@ def test_equals_dummy_vec_env_over_hundreds_of_episodes(control):
     assert compare(one, other, 14, draw) == 22
 
 
-def test_equals_under_normalisation():
-    one, other = (VecNormalize(env, gamma=0.95) for env in (native(8, horizon=5), dummy(8, horizon=5)))
-    one.seed(1)
-    other.seed(1)
-    np.testing.assert_array_equal(one.reset(), other.reset())
-    rng = np.random.default_rng(0)
-    assert compare(one, other, 25, lambda: rng.uniform(-1, 1, (8, 1)).astype(np.float32)) == 40
-
-
 def test_staggered_episodes_are_shorter_once():
     env = native(6, staggered=True, horizon=12)
     env.seed(3)
@@ -107,34 +98,11 @@ def test_staggered_episodes_are_shorter_once():
     assert most_at_once == 1
 
 
-def test_shortened_episode_is_the_beginning_of_the_whole_one():
-    whole = TaskVectorEnv(ID, 3, "gain", horizon=9, autoreset_mode="Disabled")
-    cut = TaskVectorEnv(ID, 3, "gain", horizon=9, autoreset_mode="Disabled")
-    whole.reset(seed=4)
-    cut.reset(seed=4, options={"shortened_by": np.array([0, 4, 0])})
-    for step in range(1, 6):
-        action = np.full((3, 1), 0.1 * step)
-        one, other = whole.step(action), cut.step(action)
-        np.testing.assert_array_equal(one[0], other[0])
-        np.testing.assert_array_equal(one[1], other[1])
-        assert not one[3].any()
-        np.testing.assert_array_equal(other[3], [False, step == 5, False])
-
-
 @pytest.mark.parametrize("wrong", [[0, 0], [0, 0, 9], [0, 0, -1], [0.0, 1.0, 2.0]])
 def test_shortened_by_is_checked(wrong):
     env = TaskVectorEnv(ID, 3, horizon=9)
     with pytest.raises(ValueError, match=r"'shortened_by'\] must hold 3 integers from 0 to 8"):
         env.reset(options={"shortened_by": np.array(wrong)})
-
-
-def test_seeds_are_used_once():
-    env = native(2)
-    env.seed(7)
-    first = env.reset()
-    assert (env.reset() != first).any()
-    env.seed(7)
-    np.testing.assert_array_equal(env.reset(), first)
 
 
 def test_snapshot_continues_to_the_bit():

@@ -4,7 +4,6 @@ import warnings
 
 import numpy as np
 import pytest
-from own_models import make_models
 
 import filtergym
 from filtergym import Sensor
@@ -34,11 +33,6 @@ def turning(unit="rad", h=None, f=None, **keywords):
         "sampling_interval": 0.1,
         **keywords,
     }
-
-
-@pytest.fixture
-def make():
-    yield from make_models({})
 
 
 def write(path, unit, truth, rows=400):

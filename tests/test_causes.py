@@ -18,8 +18,7 @@ from filtergym.evaluation.figures.worst_episodes import (
     select_worst,
 )
 from filtergym.evaluation.running.curves import BAND_RESAMPLES, cost_in_stretches, curves_of, stretches_of
-from filtergym.evaluation.running.parallel import Workers
-from filtergym.evaluation.running.summary import Evaluation, run_requests
+from filtergym.evaluation.running.summary import Evaluation
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.cause_split import (
     held_causes,
@@ -27,7 +26,6 @@ from filtergym.evaluation.statistics.cause_split import (
     phrases_of,
     reason_weight,
 )
-from filtergym.functions import requests_of
 from filtergym.names import find_competitors
 from filtergym.reports.tables.reasons import (
     explained_by_default,
@@ -128,18 +126,6 @@ def test_opponents():
     assert opponent_of("told", costs, ["a", "b", "c"]) == "b"
     assert opponent_of("a", {"a": 2.0, "told": 0.1}, ["a"]) == "told"
     assert opponent_of("a", {"a": 2.0}, ["a"]) == ""
-
-
-def test_a_summary_splits_what_a_whole_evaluation_does(records):
-
-    problem = problem_of(ENV)
-    requests = requests_of(problem, problem.experiment(None, EPISODES, 3), find_competitors(problem, NAMES))
-    with Workers(1, None) as workers:
-        found = run_requests(requests, workers)
-    split = [r for r in found.records if r.metric.startswith("cause_")]
-    assert split == [r for r in records if r.metric.startswith("cause_")]
-    assert "cost_minus_best" in found.curves
-    assert phrases_of(found.dataset)["missed"] == "where a scan misses the target"
 
 
 def test_every_environment_says_what_its_causes_are(env_id):

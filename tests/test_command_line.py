@@ -316,14 +316,6 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     assert "known-turn knows when every manoeuvre begins and ends, its accel" in result.stdout
 
 
-def test_a_flight_from_a_file(tmp_path, run):
-    rows = "\n".join(f"{t},{20000 + 100 * t},{5000 + t}" for t in range(0, 200, 4))
-    (tmp_path / "flight.csv").write_text(f"time,x,y\n{rows}\n")
-    result = run("evaluate", ENV, "--scenario", "flight.csv", "--policy", "imm", "--episodes", "5")
-    assert result.returncode == 0, result.stderr
-    assert "flight" in result.stdout
-
-
 def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     cells = [
         benchmark.Cell(problem_of(ENV), scenario, 4, ("imm", "known-turn"))

@@ -3,7 +3,6 @@
 import multiprocessing
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -11,10 +10,8 @@ import pytest
 from models import KINDS, make_model
 from rounding import assert_same, flown_side_by_side
 
-import filtergym
 from filtergym.envs.engine import compiled as compiled_tasks
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.interface.environment import TaskEnv
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
@@ -242,27 +239,3 @@ def test_a_report_that_cannot_be_traced_is_made_with_numpy():
     assert found["largest"][0] == found["cost"].max()
     with pytest.warns(UserWarning, match="is not compiled"):
         model.run(lambda model, episode: float(episode.max()), np.ones((2, 8)))
-
-
-def test_two_scenarios_share_their_code(tmp_path, monkeypatch):
-    """Numbers are told apart from code, so that other parameters need no other compilation."""
-    monkeypatch.setenv("FILTERGYM_COMPILER_CACHE", str(tmp_path))
-    counts = []
-    for sigma in (40.0, 41.5):
-        env = TaskEnv("filtergym/ManeuveringTarget-v0", "gain", backend="compiled", range_sigma=sigma)
-        env.reset(seed=0)
-        env.step(np.zeros(1))
-        counts.append(len(list(Path(tmp_path).iterdir())))
-    assert counts[0] == counts[1]
-
-
-def test_evaluation_says_the_same_on_both_backends():
-    keywords = {"episodes": 8, "horizon": 20}
-    one, other = (
-        filtergym.evaluate(
-            "ManeuveringTarget", ["imm", "semi-markov", "known-turn"], backend=backend, **keywords
-        )
-        for backend in ("compiled", "numpy")
-    )
-    for name in ("error", "nees", "cost", "nis"):
-        np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-9)

@@ -8,7 +8,6 @@ from scipy.stats import chi2
 from filtergym import evaluate, tidy_records
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
 from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
-from filtergym.filters import alpha_beta
 from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -57,21 +56,6 @@ def test_consistency_is_what_it_says(dataset, found):
     np.testing.assert_array_equal(np.isnan(nis), missed)
     assert found["kalman-imm", "anis"].value == pytest.approx(np.nanmean(nis) / 2, rel=1e-9)
     assert ("known-input-bound", "anees") not in found
-
-
-def test_what_an_acceleration_leaves():
-    T, alpha, a = 4.0, np.array([0.2, 0.9]), 3.0
-    beta, zero = alpha_beta.benedict_bordner_beta(alpha), np.zeros(2)
-    d = 0.5 * a * T**2
-    # A filter at rest at the origin, without noise, whose target has accelerated in this interval.
-    position, velocity = alpha_beta.update(zero, zero, np.full(2, d), alpha, beta, T)
-    error = np.array([d - position, a * T - velocity])
-    P = alpha_beta.left_by_acceleration(
-        alpha_beta.Covariance(zero, zero, zero), np.full(2, d**2), alpha, beta, T
-    )
-    np.testing.assert_allclose(P.position, error[0] ** 2, rtol=1e-14)
-    np.testing.assert_allclose(P.cross, error[0] * error[1], rtol=1e-14)
-    np.testing.assert_allclose(P.velocity, error[1] ** 2, rtol=1e-14)
 
 
 def test_medians_are_those_of_the_resamples():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy
-from own_models import make_models, simulate
+from own_models import simulate
 
 from filtergym import Input
 from filtergym.filters import discretisation
@@ -71,7 +71,7 @@ def test_held_noise_is_the_integral_to_its_order():
     assert np.linalg.eigvalsh(stiff).min() >= -1e-12 * np.abs(stiff).max()
 
 
-PENDULUM = {
+COMMON = {
     "drift": lambda x, u: [x[1], -9.81 * np.sin(x[0]) - 0.5 * x[1] + u[0]],
     "diffusion": [[0, 0], [0, 0.1]],
     "h": [[1, 0]],
@@ -82,12 +82,6 @@ PENDULUM = {
     "inputs": {"torque": Input(0.0, 1.0, 5.0, noise=0.3)},
     "integration_steps": 2,
 }
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(PENDULUM)
 
 
 def naive_step(x, dt, u):

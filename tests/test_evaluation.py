@@ -16,7 +16,6 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuned_values import save_tuned
 from filtergym.baselines.tuning import Candidate, Search, episode_costs, geometric_cost, tune
-from filtergym.evaluation.competitors.kinds import Policy
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.storage.dataset import windows_of
 
@@ -77,30 +76,6 @@ def test_score_is_zero_for_the_paper_and_one_for_the_reference(dataset):
     cost = np.log(dataset["cost"].mean("time")).mean("episode")
     adaptive, paper, bound = (float(cost.sel(policy=p)) for p in ("adaptive", "imm", "known-turn"))
     assert records["adaptive"].value == pytest.approx((paper - adaptive) / (paper - bound), rel=1e-9)
-
-
-def test_no_room_gives_no_score(dataset):
-    flat = dataset.copy(deep=True)
-    cost = flat["cost"].values
-    index = {name: i for i, name in enumerate(flat["policy"].values.tolist())}
-    shuffled = np.random.default_rng(0).permutation(cost[index["imm"]])
-    cost[index["known-turn"]] = shuffled
-    record = next(r for r in tidy_records(flat) if r.metric == "score" and r.policy == "adaptive")
-    assert record.value is None
-
-
-def test_a_class_of_ones_own_and_its_mistakes():
-    class Mine(Policy):
-        control = "gain"
-
-        def act(self, observation, state, start):
-            return np.zeros((len(observation), 1)), None
-
-    assert evaluate(ENV, {"mine": Mine, "imm": "imm"}, episodes=3).sizes["policy"] == 2
-    with pytest.raises(ValueError, match="'gain', not 'weights'"):
-        evaluate(ENV, {"mine": Mine}, episodes=3, control="weights")
-    with pytest.raises(ValueError, match="cannot load policy"):
-        evaluate(ENV, ["nowhere:Nothing"], episodes=3)
 
 
 def test_tuning_improves_on_fresh_episodes_and_is_repeatable():
@@ -178,11 +153,3 @@ def test_searches_that_end_together_lose_no_values(tmp_path):
     table = json.loads(path.read_text())
     assert set(table) == {*names}
     assert math.isfinite(table["policy-7"]["validation_cost"])
-
-
-def test_tracks_are_kept_of_as_many_episodes_as_are_drawn_in_whatever_pieces(monkeypatch):
-    keywords = {"episodes": 20, "drawn_episodes": 10, "horizon": 4}
-    whole = filtergym.evaluate("filtergym/ManeuveringTarget-v0", ["imm"], **keywords)
-    assert whole.sizes["drawn_episode"] == 10
-    monkeypatch.setattr("filtergym.evaluation.statistics.bootstrap.BLOCK", 8)
-    assert filtergym.evaluate("filtergym/ManeuveringTarget-v0", ["imm"], **keywords).identical(whole)

@@ -11,6 +11,7 @@ import filtergym
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.contract.filter import Likelihood
 from filtergym.evaluation.competitors.filters import find_fault, is_lacking, put_in_loop
+from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.rollout import rollout, start_lanes
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import packed_covariance
@@ -62,14 +63,16 @@ class InPython(Kalman):
     traceable = False
 
 
-def test_shipped_estimators_references_and_bounds_are_traced(env_id):
+def test_shipped_filters_are_traced(env_id):
     """All; of TightlyCoupledNavigation, where they take 300 MB together, every third."""
     known, usual = baselines_of(env_id), SHORT.get(env_id, {"horizon": 40})
     groups = {"estimator": known.estimators, "reference": known.references, "bound": known.bounds}
+    groups["smoother"] = known.smoothers
     for kind, group in groups.items():
         for name, maker in list(group.items())[:: 3 if env_id in SHORT else 1]:
             keywords = {**getattr(maker, "task_keywords", {}), **usual}
             fast = put_in_loop(make_model(env_id, **keywords, backend="compiled"), maker, kind, name, 8)
+            assert kind_of(maker) == kind
             assert not fast.filter.in_python, name
             assert fast.backend == "compiled", name
 

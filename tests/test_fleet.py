@@ -69,18 +69,6 @@ def test_shares_of_a_mixture():
     np.testing.assert_allclose(counts / 20_000, [0.2, 0.5, 0.3], atol=0.015)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_copies_in_the_middle_of_an_episode_go_on_identically(backend):
-    env = gymnasium.make_vec(ID, num_envs=10, scenario=MIXTURE, backend=backend, reward="relative", **SHORT)
-    env.reset(seed=3)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 10, 1))
-    continued(env, actions[:4])
-    others = [way(env) for way in WAYS]
-    expected = continued(env, actions[4:])
-    for other in others:
-        same(expected, continued(other, actions[4:]))
-
-
 @pytest.mark.parametrize("keywords", [{"scenario": MIXTURE}, {"observation": "asymmetric"}])
 def test_copies_of_single_environments_keep_what_a_reset_named(keywords):
     env = gymnasium.make(ID, **SHORT, **keywords)
@@ -92,21 +80,6 @@ def test_copies_of_single_environments_keep_what_a_reset_named(keywords):
     for other in others:
         np.testing.assert_equal([*(other.step(action) for _ in range(3)), other.reset()], expected)
         assert other.unwrapped.task.parameters.range_sigma == 44.0
-
-
-def test_restored_lanes_go_on_as_they_did():
-    env = gymnasium.make_vec(ID, num_envs=10, scenario=MIXTURE, horizon=300, control="gain").unwrapped
-    env.reset(seed=3)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (90, 10, 1))
-    continued(env, actions[:4])
-    snapshot = env.fleet.snapshot()
-    runs = []
-    for _ in range(2):
-        env.fleet.restore(snapshot)
-        paid = [env.step(a)[1] for a in actions]
-        env.fleet.restart([1, 4])
-        runs.append([*paid, env.fleet.observe()])
-    same(*runs)
 
 
 def test_restored_lanes_draw_what_a_reset_names_from_the_generators_of_their_episodes():
@@ -121,16 +94,6 @@ def test_restored_lanes_draw_what_a_reset_names_from_the_generators_of_their_epi
         shown = np.array(env.fleet.observe())
         runs.append([shown, env.reset(options={"parameters": {"range_sigma": 44.0}})[0]])
     same(*runs)
-
-
-def test_torch_flies_the_same_mixture(torch):
-    runs = []
-    for backend in ("numpy", "torch"):
-        env = gymnasium.make_vec(ID, num_envs=9, scenario=MIXTURE, backend=backend, **SHORT)
-        env.reset(seed=0)
-        runs.append(continued(env, np.full((10, 9, 1), 0.2)))
-    for a, b in zip(*runs, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
 def test_gradients_flow_through_a_mixture(torch):

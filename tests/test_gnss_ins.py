@@ -331,12 +331,3 @@ def test_robust_update_is_the_minimum_of_hubers_cost(seed):
         assert abs((result.covariance[at] - C) / numpy.outer(sigma, sigma)).max() < 1e-8
         assert result.log_likelihood[at] == pytest.approx(log_likelihood, rel=1e-8)
     assert 5 < beyond < 50
-
-
-def test_robust_update_without_thresholds_is_the_plain_one():
-    state, P, residual, rows = random_update(0)
-    arguments = (state, P, residual, rows, SENSOR_SIGMA**2, numpy.ones(14))
-    plain = extended_kalman.update_one_by_one(*arguments)
-    robust = extended_kalman.update_one_by_one(*arguments, [math.inf] * 14)
-    for one, other in zip(plain[:3], robust[:3], strict=True):
-        assert (one == other).all()

@@ -8,8 +8,8 @@ import pytest
 from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
 
 from filtergym import evaluate, read_recording
-from filtergym.envs.logs import strapdown
 from filtergym.envs.data.recording import Recording
+from filtergym.envs.logs import strapdown
 from filtergym.envs.loosely_coupled_navigation.inertial import (
     ACCELERATIONS,
     RATES,

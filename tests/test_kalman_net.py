@@ -27,7 +27,6 @@ SATELLITES = "filtergym/TightlyCoupledNavigation-v0"
 SHORT = {SATELLITES: {"horizon": 60, "backend": "numpy"}}
 """Of what takes long to compile."""
 TRAINED = [(id, name) for id, cls in catalogue().items() for name in trained_banks(cls)]
-HAVING = [id for id, cls in catalogue().items() if NAME in trained_banks(cls)]
 
 
 def network(model, answer=0.0):
@@ -74,15 +73,6 @@ def test_of_an_ins_zero_answers_are_the_augmented_filter():
         np.testing.assert_allclose(net, augmented, rtol=0.0, atol=1e-11)
 
 
-def test_of_an_aircraft_zero_answers_are_the_papers_filter():
-    """In a closed loop: what the autopilot is told is the same, too."""
-    competitors = {"kalman": "kalman", "net": EstimatorMaker(NAME, network)}
-    dataset = filtergym.evaluate(AIRCRAFT, competitors, episodes=4, horizon=150)
-    for name in ("error", "nees", "control_signal"):
-        paper, net = dataset[name].values
-        np.testing.assert_allclose(net, paper, rtol=0.0, atol=1e-10)
-
-
 @pytest.mark.parametrize("plant", ["U", "P"])
 def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
@@ -120,17 +110,6 @@ def test_of_an_aircraft_any_answer_is_what_the_description_says(plant):
             np.testing.assert_allclose(bank.covariance(state)[:, :, i], joseph, rtol=1e-9, atol=1e-9)
             of_gain = packed_covariance.unpack(state.gain_covariance[:, i], len(F))
             np.testing.assert_allclose(of_gain, rest @ M, rtol=1e-9, atol=1e-9)
-
-
-def test_of_radar_and_esm_zero_answers_are_the_papers_algorithm():
-    stay = np.eye(3) * (1.0 - 1.5 * 0.02) + 0.5 * 0.02
-    competitors = {"paper": "quasi-optimal", "net": EstimatorMaker(NAME, network)}
-    keywords = {"class_transition": tuple(map(tuple, stay.tolist()))}
-    dataset = filtergym.evaluate(ESM, competitors, "class-change", episodes=16, **keywords)
-    # Metres and m^2; the paper's bank has tables of gains, this one computes them.
-    for name in ("error", "nees"):
-        paper, net = dataset[name].values
-        np.testing.assert_allclose(net, paper, rtol=1e-7, atol=1e-7)
 
 
 def test_of_radar_and_esm_any_answer_is_what_the_description_says():

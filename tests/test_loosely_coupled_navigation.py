@@ -206,26 +206,6 @@ def test_scaled_noises_are_those_of_a_textbook_filter():
             np.testing.assert_allclose(model.covariance(state)[..., lane], P[0, 0] * np.eye(2), rtol=1e-9)
 
 
-def test_no_change_of_the_noises_is_the_paper_s_augmented_filter():
-    lanes, steps = 6, 300
-    model, schemes = make("random", "noise"), make("random", "mode")
-    drawn = numbers(model, lanes, steps, 4)
-    for (seen, state), (also_seen, scheme) in zip(
-        states(model, drawn, constant(model, 0.0, lanes)),
-        states(schemes, drawn, constant(schemes, 2, lanes)),
-        strict=True,
-    ):
-        # The displacement's variance is taken apart and put together again: one rounding.
-        for found, expected in (
-            (model.mean(state), schemes.mean(scheme)),
-            (model.covariance(state), schemes.covariance(scheme)),
-            (seen.filter.seen.normalised, also_seen.filter.seen.normalised[2]),
-            (state.filter.drift, scheme.filter.drift),
-            (state.filter.coloured, scheme.filter.coloured),
-        ):
-            np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-13)
-
-
 def test_actions_and_gains_are_inverse():
     model = make("paper")
     bank = model.filter

@@ -373,25 +373,6 @@ def test_gain_action_sets_alpha():
         assert info["alpha"] == pytest.approx(alpha, rel=1e-12)
 
 
-def test_one_filter_says_how_likely_each_measurement_was():
-    model = make_model(ID, "gain", "random", **REGULAR)
-    rng = np.random.default_rng(1)
-    state = begin(model, rng, 8)
-    for _ in range(3):
-        state = model.measure(state, rng.normal(size=(2, 8)))
-        innovation = state.measurement.position - state.filter.predicted
-        S, said = state.filter.innovation_variance, model.records(state)["log_likelihood"]
-        for b in range(8):
-            expected = multivariate_normal.logpdf(innovation[:, b], cov=np.diag(S[:, b]))
-            assert said[b] == pytest.approx(expected, rel=1e-10)
-        state = model.act(state, np.zeros((1, 8)))
-
-
-def test_one_filter_is_no_bank():
-    with pytest.raises(ValueError, match="gains must name at least two filters"):
-        make_model(ID, gains=(0.3,), transition=((1.0,),), initial_probabilities=(1.0,))
-
-
 def test_cost_is_the_squared_distance_in_deviations_of_the_range():
     env = gym.make(ID, control="gain", scenario="paper", detailed_info=True)
     env.reset(seed=0)
@@ -409,15 +390,6 @@ def test_log_likelihood_reward_is_that_of_the_truth():
         _, reward, _, _, info = env.step(np.array([0.5, 0.5]))
         expected = multivariate_normal.logpdf(info["error"], cov=model.covariance(after)[..., 0])
         assert reward == pytest.approx(expected, rel=1e-9)
-
-
-def test_restarted_lane_is_not_rounded_to_the_precision_of_the_actions():
-    keywords = {"control": "weights", "initial_probabilities": (0.3, 0.7), "horizon": 5}
-    env, single = gym.make_vec(ID, num_envs=2, **keywords), gym.make(ID, **keywords)
-    env.reset(seed=0)
-    env.step(np.full((2, 2), 0.5, dtype=np.float32))
-    shown, _ = env.reset(seed=5, options={"reset_mask": np.array([True, False])})
-    np.testing.assert_array_equal(shown[0], single.reset(seed=5)[0])
 
 
 # --- a user's trajectory

@@ -250,9 +250,6 @@ def test_training_and_tuning_refuse_recordings(recordings):
         tune(problem_of(TARGET), "imm", Search(1000, recordings[TARGET]))
 
 
-# --- estimates
-
-
 # --- closed loops
 
 
@@ -415,19 +412,6 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     again = read_log(Columns("track", pandas.DataFrame({"time": full, "x": told, "y": told + 1.0}), given))
     for name, values in said.items():
         np.testing.assert_array_equal(values, again.measurements[name])
-
-
-@pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
-def test_missed_and_irregular_scans_are_replayed_bit_for_bit(scenario, tmp_path):
-    made = record(TARGET, scenario, episodes=3, horizon=30)
-    made.write(tmp_path / "made.nc")
-    simulated = evaluate(TARGET, ["imm"], scenario, 3, horizon=30)
-    replayed = evaluate(TARGET, ["imm"], read_recording(tmp_path / "made.nc"))
-    np.testing.assert_array_equal(simulated["error"].values, replayed["error"].values)
-    interval = made.measurements["interval"]
-    np.testing.assert_allclose(made.seconds, np.cumsum(interval, axis=1))
-    assert (np.ptp(interval) > 1.0) == (scenario == "irregular-scans")
-    assert (made.measurements["available"] == 0.0).any() == (scenario == "missed-detections")
 
 
 def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import gymnasium
 import numpy as np
 import pytest
+from own_models import forget
 
 import filtergym
 from filtergym.baselines import catalogue as baselines
@@ -66,12 +67,6 @@ def turns():
 
     yield Turns
     forget(Turns.id)
-
-
-def forget(id):
-    registration.USER_TASKS.pop(id, None)
-    baselines.USER_BASELINES.pop(id, None)
-    gymnasium.registry.pop(id, None)
 
 
 def test_gymnasium_makes_and_renders_it(package):

@@ -72,16 +72,6 @@ def test_reused_figure_shows_what_a_new_one_shows():
     numpy.testing.assert_array_equal(reused.render(), drawn_once.render())
 
 
-def test_rendering_leaves_the_episode_alone():
-    plain, drawn = TaskEnv(ID, "gain"), TaskEnv(ID, "gain", render_mode="rgb_array")
-    numpy.testing.assert_array_equal(plain.reset(seed=5)[0], drawn.reset(seed=5)[0])
-    for alpha in numpy.linspace(-1.0, 1.0, 5):
-        drawn.render()
-        one, other = plain.step(numpy.array([alpha])), drawn.step(numpy.array([alpha]))
-        numpy.testing.assert_array_equal(one[0], other[0])
-        assert one[1:4] == other[1:4]
-
-
 def test_axes_stay_where_they_are_and_hold_the_track():
     env = played(0, scenario="paper")
     env.render()

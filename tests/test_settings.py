@@ -26,7 +26,6 @@ from filtergym.agents.sb3_training import train_sb3, training_environment
 from filtergym.agents.settings import merge_settings, parse_settings, read_config
 from filtergym.agents.training_run import RunOptions, load_run, new_run, open_run, read_hyperparameters
 from filtergym.agents.training_session import Session
-from filtergym.agents.validation import TrainingEpisodes
 
 ID = "filtergym/ManeuveringTarget-v0"
 SMALL = {
@@ -309,18 +308,6 @@ def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
     run = new_run(problem_of(ID), RunOptions("bptt", "gain", 400, 4, scenario="random:1,cruise:1"))
     with pytest.raises(ValueError, match="episodes of one length, not from random:"):
         train_bptt(run, Session(tmp_path))
-
-
-def test_costs_of_a_mixture_are_weighted():
-    run = new_run(problem_of(ID), RunOptions("ppo"))
-    paper = problem_of(ID).competitor("imm")
-    run.scenario = "random:0.25,paper:0.75"
-    mixed = TrainingEpisodes(run, 4).costs(paper)
-    parts = []
-    for name in ("random", "paper"):
-        run.scenario = name
-        parts.append(TrainingEpisodes(run, 4).costs(paper))
-    np.testing.assert_allclose(mixed, 0.25 * parts[0] + 0.75 * parts[1])
 
 
 def test_options_of_a_reset_reach_the_environments_of_an_adapter():

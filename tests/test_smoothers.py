@@ -4,10 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from models import make_model
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import (
     KalmanInteractingMultipleModel,
     KalmanTurnInteractingMultipleModel,
@@ -20,7 +18,6 @@ from filtergym.baselines.maneuvering_target.smoothers import (
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Variant
 from filtergym.commands.evaluation import find_participants
-from filtergym.evaluation.competitors.filters import put_in_loop
 from filtergym.evaluation.competitors.kinds import kind_of
 from filtergym.evaluation.running.curves import curves_of
 from filtergym.evaluation.running.summary import Evaluation
@@ -37,7 +34,6 @@ from filtergym.reports.tables.results import Settings
 from filtergym.reports.tables.terminal_tables import rank_competitors, results_tables
 
 TARGET = "filtergym/ManeuveringTarget-v0"
-SMOOTHERS = baselines_of(TARGET).smoothers
 
 
 @pytest.mark.parametrize(
@@ -123,15 +119,6 @@ def test_smoothers_are_marked_and_never_ranked():
     assert "imm-smoother" not in " ".join([*outcome_sentences([found]), *remarks([found])])
     page = report_html([found], Settings("filtergym benchmark", {}))
     assert "Not causal, with later measurements: <code>imm-smoother</code>." in page
-
-
-def test_shipped_smoothers_run_forward_compiled():
-    model = make_model(TARGET, horizon=40, backend="compiled")
-    for name, maker in SMOOTHERS.items():
-        looped = put_in_loop(model, maker, "smoother", name, 8)
-        assert looped.backend == "compiled"
-        assert not looped.filter.in_python
-        assert kind_of(maker) == "smoother"
 
 
 def test_a_closed_loop_refuses_smoothers():

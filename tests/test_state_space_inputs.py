@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import scipy
-from own_models import make_models, simulate
+from own_models import simulate
 
 import filtergym
 from filtergym import Input, read_recording
@@ -38,7 +38,7 @@ def noise_of(dt):
 
 NOISY = {"current": Input(1.0, 0.5, 3.0, noise=0.3), "load": Input(0.5, 0.2, 2.0)}
 N = np.diag([0.3**2, 0.0])
-CELL = {
+COMMON = {
     "f": discharge,
     "Q": noise_of,
     "h": lambda x: [x[0] + 0.1 * x[0] ** 2 - x[1]],
@@ -50,12 +50,6 @@ CELL = {
     "sampling_interval": 0.5,
 }
 FIXED = {"f": lambda x, u: discharge(x, 0.5, u), "Q": noise_of(0.5)}
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(CELL)
 
 
 def naive(mean, P, rows, N=N):
@@ -106,18 +100,6 @@ def test_inputs_have_the_distribution_that_is_declared(make):
         assert abs(np.mean(course * before) - kept_share) < 4.0 * np.sqrt(2.0 / 4000)
         told = last[1].inputs[j] - last[0].inputs[j]
         np.testing.assert_allclose(told.std(), one.noise, rtol=0.05, atol=1e-15)
-
-
-def test_errors_are_as_large_as_the_covariance_says(make):
-    """The sum of normalised squared errors of M episodes is chi-square with 2 M degrees of freedom."""
-    M = 4000
-    f = lambda x, dt, u: [x[0] + dt * u[0], x[1] + dt * (u[0] - u[1])]  # noqa: E731
-    _, kept = simulate(make(f=f, h=[[1.0, 0.5]]), 10, M, jitter=0.5)
-    truth, _, mean, P = kept[-1]
-    error = mean - truth.state
-    nees = np.einsum("in,nij,jn->n", error, np.linalg.inv(np.moveaxis(P, 2, 0)), error)
-    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 2 * M)
-    assert low < nees.sum() < high
 
 
 LOADED = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy
-from own_models import make_models, simulate
+from own_models import simulate
 
 import filtergym
 from filtergym import Sensor
@@ -13,7 +13,7 @@ from filtergym.envs.engine.backend import make_model
 
 Q = np.diag([0.1, 0.2])
 R = {"gps": 4.0, "odometry": 0.25}
-CAR = {
+COMMON = {
     "f": lambda x, dt: [x[0] + dt * x[1], 0.9 * x[1]],
     "Q": lambda dt: dt * Q,
     "sensors": {"gps": Sensor([[1, 0]], R["gps"], interval=1.0), "odometry": Sensor([[0, 1]], R["odometry"])},
@@ -22,12 +22,6 @@ CAR = {
     "sampling_interval": 0.5,
 }
 LATE = {"late": 0.4, "lateness": 3}
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(CAR)
 
 
 def naive(x, P, rows):

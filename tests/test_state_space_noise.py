@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from own_models import make_models, simulate
+from own_models import simulate
 
 import filtergym
 from filtergym import Input, Sensor, read_recording
@@ -33,14 +33,7 @@ NOISES = {
     "interval": ([0.0, 1.0], lambda dt, u: [[u[0] ** 2 / dt]], lambda x, dt, u: u[0] ** 2 / dt),
 }
 """What R of the sensor is called with, and the same of state, interval and inputs."""
-
-
-@pytest.fixture
-def make():
-    """Make an environment of keywords; forgotten afterwards."""
-    yield from make_models(
-        {"mean": MEAN, "covariance": COVARIANCE, "inputs": INPUTS, "units": ["m", "m/s"], **TIMED}
-    )
+COMMON = {"mean": MEAN, "covariance": COVARIANCE, "inputs": INPUTS, "units": ["m", "m/s"], **TIMED}
 
 
 def sensors(R):

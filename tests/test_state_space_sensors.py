@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from own_models import make_models, simulate
+from own_models import simulate
 
 import filtergym
 from filtergym import Sensor, read_recording
@@ -28,7 +28,7 @@ SENSORS = {
     "odometry": Sensor(lambda x: [x[0] * x[1]], 0.5, interval=0.2, availability=0.8),
     "compass": Sensor([[0, 0, 1]], 0.25, wraps="rad"),
 }
-CAR = {
+COMMON = {
     "f": lambda x, dt: [x[0] + dt * x[1], 0.9 * x[1], x[2] + 2.0 * dt],
     "Q": lambda dt: dt * Q,
     "sensors": SENSORS,
@@ -38,12 +38,6 @@ CAR = {
 R = np.zeros((4, 4))
 R[:2, :2], R[2, 2], R[3, 3] = [[4.0, 1.0], [1.0, 9.0]], 0.5, 0.25
 FIXED = {"f": lambda x: [x[0] + 0.2 * x[1], 0.9 * x[1], x[2] + 0.4], "Q": 0.2 * Q}
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(CAR)
 
 
 def wrapped(angle):
@@ -179,7 +173,7 @@ def test_a_loop_of_ones_own_names_the_sensors(make):
     id = make().id
     filter, late = filtergym.online(id, "extended"), filtergym.online(id, "extended", lag=4)
     for each in (filter, late):
-        each.start(mean=CAR["mean"], covariance=CAR["covariance"])
+        each.start(mean=COMMON["mean"], covariance=COMMON["covariance"])
     filter.update(1.0, gps=[3.1, 2.0], compass=3.0)
     filter.update(1.25, odometry=5.0, compass=-2.75)
     found = filter.update(2.25, gps_x=4.5, gps_y=1.0, odometry=3.0)
@@ -188,7 +182,9 @@ def test_a_loop_of_ones_own_names_the_sensors(make):
     late.update(1.25, odometry=5.0, compass=-2.75)
     late.update(2.25, gps=[4.5, 1.0])
     again = late.update(1.0, gps=[3.1, 2.0])
-    mean, P, closed = naive(np.array(CAR["mean"]), CAR["covariance"], [(dt, np.array(z)) for dt, z in ROWS])
+    mean, P, closed = naive(
+        np.array(COMMON["mean"]), COMMON["covariance"], [(dt, np.array(z)) for dt, z in ROWS]
+    )
     assert not closed
     np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
     np.testing.assert_allclose(found.covariance, P, rtol=1e-12, atol=1e-15)
@@ -205,7 +201,7 @@ def test_two_sensors_of_one_time_are_taken_in_in_order(make):
     id = make(sensors=sensors, f=lambda x, dt: [x[0] + dt * x[1], x[1], x[2]]).id
     both, one = filtergym.online(id, "kalman"), filtergym.online(id, "kalman")
     for each in (both, one):
-        each.start(mean=CAR["mean"], covariance=CAR["covariance"])
+        each.start(mean=COMMON["mean"], covariance=COMMON["covariance"])
     expected = both.update(1.0, gps=[3.0, 2.0], odometry=5.5)
     one.update(1.0, gps=[3.0, 2.0])
     found = one.update(1.0, odometry=5.5)
@@ -220,11 +216,11 @@ def test_a_table_has_columns_named_after_the_sensors(make, tmp_path):
     recording = read_recording(tmp_path / "log.csv", cls.id, sampling_interval=1.0)
     run = filtergym.evaluate(cls.id, ["extended"], scenario=recording, tracks=True)
     rows = [(dt, np.array(z)) for dt, z in ROWS]
-    mean, _, _ = naive(np.array(CAR["mean"]), CAR["covariance"], rows)
+    mean, _, _ = naive(np.array(COMMON["mean"]), COMMON["covariance"], rows)
     last = run.isel(policy=0, episode=0, time=-1)
     np.testing.assert_allclose(last["estimate"].values.ravel(), mean, rtol=1e-12)
     found = with_innovations(run, make_task(cls, recording))["prediction_error"]
-    before, _, _ = naive(np.array(CAR["mean"]), CAR["covariance"], rows[:1])
+    before, _, _ = naive(np.array(COMMON["mean"]), COMMON["covariance"], rows[:1])
     np.testing.assert_allclose(found.values[0, 0, 1, 3], wrapped(-2.75 - before[2] - 0.5), rtol=1e-10)
     assert found.measured.values.tolist() == ["gps_x", "gps_y", "odometry", "compass"]
     assert found.measured_unit.values.tolist() == ["1", "1", "1", "rad"]

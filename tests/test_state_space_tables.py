@@ -3,18 +3,16 @@
 import shutil
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pandas
 import pytest
+from own_models import forget
 
 import filtergym
 from filtergym import read_recording, record
-from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.companions import find_companion
 from filtergym.envs.contract.log_format import LogFormat
-from filtergym.envs.engine import registration
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.statistics.innovations import with_innovations
@@ -43,8 +41,7 @@ ID = "mine/Table-v0"
 def make():
     """Make the environment; forgotten afterwards."""
     yield lambda **keywords: filtergym.state_space(ID, **{**TIMED, **BOTH, **keywords})
-    for table in (registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
-        table.pop(ID, None)
+    forget(ID)
 
 
 def written(path, text):

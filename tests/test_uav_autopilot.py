@@ -4,7 +4,6 @@ from typing import Any
 import numpy
 import pytest
 
-from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.model import Episode, Model
 from filtergym.envs.contract.task import Scenario
 from filtergym.envs.uav_autopilot.banks import MODES
@@ -256,14 +255,6 @@ def test_step_of_the_command(plant: str, overshoot: float, rise: float, settling
 
 
 # ---------------------------------------------------------------- the contract
-
-
-def test_action_beyond_the_box_is_the_action_at_its_edge() -> None:
-    model = make("U")
-    state = begin(model, Noise(model, 8, 0, 1))
-    beyond, edge = model.act(state, numpy.full((1, 8), 9.0)), model.act(state, numpy.ones((1, 8)))
-    for array, limit in zip(leaves(beyond), leaves(edge), strict=True):
-        numpy.testing.assert_array_equal(array, limit)
 
 
 @BOTH

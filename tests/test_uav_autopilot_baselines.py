@@ -23,7 +23,7 @@ from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
 from filtergym.evaluation.statistics.statistic import reduce_run
-from filtergym.filters import linear_systems, packed_covariance
+from filtergym.filters import linear_systems
 from filtergym.papers import uav_autopilot_kalman as paper
 from filtergym.papers.uav_autopilot_kalman import experiment
 
@@ -86,35 +86,6 @@ def test_records_hold_the_theory_in_the_steady_window_alone() -> None:
 
 
 # ---------------------------------------------------------------- references and the bound
-
-
-def innovations_of_matched(plant: str, scenario: str, episodes: int) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """NIS per available reading, and the innovation over its sigma of the output's sensor, ``(episodes, time)``."""
-    model: Any = make_model(ID, "gain", scenario, plant=plant)
-    shown = model.task.measured.index(model.task.output)
-    nis: list[numpy.ndarray] = []
-    innovation: list[numpy.ndarray] = []
-
-    class Watched(Matched):
-        def update(self, memory: Any, measurement: Any, truth: Any) -> Any:
-            mean, covariance = self.predict(measurement, truth, memory)
-            R, there = self.sensor_variances(truth), measurement.available
-            update = self.update_covariance(mean, covariance, measurement, truth)
-            count = there.sum(axis=0)
-            before = nis[-1] if nis else numpy.ones_like(count)
-            nis.append(numpy.where(count > 0.0, update.squared_distance / numpy.maximum(count, 1.0), before))
-            read = list(self.rows[shown])
-            S = (
-                packed_covariance.unpack(covariance, len(mean))[numpy.ix_(read, read)].sum(axis=(0, 1))
-                + R[shown]
-            )
-            error = measurement.reading[shown] - mean[read].sum(axis=0)
-            innovation.append(there[shown] * error / numpy.sqrt(S))
-            return super().update(memory, measurement, truth)
-
-    for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, episodes)):
-        pass
-    return numpy.stack(nis, axis=-1)[:episodes], numpy.stack(innovation, axis=-1)[:episodes]
 
 
 def test_matched_is_a_kalman_filter_of_all_that_befalls_an_episode() -> None:
@@ -180,19 +151,6 @@ def test_bound_is_the_covariance_of_the_nominal_filter_when_the_noise_is_nominal
 
 
 @BOTH
-def test_matched_is_the_paper_filter_where_the_noise_is_nominal(plant: str) -> None:
-    dataset = run(plant, "paper-noise", 2, SAME)
-    # One filter written twice, 600 measurements of a stable loop.
-    for name in ("error", "cost"):
-        one, two = (dataset[name].sel(policy=p).values for p in ("kalman", "matched"))
-        numpy.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
-    nis, innovation = innovations_of_matched(plant, "paper-noise", 2)
-    told = dataset.sel(policy="kalman")
-    numpy.testing.assert_allclose(told["nis"] / told["nis_degrees"], nis, rtol=0, atol=1e-9)
-    numpy.testing.assert_allclose(told["innovation"], innovation, rtol=0, atol=1e-9)
-
-
-@BOTH
 def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
     dataset = run(plant, "paper-noise", 2, SAME)
     error = dataset["error"].sel(policy=["kalman", "steady-kalman"])
@@ -202,9 +160,6 @@ def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
     # Both forget their start with the filter's slowest pole.
     assert gap[599] < 10.0 * gap[99] * slowest**500 + 1e-9
     assert gap[0] > 0.1
-
-
-# ---------------------------------------------------------------- no leak
 
 
 # ---------------------------------------------------------------- policies

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from own_models import make_models
 
 import filtergym
 from filtergym import Sensor
@@ -58,11 +57,6 @@ def test_moments_of_linear_and_quadratic_functions_are_exact(spread):
     squares, _ = transform(mean, covariance, lambda x: x * x, spread)
     variances = np.stack([covariance[i, i] for i in range(5)])
     np.testing.assert_allclose(squares, mean**2 + variances, rtol=1e3 * tolerance)
-
-
-@pytest.fixture
-def make():
-    yield from make_models({})
 
 
 @pytest.fixture

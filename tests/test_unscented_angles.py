@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from own_models import make_models
 
 import filtergym
 from filtergym import Sensor
@@ -10,12 +9,6 @@ from filtergym import Sensor
 NOISE = 0.2
 COMMON = {"mean": [0.5, 0.0], "covariance": np.eye(2)}
 VARIANCES = [1e-4, 1e-2, 1.0, 10.0, 100.0]
-
-
-@pytest.fixture
-def make():
-    """Make an environment; forgotten afterwards."""
-    yield from make_models(COMMON)
 
 
 def model(make, n, sensors, mean):

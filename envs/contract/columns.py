@@ -24,12 +24,15 @@ class Readings(Protocol):
 
     def has(self, *names: str) -> bool:
         """Whether all of these are given."""
+        ...
 
     def __getitem__(self, name: str) -> numpy.ndarray:
         """Numbers of a column, ``(n,)``; NaN where one did not come."""
+        ...
 
     def place(self, number: int) -> str:
         """Where a number stands, such as "row 12"."""
+        ...
 
 
 def optional(readings: Readings, name: str, count: int) -> numpy.ndarray:

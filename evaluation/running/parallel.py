@@ -88,9 +88,8 @@ def _end_with(parent: int) -> None:
 
 def _run_piece(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
     """Do a piece of work, in a process that may know nothing yet."""
-    if os.getcwd() != place.folder:
-        with suppress(OSError):  # another machine may not have it
-            os.chdir(place.folder)
+    with suppress(OSError):  # another machine may not have it
+        os.chdir(place.folder)
     if place.safe_path is None:  # programs that compete are the user's
         os.environ.pop("PYTHONSAFEPATH", None)
     # Engines search the working directory, too, where a file is no library, unless this command does.
