@@ -18,7 +18,7 @@ from ..envs.contract.task import Task
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import parameter_names
 from ..envs.engine.scenario_choice import find_mixture, make_task
-from ..evaluation.competitors.kinds import Policy, make_competitor
+from ..evaluation.competitors.kinds import Kind, Policy, make_competitor
 from ..evaluation.competitors.stepping import SteppingPolicy
 from ..evaluation.running.rollout import start_lanes
 from ..evaluation.running.seeds import episode_seeds
@@ -228,3 +228,17 @@ def _observations(
         action, memory = policy.predict(shown, memory)
         lanes.decide(action)
     return numpy.concatenate(found)
+
+
+def watch_live(model: Model, maker: Any, kind: Kind) -> tuple[Any, WatchedPolicy] | None:
+    """Return an agent that runs live, and what compares its observations with those of its training; None of others."""
+    seen = training_range(type(model.task), maker)
+    if seen is None:
+        return None
+    if kind == "estimator":
+        estimator = maker(model.task)
+        watch = WatchedPolicy(estimator.network, seen)
+        estimator.decider.ask = watch.act
+        return estimator, watch
+    watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), seen)
+    return watch, watch

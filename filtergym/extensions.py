@@ -22,6 +22,9 @@ PREFIXES: Mapping[str, str] = {
 other competitors of it, that returns a :class:`.evaluation.competitors.kinds.Competitor`."""
 SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_policies:LEARNED")
 """Each a :class:`.evaluation.competitors.kinds.Source`, of competitors in files and folders."""
+WATCHES: Sequence[str] = ("agents.envelope:watch_live",)
+"""Functions of a model, of the maker of a competitor and of its kind, which return what runs live in its place and what
+watches it (:class:`.evaluation.competitors.online_state.Watch`), or None."""
 MODEL_COMPANIONS: Sequence[str] = ("envs.logs.own_models:state_space_log_format",)
 """Functions of the definition of a model of one's own and of its defaults, each of which returns a companion of its
 task."""
@@ -29,14 +32,14 @@ READERS: Sequence[str] = ("envs.logs.reading:RECORDINGS", "envs.logs.reading:FLI
 """Each a :class:`.envs.data.scenario_data.Reader`, in the order in which they are tried."""
 
 
-def load(place: str) -> Any:
-    """Import what stands at ``module:name`` of this package.
+def load(place: str, package: str = PACKAGE) -> Any:
+    """Import what stands at ``module:name`` of a package.
 
     Raises:
         ValueError: if this installation does not hold the module.
     """
     module, _, name = place.partition(":")
-    path = f"{PACKAGE}.{module}"
+    path = f"{package}.{module}"
     try:
         return getattr(importlib.import_module(path), name)
     except ModuleNotFoundError as error:
@@ -45,9 +48,16 @@ def load(place: str) -> Any:
         raise ValueError(f"this installation of filtergym holds no {module}") from None
 
 
-def load_present(places: Iterable[str]) -> Iterator[Any]:
-    """Import what stands at several places, without those whose module this installation does not hold."""
+def load_present(places: Iterable[str], package: str = PACKAGE) -> Iterator[Any]:
+    """Import what stands at several places of a package, without those whose module this installation does not hold."""
     for place in places:
-        module = f"{PACKAGE}.{place.partition(':')[0]}"
-        if module in sys.modules or find_spec(module) is not None:
-            yield load(place)
+        module = f"{package}.{place.partition(':')[0]}"
+        if module in sys.modules or _is_there(module):
+            yield load(place, package)
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # nor the package that it would stand in
+        return False

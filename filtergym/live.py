@@ -5,16 +5,15 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from .agents.envelope import WatchedPolicy, training_range
 from .baselines.problem import import_problem
 from .envs.contract.parameters import Limits, check
 from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
-from .evaluation.competitors.kinds import Competitor, kind_of, make_competitor
+from .evaluation.competitors.kinds import Competitor, kind_of
 from .evaluation.competitors.online import OnlineFilter
-from .evaluation.competitors.stepping import SteppingPolicy
 from .evaluation.running.evaluate import control_of
+from .extensions import WATCHES, load_present
 from .names import adopt, find_competitor
 
 
@@ -81,13 +80,8 @@ def online(
     )
     own = control_of(maker, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
-    range = training_range(problem.task, maker)
-    if range is None:
-        return OnlineFilter(model, maker, name, tracks, lag=lag)
-    if kind == "estimator":
-        estimator = maker(model.task)
-        watch = WatchedPolicy(estimator.network, range)
-        estimator.decider.ask = watch.act
-        return OnlineFilter(model, estimator, name, tracks, watch, lag)
-    watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), range)
-    return OnlineFilter(model, watch, name, tracks, watch, lag)
+    for watch_of in load_present(WATCHES):
+        watched = watch_of(model, maker, kind)
+        if watched is not None:
+            return OnlineFilter(model, watched[0], name, tracks, watched[1], lag)
+    return OnlineFilter(model, maker, name, tracks, lag=lag)

@@ -8,7 +8,7 @@ A data set holds the episodes of one policy in one environment: observations, ac
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
+from rich.table import Table
 
 from . import __version__
 from .agents.training_run import training_scenarios
@@ -30,6 +31,7 @@ from .evaluation.running.transitions import Transitions, transitions_of
 from .evaluation.storage.files import whole_files
 from .functions import find_policy
 from .names import find_competitor
+from .reports.tables.terminal_tables import plain_table
 
 CHUNK = 256
 """Episodes flown side by side, and held in memory until they are written."""
@@ -317,3 +319,18 @@ def _tell_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> No
         if low is not None and low < high:
             scores = {"ref_min_score": low, "ref_max_score": high}
             dataset.storage.update_metadata({**scores, "num_episodes_average_score": entry.episodes})
+
+
+def datasets_table(written: Iterable[DatasetSummary]) -> Table:
+    """Return what data sets hold; those whose environments are the same can be combined."""
+    table = plain_table()
+    table.add_column("data set", overflow="fold")
+    table.add_column("environment", overflow="fold")
+    for title in ("episodes", "steps", "mean return"):
+        table.add_column(title, justify="right")
+    for entry in written:
+        made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
+        table.add_row(
+            entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"
+        )
+    return table

@@ -2,15 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
 from .columns import Column
-
-if TYPE_CHECKING:
-    from ..logs.recorded_tables import Columns
-
 
 TIME = ("time", "timestamp", "seconds")
 """Names of the column of times."""
@@ -103,8 +99,9 @@ class LogFormat:
 
     columns: Mapping[str, Column]
     """The columns beside ``time``, by their names."""
-    read: "Callable[[Columns], TrackLog]"
-    """Makes the measurements of one track of its columns; raises :class:`ValueError` for what lacks or cannot be."""
+    read: Callable[[Any], TrackLog]
+    """Makes the measurements of one track of its columns (:class:`~.recorded_tables.Columns`); raises
+    :class:`ValueError` for what lacks or cannot be."""
     start: Callable[[Mapping[str, numpy.ndarray], numpy.ndarray, Any], TrackStart]
     """Makes the start of the tracks of measurements ``(E, T, ...)`` by name, of their times ``(E, T)``, s, and of the
     parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.live_input import LiveInput, LiveValues, Memory
+from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory
 from .logs import COLUMNS, measure
 from .world import Measurement
 
@@ -38,3 +38,6 @@ class PositionInput(LiveInput):
         number = memory["count"] + 1.0
         found = measure(number, ins, memory["ins"], fix, sigma, p)
         return Measurement(**found), {"time": time, "count": number, "ins": ins}
+
+
+LIVE_READER = LiveReader(PositionInput)

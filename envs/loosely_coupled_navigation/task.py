@@ -13,17 +13,15 @@ Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 an
 
 from typing import Any
 
+from ...extensions import load_present
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LostTracks, Paper, TrainedBanks
-from ..contract.live_input import LiveReader
 from ..contract.task import Component, PaperPolicy, Reward, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
-from .live import PositionInput
-from .logs import LOG_FORMAT
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import InsGnssWorld
@@ -156,11 +154,10 @@ class LooselyCoupledNavigation(Task):
             },
         ),
         TrainedBanks({"kalman-net": KalmanNetBank}),
-        LOG_FORMAT,
-        LiveReader(PositionInput),
         Causes(CAUSES, start=50),
         # No better than single measurements throughout; more axes cost more.
         LostTracks(1.0),
+        *load_present(("logs:LOG_FORMAT", "live:LIVE_READER"), __package__),
     )
 
     parameters: LooselyCoupledNavigationParameters

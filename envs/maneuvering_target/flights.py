@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy
 
+from ..contract.companions import FlightScenarios
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario
 from ..data.trajectory import Trajectory
@@ -82,3 +83,6 @@ def scenario_of_flights(flights: Trajectory | Flights, keywords: Mapping[str, An
         flights=tuple(map(flight_of, used)),
         notes=tuple(notes),
     )
+
+
+FLIGHT_SCENARIOS = FlightScenarios(scenario_of_flights)

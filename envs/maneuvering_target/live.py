@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.live_input import LiveInput, LiveValues, Memory
+from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory
 from ..logs.plausibility import check_degrees
 from .logs import COLUMNS, FARTHEST_RANGE, east_north, two_plot_start
 from .world import Measurement, Odometry
@@ -127,3 +127,6 @@ class PlotInput(LiveInput):
         with numpy.errstate(invalid="ignore"):
             polar_variance = polar.cartesian_variances(position, distance, numpy.radians(bearing))
         return numpy.where(numpy.isfinite(stated), stated**2, polar_variance)
+
+
+LIVE_READER = LiveReader(PlotInput)

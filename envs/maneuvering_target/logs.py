@@ -22,8 +22,6 @@ from ..contract.log_format import (
     deviation_words,
     is_assumed,
 )
-from ..data.recorded_world import Feed
-from ..data.recording import Recording
 from ..logs.plausibility import check_bearings, scatter_of
 from ..logs.recorded_tables import Columns
 from .parameters import ManeuveringTargetParameters
@@ -187,22 +185,6 @@ def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
         )
         if count
         else ()
-    )
-
-
-def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
-    """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
-    if isinstance(recording, Feed):
-        return recording.regular
-    there = numpy.isfinite(recording.seconds)
-    said = recording.measurements
-    return all(
-        bool((said[name][there] == value).all())
-        for name, value in (
-            ("available", 1.0),
-            ("interval", p.sampling_interval),
-            ("elapsed", p.sampling_interval),
-        )
     )
 
 

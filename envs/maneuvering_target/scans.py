@@ -2,10 +2,14 @@
 
 from typing import Any, NamedTuple
 
+import numpy
+
 from ..contract.draws import Draws
 from ..contract.faults import undisturbed
 from ..contract.observation import Array
 from ..contract.task import Task
+from ..data.recorded_world import Feed
+from ..data.recording import Recording
 from .courses import Course, Motion
 from .parameters import ManeuveringTargetParameters
 
@@ -122,3 +126,19 @@ class UnreliableScans(RegularScans):
     def context(self, scans: Reliability) -> dict[str, Array]:
         """Probability that scans see the target, and the share of the scan period by which they come early at most."""
         return {"detection_probability": scans.detection_probability, "scan_jitter": scans.jitter}
+
+
+def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
+    """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    if isinstance(recording, Feed):
+        return recording.regular
+    there = numpy.isfinite(recording.seconds)
+    said = recording.measurements
+    return all(
+        bool((said[name][there] == value).all())
+        for name, value in (
+            ("available", 1.0),
+            ("interval", p.sampling_interval),
+            ("elapsed", p.sampling_interval),
+        )
+    )

@@ -7,9 +7,9 @@ the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``fi
 
 from typing import Any
 
+from ...extensions import load_present
 from ..contract.causes import Causes
-from ..contract.companions import Actions, FlightScenarios, LostTracks, Paper, PictureMaker, TrainedBanks
-from ..contract.live_input import LiveReader
+from ..contract.companions import Actions, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Model
 from ..contract.observation import Array
 from ..contract.task import Component, PaperPolicy, Reward, Task
@@ -17,12 +17,10 @@ from . import ID
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .causes import CAUSES
 from .clutter import Track
-from .flights import scenario_of_flights
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
-from .live import PlotInput
-from .logs import LOG_FORMAT, has_regular_scans
 from .parameters import ManeuveringTargetParameters
+from .scans import has_regular_scans
 from .scenarios import SCENARIOS
 from .student import RadarStudentBank
 from .world import RadarWorld
@@ -145,13 +143,18 @@ class ManeuveringTarget(Task):
             {"evidence": ("evidence_scale",)},
         ),
         TrainedBanks({"kalman-net": KalmanNetBank, "student": RadarStudentBank}),
-        LOG_FORMAT,
-        LiveReader(PlotInput),
         PictureMaker(_picture),
         Causes(CAUSES),
         # An error of a kilometre throughout: ten times that of a plot.
         LostTracks(100.0),
-        FlightScenarios(scenario_of_flights),
+        *load_present(
+            (
+                "logs:LOG_FORMAT",
+                "live:LIVE_READER",
+                "flights:FLIGHT_SCENARIOS",
+            ),
+            __package__,
+        ),
     )
 
     parameters: ManeuveringTargetParameters

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.live_input import LiveInput, LiveValues, Memory
+from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory
 from .logs import COLUMNS, read_decisions, start_track
 from .world import Measurement, Start
 
@@ -44,3 +44,6 @@ class ScanInput(LiveInput):
         radar = self.read_all(values, ("range", "range_rate"), "at every scan")
         found = read_decisions(LiveValues(self, values), scan, self.parameters)
         return Measurement(scan=scan.astype(numpy.int64), radar=radar, **found)
+
+
+LIVE_READER = LiveReader(ScanInput)

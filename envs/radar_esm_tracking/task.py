@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy
 
+from ...extensions import load_present
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
-from ..contract.live_input import LiveReader
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 from ..contract.task import Component, PaperPolicy, Reward, Task
@@ -21,8 +21,6 @@ from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
 from .kalman_net import KalmanNetBank
-from .live import ScanInput
-from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
@@ -162,12 +160,11 @@ class RadarEsmTracking(Task):
             {"evidence": ("evidence_scale", "decision_interval")},
         ),
         TrainedBanks({"kalman-net": KalmanNetBank}),
-        LOG_FORMAT,
-        LiveReader(ScanInput),
         PictureMaker(_picture),
         # Errors of three of the scales throughout.
         LostTracks(9.0),
         LoopRecords(_records),
+        *load_present(("logs:LOG_FORMAT", "live:LIVE_READER"), __package__),
     )
 
     parameters: RadarEsmTrackingParameters

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class ReceiverInput(LiveInput):
@@ -41,3 +41,6 @@ class ReceiverInput(LiveInput):
         readings = [self.read(values, sensor.name, (self._count(sensor),)) for sensor in self._sensors]
         others = {name: value for name, value in values.items() if name not in names}
         return super().measure(memory, time, {**others, "readings": numpy.concatenate(readings)})
+
+
+LIVE_READER = LiveReader(ReceiverInput)

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy
 
+from ...extensions import load_present
 from ...filters import gnss_ins, satellites
 from ..contract.causes import Causes
 from ..contract.companions import Actions, ArrayMeanings, LostTracks, Paper, PictureMaker, TrainedBanks
-from ..contract.live_input import LiveReader
 from ..contract.model import Model
 from ..contract.observation import Array
 from ..contract.task import Component, PaperPolicy, Reward, Task
@@ -32,7 +32,6 @@ from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
 from .hypotheses import FaultHypothesesBank
 from .kalman_net import KalmanNetBank
-from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import NavigationWorld
@@ -174,7 +173,6 @@ class TightlyCoupledNavigation(Task):
             },
         ),
         TrainedBanks({"kalman-net": KalmanNetBank}),
-        LiveReader(ReceiverInput),
         PictureMaker(_picture),
         Causes(CAUSES, start=100),
         # Five times the errors of a single-epoch fix throughout.
@@ -183,6 +181,7 @@ class TightlyCoupledNavigation(Task):
             feedback="state that the tracking loops expect at the next measurement, in the order of the components; by default the "
             "estimate, extrapolated as in a manoeuvre"
         ),
+        *load_present(("live:LIVE_READER",), __package__),
     )
 
     parameters: TightlyCoupledNavigationParameters

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.live_input import LiveInput, Memory
+from ..contract.live_input import LiveInput, LiveReader, Memory
 
 
 class SensorInput(LiveInput):
@@ -35,3 +35,6 @@ class SensorInput(LiveInput):
     def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
         """Hold the last reading."""
         return numpy.where(there, received, memory["reading"])
+
+
+LIVE_READER = LiveReader(SensorInput)

@@ -19,9 +19,9 @@ takes the control in force, ``B U`` of (8) and (10), command included. Reading: 
 
 from typing import Any
 
+from ...extensions import load_present
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
-from ..contract.live_input import LiveReader
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 from ..contract.task import PaperPolicy, Reward, Task
@@ -30,7 +30,6 @@ from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
-from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
 from .scenarios import SCENARIOS
@@ -156,12 +155,12 @@ class UavAutopilot(Task):
             },
         ),
         TrainedBanks({"kalman-net": KalmanNetBank}),
-        LiveReader(SensorInput),
         PictureMaker(_picture),
         Causes(CAUSES, start=20),
         # A loop that is off by ten times its sensor's error throughout.
         LostTracks(100.0),
         LoopRecords(_records),
+        *load_present(("live:LIVE_READER",), __package__),
     )
 
     parameters: UavAutopilotParameters

@@ -21,8 +21,7 @@ from ...envs.contract.task import Task, named_arrays
 from ...envs.engine.compiled import warn_of
 from ...filters.small_matrices import cholesky
 from .adapters import select_lanes
-from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, make_competitor
-from .programs import ProgramEstimator
+from .kinds import TOLD_MORE, Kind, check_competitor, compilation_key, is_program, make_competitor
 
 AFTER_MISSED = 5.0
 """Number of the reason among :data:`..storage.dataset.FAULTS` that a missed measurement explains."""
@@ -213,8 +212,8 @@ class HeldInPython(Filter[Task, Any, Adapted]):
 
     def feedback(self, state: Adapted, measurement: Any) -> Array | None:
         """What a program has reported to steer the world."""
-        own = self.own.own if isinstance(self.own, Adapter) else None
-        return own.feedback if isinstance(own, ProgramEstimator) else None
+        own: Any = self.own.own if isinstance(self.own, Adapter) else None
+        return own.feedback if is_program(own) else None
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
         """Return what was answered as float64, or raise ValueError if it has another shape."""
@@ -515,7 +514,7 @@ def put_in_loop(
         own = make_competitor(competitor, model.task)
     if kind in TOLD_MORE:
         check_knowledge(name, own, kind, model.task)
-    if isinstance(own, ProgramEstimator):
+    if is_program(own):
         own.tracks, own.last = count, last
     own = as_filter(model.task, check_competitor(name, own, kind), kind)
     if _can_be_traced(competitor, own):

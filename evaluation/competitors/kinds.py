@@ -73,6 +73,11 @@ def is_filter(competitor: Any) -> bool:
     return issubclass(made if isinstance(made, type) else type(made), Filter)
 
 
+def is_program(found: Any) -> bool:
+    """Whether it computes in a process of its own, whose time that process tells."""
+    return getattr(found, "is_program", False) is True
+
+
 def _has(found: Any, *methods: str) -> bool:
     return all(callable(getattr(found, method, None)) for method in methods)
 

@@ -99,6 +99,7 @@ class Program:
     environment: tuple[tuple[str, str], ...] | None = None
     """Variables of the process; None: ours, with :func:`search_path`."""
     kind: ClassVar[Kind] = "estimator"
+    is_program: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if os.name != "posix":
@@ -195,6 +196,7 @@ class ProgramEstimator:
     """
 
     kind: ClassVar[Kind] = "estimator"
+    is_program: ClassVar[bool] = True
 
     def __init__(self, task: Task, program: Program) -> None:
         self.task, self.program = task, program

@@ -22,7 +22,6 @@ from ...envs.engine.catalogue import importable_name, nearest, task_class
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.programs import Report
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
-from ..competitors.file_estimates import FileEstimates
 from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
@@ -421,7 +420,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}
     competitors = dict(competitors)
     for name, one in competitors.items():
-        if isinstance(one, FileEstimates):
+        if hasattr(one, "of_tracks"):
             check_open_loop(models[name], repr(name))
             competitors[name] = one.of_tracks(models[name].on_numpy().task, tracks)
     return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)

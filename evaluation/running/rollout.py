@@ -25,10 +25,10 @@ from ..competitors.kinds import (
     answers_by_track,
     check_competitor,
     compilation_key,
+    is_program,
     kind_of,
     make_competitor,
 )
-from ..competitors.programs import Program
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
@@ -329,7 +329,7 @@ def measure_time(
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
     task, steers = model.task, kind == "policy"
     clock = time.process_time
-    if own := isinstance(competitor, Program):
+    if own := is_program(competitor):
         competitor = competitor(task)
         clock = competitor.processor_seconds
     decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)

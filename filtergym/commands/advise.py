@@ -26,7 +26,7 @@ from ..reports.tables.advice import (
 )
 from ..reports.tables.results import settings_of
 from .evaluation import causal_competitors, departure_lines
-from .shown import advice_maker
+from .shown import report_maker
 from .terminal import (
     Parameters,
     RenameOption,
@@ -145,7 +145,7 @@ def advise_on_log(
         if not out.name.endswith(SUFFIX):
             raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
         writable_file(out)
-    make_page = None if report is None else advice_maker()  # what it lacks is said before anything else
+    make_page = None if report is None else _advice_maker()  # what it lacks is said before anything else
     if report is not None:
         writable_file(report)
     found = read_recording(
@@ -209,3 +209,11 @@ def advise_on_log(
         console.print(
             f"report: {report} ({report.stat().st_size / 1e6:.1f} MB), opens in a browser", soft_wrap=True
         )
+
+
+def _advice_maker() -> Callable[..., str]:
+    """Return what makes the report of an advice; refusals as of :func:`.shown.report_maker`."""
+    report_maker()
+    from ..reports.pages.advice_report import advice_html
+
+    return advice_html

@@ -21,14 +21,14 @@ from ..evaluation.storage.files import whole_file, whole_files, writable_file, w
 from ..evaluation.storage.store import UNFINISHED, Store
 from ..functions import requests_of
 from ..names import find_competitor, isolate_names, learned_names
-from ..offline import plan_datasets
+from ..offline import datasets_table, plan_datasets
 from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv
 from ..reports.tables.headline import headline_table
 from ..reports.tables.reasons import explained_by_default
 from ..reports.tables.results import RESULTS, Result, WorstTrack, settings_of
-from ..reports.tables.terminal_tables import datasets_table, results_tables
+from ..reports.tables.terminal_tables import results_tables
 from ..reports.tables.worst import find_worst
 from .evaluation import (
     FileOptions,

@@ -44,14 +44,6 @@ def report_maker() -> Callable[[Sequence[Result], Settings], str]:
     return report_html
 
 
-def advice_maker() -> Callable[..., str]:
-    """Return what makes the report of an advice; refusals as of :func:`report_maker`."""
-    report_maker()
-    from ..reports.pages.advice_report import advice_html
-
-    return advice_html
-
-
 def make_report(results: Sequence[Result], settings: Settings, out: Path) -> None:
     """Make a report and say where it is; beside other results it may lack, and then this says why.
 

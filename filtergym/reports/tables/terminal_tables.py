@@ -15,7 +15,6 @@ from rich.table import Table
 from ...baselines.tuned_values import Tuned
 from ...evaluation.competitors.kinds import NOT_CAUSAL, RANKED
 from ...evaluation.running.times import OWN_MARK, OWN_NOTE, TIME_NOTE, TIME_TITLE, column_of_times
-from ...offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
 """Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
@@ -388,19 +387,4 @@ def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     for name, value in outcome.values.items():
         table.add_row(name, f"{start[name]:g}", f"{value:g}")
     table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
-    return table
-
-
-def datasets_table(written: Iterable[DatasetSummary]) -> Table:
-    """Return what data sets hold; those whose environments are the same can be combined."""
-    table = plain_table()
-    table.add_column("data set", overflow="fold")
-    table.add_column("environment", overflow="fold")
-    for title in ("episodes", "steps", "mean return"):
-        table.add_column(title, justify="right")
-    for entry in written:
-        made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
-        table.add_row(
-            entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"
-        )
     return table

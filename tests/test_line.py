@@ -1,0 +1,92 @@
+"""The line through the house: the core knows no problem and no companion, and is small."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_imports import FILES, ROOT, imports_of
+
+from filtergym.envs.engine.catalogue import folders
+
+PROBLEM = f"({'|'.join(folders().values())})"
+OF_PROBLEMS = (
+    "alpha_beta", "class_fusion", "coordinated_turn", "data_association", "dead_reckoning", "emitter_association",
+    "extended_kalman", "gnss_ins", "gusts", "loosely_coupled", "noise_levels", "polar", "predicted_covariance",
+    "range_errors", "receiver_faults", "satellites", "singer",
+)  # fmt: skip
+"""Mathematics of one problem, beside what several use."""
+PARTS = {
+    "logs and advice": (
+        rf"envs/logs/|envs/{PROBLEM}/(logs|live|flights|inertial)\.py"
+        r"|baselines/(advice|fitt\w+|judgement|tuning)\.py|filtergym/commands/(advise|improve)\.py"
+        r"|filtergym/reports/(tables/(advice|recording_tables)|pages/advice_report)\.py"
+        r"|evaluation/(competitors/(likelihood|file_estimates)|storage/(blind|estimate_tables|estimates))\.py"
+    ),
+    "problems": rf"(envs|baselines)/{PROBLEM}/|filters/({'|'.join(OF_PROBLEMS)})\.py",
+    "learning": r"agents/|filtergym/commands/training\.py|filtergym/reports/tables/standing\.py",
+    "crash test": r"evaluation/stress/|filtergym/commands/stress\.py|filtergym/reports/pages/crash_report\.py",
+    "programs of others": r"evaluation/competitors/(programs|program_process|isolation)\.py",
+    "export": r"filtergym/exports/",
+    "data sets": r"filtergym/offline\.py",
+    "publication": r"filtergym/(submission|protocol)\.py|filtergym/commands/(submit|protocol)\.py",
+    "papers": r"filtergym/(papers/|reproductions\.py)",
+    "commands": r"filtergym/commands/(?!(__init__|progress|shown|terminal)\.py)",
+    "outside the package": r"docs/",
+}
+"""Files of each part by their paths; the first that matches counts, and what none matches is the core."""
+KNOWN = {
+    "core": set(),
+    "problems": {"core"},
+    "learning": {"core"},
+    "crash test": {"core"},
+    "programs of others": {"core"},
+}
+"""Parts that a part may import, of those that know few."""
+MOST_LINES = 36_000
+"""Of the core."""
+TYPES_ALONE = Path("filtergym/__init__.py")
+"""Names the functions of the package for type checkers, and imports them when they are first used."""
+
+
+def part_of(file: Path) -> str:
+    return next((name for name, pattern in PARTS.items() if re.match(pattern, file.as_posix())), "core")
+
+
+MODULES = {
+    tuple(part for part in file.with_suffix("").parts if part not in ("filtergym", "__init__")): file
+    for file in FILES
+}
+
+
+def imported_files(file: Path) -> Iterator[Path]:
+    for (first, *rest), _ in imports_of(file):
+        if first == "filtergym":
+            found = MODULES.get(tuple(rest)) or MODULES.get(tuple(rest[:-1]))
+            if found is not None:
+                yield found
+
+
+@pytest.mark.parametrize("part", KNOWN)
+def test_a_part_knows_few_others(part: str) -> None:
+    wrong = {
+        f"{file} imports {other} of {part_of(other)}"
+        for file in FILES
+        if part_of(file) == part and file != TYPES_ALONE
+        for other in imported_files(file)
+        if part_of(other) not in {part, *KNOWN[part]}
+    }
+    assert not wrong
+
+
+def test_the_check_sees_what_crosses_the_line() -> None:
+    front = {part_of(file) for file in imported_files(TYPES_ALONE)}
+    assert "logs and advice" in front
+    assert {part_of(file) for file in FILES} == {"core", *PARTS}
+
+
+def test_the_core_is_small() -> None:
+    lines = sum(
+        (ROOT / file).read_text(encoding="utf-8").count("\n") for file in FILES if part_of(file) == "core"
+    )
+    assert lines <= MOST_LINES
