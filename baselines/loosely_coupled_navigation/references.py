@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy
 
+from ...envs.contract.draws import within
 from ...envs.contract.filter import Initial, Likelihood
 from ...envs.contract.observation import Array
-from ...envs.contract.schedules import within
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement, Truth
 from ...filters import loosely_coupled as ins_gnss

@@ -2,12 +2,13 @@
 
 A world asks for what it needs in a fixed order, and how many numbers that takes is counted by asking once
 without any (:meth:`Draws.counting`). What was drawn is kept under its name: an episode's levels, times and
-kinds are its context.
+kinds are its context. What is drawn may hold within a window of time, or step: :func:`within`, :class:`Steps`.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
+from typing import NamedTuple
 
 from .observation import Array
 
@@ -104,3 +105,24 @@ def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Arr
     for threshold in thresholds:
         index = index + xp.astype(uniform >= threshold, xp.int64)
     return index
+
+
+class Steps(NamedTuple):
+    """A signal that is constant between its steps."""
+
+    values: Array
+    """At the start and from each step on, ``(J + 1, ..., N)``."""
+    times: Array
+    """Of the steps, ascending, ``(J, N)``: numbers of measurements, or s."""
+
+    def at(self, time: Array, xp: ModuleType) -> Array:
+        """Value at a time, ``(..., N)``."""
+        value = self.values[0]
+        for i in range(self.times.shape[0]):
+            value = xp.where(time >= self.times[i], self.values[i + 1], value)
+        return value
+
+
+def within(time: Array, window: Array) -> Array:
+    """Whether a time lies in a window: not before its first row, but before its second one, ``(N,)``."""
+    return (time >= window[0]) & (time < window[1])

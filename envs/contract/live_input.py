@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy
 
-from .columns import check_deviations
 from .companions import find_companion
+from .log_format import check_deviations
 from .parameters import quote_shortened, read_numbers
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class LiveInput:
 
 
 class LiveValues:
-    """Values that came live, as :class:`~.columns.Readings` of several tracks.
+    """Values that came live, as :class:`~.log_format.Readings` of several tracks.
 
     Args:
         input: that reads them.

@@ -1,8 +1,8 @@
 """Pictures of a running episode: what ``render_mode`` "rgb_array" and "human" show.
 
 An :class:`EpisodePicture` keeps the history of one episode and draws it into one figure, whose axes never
-move. What is drawn is said by a :class:`Picture`: what :meth:`.task.Task.picture` returns, or, where that is
-None, the base class, which can draw every task: errors with the band that the estimator reports, actions,
+move. A :class:`Picture` decides what is drawn: that of the problem's :class:`~.companions.PictureMaker`, or, where
+there is none, the base class, which can draw every task: errors with the band that the estimator reports, actions,
 observations.
 
 Pictures show the truth, also that of the scans to come (the limits of the axes, marked manoeuvres). Nothing

@@ -30,8 +30,6 @@ from ..contract.observation import (
     SIGNED_LOG,
     Array,
     Block,
-)
-from ..contract.standard_blocks import (
     availability_block,
     innovation_block,
     last_action_block,

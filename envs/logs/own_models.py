@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..contract.columns import Column
-from ..contract.log_format import LogFormat, PlainRows, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, PlainRows, Predicted, TrackLog, TrackStart
 from ..linear.equations import find_invalid_noise
 from .recorded_tables import UNEVEN, Columns
 

@@ -14,10 +14,9 @@ import numpy
 
 from ...filters.angles import PERIODS
 from ...filters.geodesy import PlaneOrigin
-from ..contract.columns import check_deviations
 from ..contract.companions import find_companion
 from ..contract.live_input import LARGEST
-from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog
+from ..contract.log_format import RECORDING, TIME, TRUTH, LogFormat, TrackLog, check_deviations
 from ..contract.task import Component, Task
 from ..data.recorded_world import measure_once
 from ..data.recording import Recording, side_by_side

@@ -24,8 +24,6 @@ from ..contract.observation import (
     Block,
     Compression,
     Quantity,
-)
-from ..contract.standard_blocks import (
     availability_block,
     average_block,
     innovation_block,

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
-from ..contract.draws import Draws, draw_between
+from ..contract.draws import Draws, Steps, draw_between, within
 from ..contract.faults import Colour, ColouredErrors, Disturbance, Outliers, Step
 from ..contract.observation import Array
-from ..contract.schedules import Steps, within
 from ..contract.task import Task
 from .parameters import LooselyCoupledNavigationParameters
 

@@ -8,8 +8,9 @@ from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
-from ..contract.observation import Array, Block
-from ..contract.standard_blocks import (
+from ..contract.observation import (
+    Array,
+    Block,
     entropy_block,
     expected_nis_block,
     last_action_block,

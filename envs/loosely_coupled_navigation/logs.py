@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy
 
-from ..contract.columns import Column
-from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, Predicted, TrackLog, TrackStart
 from ..logs.plausibility import check_extents
 from ..logs.recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters

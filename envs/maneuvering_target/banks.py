@@ -23,8 +23,6 @@ from ..contract.observation import (
     Array,
     Block,
     Quantity,
-)
-from ..contract.standard_blocks import (
     availability_block,
     average_block,
     average_log_squared_block,

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.ordered_sums import ordered_sum
-from ..contract.draws import Draws
+from ..contract.draws import Draws, Steps
 from ..contract.observation import Array
-from ..contract.schedules import Steps
 from ..contract.task import Task
 from .parameters import ManeuveringTargetParameters
 

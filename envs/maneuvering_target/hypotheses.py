@@ -9,8 +9,10 @@ from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import apply, product, transpose
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
-from ..contract.observation import BOUNDED_LOG, Array, Block
-from ..contract.standard_blocks import (
+from ..contract.observation import (
+    BOUNDED_LOG,
+    Array,
+    Block,
     entropy_block,
     expected_nis_block,
     innovation_block,

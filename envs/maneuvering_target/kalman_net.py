@@ -34,8 +34,7 @@ from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.small_matrices import apply, outer, product, transpose
 from ..contract.filter import Bank, Initial
-from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block
-from ..contract.standard_blocks import innovation_block, prior_block
+from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, innovation_block, prior_block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement

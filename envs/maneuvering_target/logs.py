@@ -12,9 +12,9 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..contract.columns import Column
 from ..contract.log_format import (
     NO_DEVIATIONS,
+    Column,
     LogFormat,
     Predicted,
     TrackLog,

@@ -21,16 +21,14 @@ from ..contract.observation import (
     SHARE,
     Array,
     Block,
-    linear_scale,
-    within,
-)
-from ..contract.standard_blocks import (
     average_block,
     average_log_squared_block,
     innovation_block,
     last_weight_block,
+    linear_scale,
     log_squared_block,
     relative_likelihood_block,
+    within,
 )
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start

@@ -26,8 +26,7 @@ from ...filters import class_fusion, imm, packed_covariance
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.small_matrices import apply, cholesky
 from ..contract.controls import bank_probabilities
-from ..contract.observation import KEPT_AS_LOG, Array, Block
-from ..contract.standard_blocks import last_action_block
+from ..contract.observation import KEPT_AS_LOG, Array, Block, last_action_block
 from .banks import ClassBank
 from .world import Measurement, Start
 

@@ -10,8 +10,7 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..contract.columns import Column, Readings, optional
-from ..contract.log_format import LogFormat, Predicted, TrackLog, TrackStart
+from ..contract.log_format import Column, LogFormat, Predicted, Readings, TrackLog, TrackStart, optional
 from ..logs.recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 

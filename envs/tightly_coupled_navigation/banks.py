@@ -21,8 +21,13 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank, Initial
-from ..contract.observation import BOUNDED_LOG, SHARE, SIGNED_LOG, Array, Block, Quantity
-from ..contract.standard_blocks import (
+from ..contract.observation import (
+    BOUNDED_LOG,
+    SHARE,
+    SIGNED_LOG,
+    Array,
+    Block,
+    Quantity,
     clock_block,
     last_action_block,
     log_predicted_block,

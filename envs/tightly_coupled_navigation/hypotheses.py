@@ -8,8 +8,15 @@ from ...filters import gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Initial, Likelihood
-from ..contract.observation import BOUNDED_LOG, KEPT_AS_LOG, SHARE, Array, Block
-from ..contract.standard_blocks import log_density_block, probability_block
+from ..contract.observation import (
+    BOUNDED_LOG,
+    KEPT_AS_LOG,
+    SHARE,
+    Array,
+    Block,
+    log_density_block,
+    probability_block,
+)
 from .banks import SatelliteBank
 from .fault_hypotheses import FaultHypotheses, FaultState, Posterior
 from .parameters import HYPOTHESES

@@ -19,8 +19,6 @@ from ..contract.observation import (
     Block,
     Compression,
     Quantity,
-)
-from ..contract.standard_blocks import (
     availability_block,
     average_block,
     clock_block,

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
-from ..contract.draws import Draws
+from ..contract.draws import Draws, Steps, within
 from ..contract.faults import Colour, ColouredErrors, Disturbance, Step
 from ..contract.observation import Array
-from ..contract.schedules import Steps, within
 
 if TYPE_CHECKING:
     from .task import UavAutopilot

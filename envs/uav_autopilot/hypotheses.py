@@ -9,14 +9,16 @@ from ...filters.noise_levels import Hypotheses
 from ...filters.ordered_sums import ordered_sum
 from ..contract.controls import SteeredBank
 from ..contract.filter import Likelihood
-from ..contract.observation import Array, Block, within
-from ..contract.standard_blocks import (
+from ..contract.observation import (
+    Array,
+    Block,
     entropy_block,
     expected_nis_block,
     last_action_block,
     log_density_block,
     predicted_block,
     probability_block,
+    within,
 )
 from .banks import AutopilotBank
 from .level_bank import LevelBank, Levels, grid

@@ -23,8 +23,7 @@ import gymnasium
 import numpy
 
 from ...filters import packed_covariance
-from ..contract.observation import SIGNED_LOG, Array, Block
-from ..contract.standard_blocks import last_action_block
+from ..contract.observation import SIGNED_LOG, Array, Block, last_action_block
 from .banks import NoiseBank
 from .world import Measurement, Start
 

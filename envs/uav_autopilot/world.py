@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters import linear_systems
-from ..contract.draws import Draws
+from ..contract.draws import Draws, Steps
 from ..contract.faults import Disturbances, undisturbed
 from ..contract.observation import Array
-from ..contract.schedules import Steps
 from ..contract.world import World
 from .disturbances import DISTURBANCES, DRAWN_FIRST, draw_steps
 from .parameters import UavAutopilotParameters
