@@ -96,17 +96,22 @@ def _resident():
 
 @pytest.fixture(scope="session", autouse=True)
 def _temporary_folder(tmp_path_factory):
-    """Give this process a temporary folder of its own, and fail if something is left in it after the last test."""
-    folder = tmp_path_factory.mktemp("temporary", numbered=False)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TMPDIR", str(folder))
-        # Stable-Baselines3 leaves a folder of every model that learns without a logger there, Torch its cache.
-        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR"):
-            patch.setenv(variable, str(tmp_path_factory.mktemp(variable)))
+    """Give this process a temporary folder of its own, and fail if something is left in it after the last test.
+
+    Its name is short, since the path of a socket in it must be.
+    """
+    tmp_path_factory.getbasetemp()  # made where it would be otherwise
+    with tempfile.TemporaryDirectory(prefix="filtergym-") as place, pytest.MonkeyPatch.context() as patch:
+        own, of_libraries = Path(place, "own"), Path(place, "libraries")
+        own.mkdir()
+        patch.setenv("TMPDIR", str(own))
         patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
+        # Stable-Baselines3 leaves a folder for every model that learns without a logger, Torch a cache, Ray its logs.
+        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR", "RAY_TMPDIR"):
+            patch.setenv(variable, str(of_libraries))
         yield
-    left = sorted(path.name for path in folder.iterdir())
-    assert not left, f"tests have left these in the temporary folder: {left}"
+        left = sorted(path.name for path in own.iterdir())
+        assert not left, f"tests have left these in the temporary folder: {left}"
 
 
 def pytest_generate_tests(metafunc):

@@ -103,23 +103,6 @@ def test_details_are_those_of_numpy(env_id, control, short):
             assert_same(found[name], values, moved, name, lanes=tuple(range(values.ndim)))
 
 
-def test_every_lane_of_many_is_the_single_environment():
-    """Of more than go into one tile; also by threads."""
-    keywords = {"backend": "compiled", "horizon": 6, "decision_interval": 2}
-    single = gym.make(MANEUVERING.id, **keywords)
-    vectors = [gym.make_vec(MANEUVERING.id, num_envs=1100, threads=threads, **keywords) for threads in (1, 2)]
-    actions = sampled(vectors[0], 3)
-    runs = [flown(vector, actions) for vector in vectors]
-    for one, other in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one, other)
-    for lane in (0, 550, 1099):
-        alone = [single.reset(seed=3 + lane)[0]]
-        for action in actions:
-            alone += [np.asarray(part) for part in single.step(action[lane])[:4]]
-        for one, other in zip(runs[0], alone, strict=True):
-            np.testing.assert_array_equal(one[lane], other)
-
-
 @pytest.mark.parametrize("env_id", KINDS)
 def test_looking_at_the_state_between_steps_changes_nothing(env_id, short, random_actions):
     plain, looked_at = (gym.make(env_id, backend="compiled", **short).unwrapped for _ in range(2))

@@ -404,7 +404,8 @@ def test_a_cluster_lets_nobody_else_in(clustered):
         addresses, mode = [address, address.replace("tls", "tcp")], {}
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen("http://127.0.0.1:8787/info/main/workers.html", timeout=5)
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    own = ("RAY_AUTH", "RAY_TMPDIR", "TMPDIR")  # folders of this user
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(own)}
     other = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
     if os.getuid() != 0 or shutil.which("setpriv") is None:
         other = []

@@ -48,17 +48,6 @@ def test_context_is_finite_of_one_shape_and_the_truths_own(env_id, short):
             np.testing.assert_array_equal(context[key], values[..., 0])
 
 
-@pytest.mark.parametrize("env_id", KINDS)
-def test_context_does_not_change_the_episode(env_id, short):
-    plain, telling = gymnasium.make(env_id, **short), gymnasium.make(env_id, context=True, **short)
-    np.testing.assert_array_equal(plain.reset(seed=1)[0], telling.reset(seed=1)[0])
-    action = plain.action_space.sample()
-    one, other = plain.step(action), telling.step(action)
-    np.testing.assert_array_equal(one[0], other[0])
-    assert one[1] == other[1]
-    assert "context" not in one[4]
-
-
 def test_maneuvers_are_flown_when_the_context_says():
     found = 0
     for seed in range(2):
@@ -114,29 +103,6 @@ def test_levels_are_those_of_the_times():
     for number, context in enumerate(contexts, 1):
         part = (number >= start["level_times"]).sum()
         assert context["level"] == start["levels"][part]
-
-
-def test_context_of_a_vector_is_that_of_single_environments():
-    pytest.importorskip("torch")
-    keywords = {"horizon": 3, "decision_interval": 1, "context": True}
-    many = gymnasium.make_vec(LOOSE, num_envs=3, backend="torch", autoreset_mode="SameStep", **keywords)
-    told = [many.reset(seed=4)[1]]
-    told += [many.step(np.zeros((3, *many.single_action_space.shape)))[4] for _ in range(5)]
-    for lane in range(3):
-        env = gymnasium.make(LOOSE, backend="numpy", **keywords)
-        own = env.reset(seed=4 + lane)[1]
-        for step, info in enumerate(told):
-            assert bool(info["_context"][lane])
-            _assert_context(info["context"], lane, own["context"])
-            _, _, _, over, own = env.step(np.zeros(env.action_space.shape))
-            if over and step < len(told) - 1:
-                _assert_context(told[step + 1]["final_info"]["context"], lane, own["context"])
-                own = env.reset()[1]
-
-
-def _assert_context(found, lane, expected):
-    for name, values in expected.items():
-        np.testing.assert_allclose(np.asarray(found[name])[lane], values, rtol=1e-12, atol=1e-12)
 
 
 def test_context_of_a_vector_has_gymnasiums_form():
