@@ -32,7 +32,7 @@ READERS: Sequence[str] = ("envs.logs.reading:RECORDINGS", "envs.logs.reading:FLI
 """Each a :class:`.envs.data.scenario_data.Reader`, in the order in which they are tried."""
 
 
-def load(place: str, package: str = PACKAGE) -> Any:
+def load(place: str, package: str | None = PACKAGE) -> Any:
     """Import what stands at ``module:name`` of a package.
 
     Raises:
@@ -48,7 +48,7 @@ def load(place: str, package: str = PACKAGE) -> Any:
         raise ValueError(f"this installation of filtergym holds no {module}") from None
 
 
-def load_present(places: Iterable[str], package: str = PACKAGE) -> Iterator[Any]:
+def load_present(places: Iterable[str], package: str | None = PACKAGE) -> Iterator[Any]:
     """Import what stands at several places of a package, without those whose module this installation does not hold."""
     for place in places:
         module = f"{package}.{place.partition(':')[0]}"

@@ -8,11 +8,11 @@ from test_kalman_net import AIRCRAFT, RADAR, episodes, network
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.contract import student
 from filtergym.envs.contract.draws import Draws
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.model import Episode
 from filtergym.envs.engine import reward
+from filtergym.envs.maneuvering_target import student_bank as student
 from filtergym.envs.maneuvering_target.kalman_net import LEAST_SPEED, STANDING
 from filtergym.envs.maneuvering_target.student import ACCELERATION_REACH
 

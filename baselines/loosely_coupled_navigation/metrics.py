@@ -15,8 +15,8 @@ import numpy
 
 from ...envs.engine.scenario_choice import make_task
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...evaluation.running.metrics import Measure, chi_square_quantile, sums_of_present
-from ...evaluation.running.own_metrics import MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import chi_square_quantile, sums_of_present
+from ...evaluation.running.own_metrics import Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, ratio
 from ...evaluation.statistics.cause_split import VARIABLE, held_causes
 from ...evaluation.storage.dataset import keywords_of

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from ...evaluation.running.metrics import Measure, squared_errors
-from ...evaluation.running.own_metrics import MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import squared_errors
+from ...evaluation.running.own_metrics import Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap
 from ...evaluation.storage.dataset import groups_of, slices_of
 

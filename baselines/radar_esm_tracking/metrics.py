@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy
 
-from ...evaluation.running.metrics import Measure, squared_errors
-from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import squared_errors
+from ...evaluation.running.own_metrics import Arrays, Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
 from ...evaluation.storage.dataset import slices_of, windows_of
 

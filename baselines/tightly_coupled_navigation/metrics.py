@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
-from ...evaluation.running.metrics import Measure, chi_square_quantile, squared_errors
-from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.running.metrics import chi_square_quantile, squared_errors
+from ...evaluation.running.own_metrics import Arrays, Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
 from ...evaluation.storage.dataset import groups_of
 

@@ -8,8 +8,7 @@ import numpy
 
 from ...envs.engine.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
-from ...evaluation.running.metrics import Measure
-from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
+from ...evaluation.running.own_metrics import Arrays, Measure, MetricInputs, OwnMetrics
 from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
 from ...evaluation.statistics.cause_split import held_causes
 from ...evaluation.storage.dataset import keywords_of, slices_of

@@ -3,14 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from .causes import Cause
 from .draws import Draws
 from .observation import Array
-
-if TYPE_CHECKING:
-    from .task import Task
+from .task_base import TaskBase
 
 
 class Step(NamedTuple):
@@ -69,7 +67,7 @@ class Disturbance(ABC):
     normals: int = 0
     row_uniforms: int = 0
 
-    def __init__(self, task: "Task") -> None:
+    def __init__(self, task: TaskBase) -> None:
         self.parameters, self.xp = task.parameters, task.xp
 
     @classmethod
@@ -164,7 +162,7 @@ class Disturbances:
     @classmethod
     def of(
         cls,
-        task: "Task",
+        task: TaskBase,
         kinds: Sequence[type[Disturbance]],
         drawn: Sequence[type[Disturbance]] = (),
     ) -> "Disturbances":
@@ -276,7 +274,7 @@ class Outliers(Disturbance):
     probability: float
     factor: float
 
-    def __init__(self, task: "Task") -> None:
+    def __init__(self, task: TaskBase) -> None:
         super().__init__(task)
         self.probability, self.factor = self.limits(self.parameters)
         self.row_uniforms = 1 if self.probability else 0
@@ -370,7 +368,7 @@ class ColouredErrors(Disturbance):
 
     name = "coloured"
 
-    def __init__(self, task: "Task", interval: float, count: int, present: bool) -> None:
+    def __init__(self, task: TaskBase, interval: float, count: int, present: bool) -> None:
         super().__init__(task)
         self.interval, self.count = interval, count
         self.initial_normals = self.normals = count if present else 0

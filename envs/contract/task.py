@@ -40,25 +40,17 @@ returns is given to the next :meth:`World.advance`. Each filter then flies a tru
 """
 
 import ast
-import functools
-import importlib
 import inspect
 import re
 import textwrap
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from types import ModuleType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
-import numpy
-
-from ...filters.angles import shorten
-from ...filters.array_namespace import lane_arrays, stack_nested
-from .draws import Draws
 from .filter import Bank
 from .observation import Array
+from .task_base import TaskBase
 from .world import World
 
 
@@ -114,175 +106,6 @@ class Reward(NamedTuple):
     log_unit: float | None = None
     """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below ``unit``;
     None where it is the same."""
-
-
-class NoiseLayout(NamedTuple):
-    """How many random numbers an episode takes.
-
-    At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
-    ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
-    ``row_uniforms`` uniform ones. Each is a function of the episode's identity, see :mod:`.episode_noise`.
-    """
-
-    uniforms: int
-    initial_normals: int
-    normals: int
-    row_uniforms: int = 0
-
-
-class TaskBase(ABC):
-    """What is computed of a task that is declared: its parameters on arrays, its world, and how its episodes run.
-
-    An author writes none of it; the declaration is :class:`~.task.Task`.
-
-    Args:
-        parameters: an instance of the task's ``Parameters``.
-        xp: array namespace, NumPy or torch.
-        device: of its arrays.
-        recording: that is replayed in place of a simulated world.
-    """
-
-    controls: ClassVar[tuple[str, ...]]
-    """Names of the task's ``banks``."""
-    parameters: Any
-    horizon: int
-    """Measurements acted on in one episode."""
-    decision_interval: int
-    """Measurements for which one action holds."""
-    recording: Any
-    """The :class:`~.recording.Recording` that is replayed in place of a simulated world; None where there is none."""
-    has_truth: bool
-    """Whether true values are known: a recording may lack them, and then there are no errors and no costs."""
-    has_whole_truth: bool
-    """Whether every component's is, at every measurement: a recording may lack some, which are NaN. What they would be
-    compared with is then left out of errors, and rewards, which need all, are zero."""
-    flights: tuple[int, ...] = ()
-    """Where every episode flies one of several, measurements acted on in each of them, all multiples of
-    ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
-    closes_loop: bool
-    """Whether an estimate decides what is measured next: where :meth:`.Task.feedback` is written, unless ``set_up``
-    says otherwise of the parameters; never in a recording."""
-    world: Any
-    """The :class:`~.world.World`, simulated or replayed."""
-    noise: NoiseLayout
-
-    def __init__(
-        self, parameters: Any, xp: ModuleType = numpy, device: Any = None, recording: Any = None
-    ) -> None:
-        self.parameters = parameters
-        self.recording = recording
-        self.has_truth = recording is None or recording.truth is not None
-        self.has_whole_truth = recording is None or recording.has_whole_truth
-        self.horizon = parameters.horizon
-        self.decision_interval = parameters.decision_interval
-        self.xp = xp
-        self.device = device
-        self.closes_loop = self._writes_feedback()
-        self.set_up()
-        if recording is None:
-            self.world = self.World(self)
-        else:
-            self.closes_loop = False
-            self.flights = recording.lengths_within(self.horizon, self.decision_interval)
-            self.world = recording.world(self)
-        self.noise = self._noise_layout()
-
-    # what the declaration gives, see :class:`~.task.Task`
-    World: ClassVar[Any]
-    components: tuple[Any, ...]
-
-    @abstractmethod
-    def set_up(self) -> None:
-        """Compute the constants that world and banks share."""
-
-    @abstractmethod
-    def _writes_feedback(self) -> bool:
-        """Whether the declaration gives something back to the world."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Share the task: nothing in it changes."""
-        return self
-
-    def __reduce__(self) -> Any:
-        """Pickle what it is made of; a module, its array namespace, cannot be."""
-        return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
-
-    def on(self, xp: ModuleType, device: Any = None) -> Self:
-        """Return the same problem on other arrays."""
-        return type(self)(self.parameters, xp, device, self.recording)
-
-    @functools.cached_property
-    def groups(self) -> Mapping[str, tuple[str, ...]]:
-        """Names of the components of each group, such as those of the ``position``."""
-        found: dict[str, tuple[str, ...]] = {}
-        for component in self.components:
-            if component.group:
-                found[component.group] = (*found.get(component.group, ()), component.name)
-        return found
-
-    @functools.cached_property
-    def periods(self) -> dict[int, float]:
-        """Periods of the components that are angles, by their numbers."""
-        return {i: one.period for i, one in enumerate(self.components) if one.period is not None}
-
-    def subtract(self, estimate: Array, truth: Array) -> Array:
-        """Estimate minus truth, ``(C, ...)`` each; of an angle the shortest difference."""
-        return shorten(estimate - truth, self.periods)
-
-    def _noise_layout(self) -> NoiseLayout:
-        world = self.world
-        average = 0.5 + self.xp.zeros((1, 8), dtype=self.xp.float64, device=self.device)
-        draws = Draws.counting(average, self.xp)
-        world.begin(draws, self.xp.concat([0.0 * average] * world.initial_normals))
-        return NoiseLayout(draws.used, world.initial_normals, world.normals, world.row_uniforms)
-
-    @property
-    def interval(self) -> float | None:
-        """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
-        the start of the track; None where they come at times of their own, or the times are not known.
-
-        It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
-        """
-        seconds: float | None = self._sampling_interval()
-        if seconds is not None and self.recording is not None:
-            return seconds if self.recording.has_interval(seconds) else None
-        return seconds
-
-    def _sampling_interval(self) -> float | None:
-        """What the parameters say of the time between measurements, s; None where it differs."""
-        return getattr(self.parameters, "sampling_interval", None)
-
-    def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
-
-        Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
-        """
-        return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
-
-    def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
-        """Measurements acted on in each episode, ``(N,)``.
-
-        Args:
-            uniforms: of the scenario, ``(noise.uniforms, N)``.
-        """
-        if not self.flights:
-            return numpy.full(uniforms.shape[1], self.horizon)
-        return numpy.asarray(self.flights)[self.flight_of(uniforms)]
-
-    def constant(self, values: Any) -> Array:
-        """Turn numbers into a float64 array of the task's namespace and device; nested lists may hold arrays ``(N,)``
-        beside numbers, where episodes differ, and then get a last axis of N.
-        """
-        if isinstance(values, list | tuple):
-            arrays = lane_arrays(values)
-            if arrays:
-                return stack_nested(values, 0.0 * sum(arrays[1:], arrays[0]), self.xp)
-        return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
-
-
-def _remake(cls: type[TaskBase], parameters: Any, namespace: str, device: Any, recording: Any) -> TaskBase:
-    return cls(parameters, importlib.import_module(namespace), device, recording)
 
 
 class Task(TaskBase):

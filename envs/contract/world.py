@@ -2,16 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from .draws import Draws
 from .faults import Disturbances
 from .observation import Array
+from .task_base import TaskBase
 
-if TYPE_CHECKING:
-    from .task import Task
-
-TaskT = TypeVar("TaskT", bound="Task")
+TaskT = TypeVar("TaskT", bound=TaskBase)
 Truth = TypeVar("Truth")
 Measurement = TypeVar("Measurement")
 

@@ -5,7 +5,7 @@ asked by measuring once.
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
@@ -16,9 +16,6 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..contract.task import Task, named_arrays
 from ..contract.world import World
-
-if TYPE_CHECKING:
-    from .recording import Recording
 
 
 class Replayed(NamedTuple):
@@ -130,17 +127,22 @@ class _ForeignWorld(World[Task, Any, Any]):
 
 
 class RecordedWorld(_ForeignWorld):
-    """What the sensors said, in place of a task's own world."""
+    """What the sensors said, in place of a task's own world.
+
+    Args:
+        task: of which.
+        tables: of a recording.
+        name: of the recording, in errors.
+    """
 
     initial_normals = 1
     normals = 1
 
-    def __init__(self, task: Task, recording: "Recording") -> None:
+    def __init__(self, task: Task, tables: Tables, name: str) -> None:
         super().__init__(task)
-        self.recording = recording
+        self._name = name
         plain = type(task)(task.parameters)
-        self._initial, self._measurement = measure_once(plain, recording.measurements)
-        tables = recording.tables
+        self._initial, self._measurement = measure_once(plain, tables.measurements)
         # Tables of NumPy are read by compiled code as they are.
         kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
         self.tables = Tables(
@@ -154,7 +156,7 @@ class RecordedWorld(_ForeignWorld):
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
         """Draw a recording, and tell of its start."""
-        number = draws.integer("recording", (0, len(self.recording.names) - 1))
+        number = draws.integer("recording", (0, len(self.tables.first) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
         initial = self._fill(self._initial, self.tables.initial, number)
         return Replayed(number, 0.0 * number, first, last), initial
@@ -194,9 +196,7 @@ class RecordedWorld(_ForeignWorld):
             ValueError: if the recording has none.
         """
         if self.tables.truth is None:
-            raise ValueError(
-                f"recording {self.recording.name!r} has no truth, so there is no error and no cost"
-            )
+            raise ValueError(f"recording {self._name!r} has no truth, so there is no error and no cost")
         return self._at(self.tables.truth, self._column(truth))
 
     def records(self, truth: Replayed) -> dict[str, Array]:

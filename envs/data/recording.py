@@ -306,7 +306,7 @@ class Recording(ScenarioData):
 
     def world(self, task: Task) -> RecordedWorld:
         """Return the world that replays this."""
-        return RecordedWorld(task, self)
+        return RecordedWorld(task, self.tables, self.name)
 
     @functools.cached_property
     def tables(self) -> Tables:

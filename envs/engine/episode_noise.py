@@ -22,7 +22,8 @@ from ...compiler.counter_numbers import numbers
 from ...compiler.functions import Call, address_of, empty_lanes, leaves, round_up_lanes
 from ...compiler.native import AVAILABLE
 from ..contract.observation import Array
-from ..contract.task import NoiseLayout, Task
+from ..contract.task import Task
+from ..contract.task_base import NoiseLayout
 
 AHEAD = 1 << 13
 """Lanes times measurements that NumPy makes at once: a call takes longer than the numbers of a few lanes."""

@@ -1,4 +1,4 @@
-"""The fully learned estimator of ManeuveringTarget: what :mod:`..contract.student` wants to know of it.
+"""The fully learned estimator of ManeuveringTarget: what :mod:`.student_bank` takes from it.
 
 The frame is that of the predicted velocity, along it and across it to the left, for positions and for velocities. The
 unit of a position is the measurement's sigma there, that of a velocity what such an error makes of it in a scan period.
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from ...filters.small_matrices import apply, product, transpose
 from ..contract.observation import Array, Block
-from ..contract.student import StudentBank, Track, View
 from .kalman_net import (
     FRAME,
     advance,
@@ -20,6 +19,7 @@ from .kalman_net import (
     sensor_covariance,
 )
 from .parameters import ManeuveringTargetParameters
+from .student_bank import StudentBank, Track, View
 from .world import Measurement
 
 ACCELERATION_REACH = 32.0

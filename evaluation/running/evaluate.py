@@ -26,7 +26,7 @@ from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
-from ..storage.dataset import FAULTS
+from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .kept import DRAWN_PREFIX, Kept, limits
 from .named_axes import recording_coords, with_named_axes
 from .parallel import Workers, check_workers
@@ -345,7 +345,9 @@ class Plan(NamedTuple):
     ) -> "xarray.Dataset":
         """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
         experiment = self.experiment
-        dataset = with_named_axes(per_policy, self, seeds)
+        dataset = with_named_axes(
+            per_policy, self.kinds, self.controls, self.models, self.scenario.windows, seeds
+        )
         if self.flown is not None and self.lengths is not None:
             import xarray
 
@@ -367,6 +369,12 @@ class Plan(NamedTuple):
                 dataset = with_innovations(dataset, next(iter(self.models.values())).task)
         task = next(iter(self.models.values())).task
         return dataset.assign_attrs(
+            environment=task.id,
+            scenario=self.scenario.name,
+            keywords=keywords_as_text(experiment.keywords),
+            split=experiment.split,
+            seed=whole_number(experiment.seed),
+            cost=task.reward.cost,
             paper=experiment.paper,
             reference=experiment.reference,
             notes="\n".join(self.scenario.notes),

@@ -27,13 +27,12 @@ from ..storage.dataset import (
     windows_of,
     with_windows,
 )
+from .own_metrics import Measure, OwnMetrics
 from .threads import one_thread
 from .times import METRIC, time_of, way_of
 
 if TYPE_CHECKING:
     import xarray
-
-    from .own_metrics import OwnMetrics
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 NEGLIGIBLE = 5e-5
@@ -60,16 +59,6 @@ class Record(NamedTuple):
     episodes: int
     seed: int
     split: str
-
-
-class Measure(NamedTuple):
-    """A record before it is told whose it is; what an environment's own metrics return."""
-
-    metric: str
-    component: str
-    window: str
-    estimate: Estimate
-    unit: str
 
 
 def squared_errors(
@@ -130,7 +119,7 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 
 
 def record_statistics(
-    run: "xarray.Dataset", episodes: int, metrics: "OwnMetrics | None" = None
+    run: "xarray.Dataset", episodes: int, metrics: OwnMetrics | None = None
 ) -> Iterator[Statistic]:
     """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
 
@@ -448,7 +437,7 @@ PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "re
 
 
 @one_thread()
-def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None) -> list[Record]:
+def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -> list[Record]:
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
@@ -489,7 +478,7 @@ def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None)
 
 
 def contender_of(
-    results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: "OwnMetrics | None"
+    results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: OwnMetrics | None
 ) -> Contender:
     """Return what the records of a competitor are made of.
 

@@ -8,14 +8,14 @@ import numpy
 from ...envs.contract.causes import Causes
 from ...envs.contract.model import Model
 from ...envs.data.recording import Recording
+from ..competitors.kinds import Kind
 from ..statistics.cause_split import VARIABLE
-from ..storage.dataset import keywords_as_text, whole_number, window_coords
+from ..storage.dataset import window_coords
 from .kept import DRAWN_PREFIX
 
 if TYPE_CHECKING:
     import xarray
 
-    from .evaluate import Plan
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
@@ -131,18 +131,25 @@ def _actions_aligned(
 
 
 def with_named_axes(
-    per_policy: dict[str, dict[str, numpy.ndarray]], plan: "Plan", seeds: Sequence[int]
+    per_policy: dict[str, dict[str, numpy.ndarray]],
+    kinds: Mapping[str, Kind],
+    controls: Mapping[str, str],
+    models: Mapping[str, Model],
+    windows: Mapping[str, tuple[int, int]],
+    seeds: Sequence[int],
 ) -> "xarray.Dataset":
     """Return what was kept of competitors as a dataset, and empty it on the way.
 
     Args:
         per_policy: of every competitor, what was kept by its name, ``(episodes, time, ...)``.
-        plan: of the evaluation.
+        kinds: of every competitor.
+        controls: likewise.
+        models: likewise, in which each acts.
+        windows: of the scenario.
         seeds: of the episodes.
     """
     import xarray
 
-    kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
     model = next(iter(models.values()))
     names = list(per_policy)
     components = [c.name for c in model.task.components]
@@ -175,12 +182,12 @@ def with_named_axes(
     if model.task.interval is not None:
         about = {"units": "s", "long_name": "since the start of the track"}
         coords["elapsed"] = ("time", float(model.task.interval) * times, about)
-    windows = {
+    within = {
         name: (first, min(last, model.task.horizon))
-        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
+        for name, (first, last) in {**windows, "all": (1, model.task.horizon)}.items()
         if first <= model.task.horizon
     }
-    coords |= window_coords(windows)
+    coords |= window_coords(within)
     if "mode_probability" in variables:
         coords["mode"] = list(model.task.modes)
     if VARIABLE in variables:
@@ -190,15 +197,4 @@ def with_named_axes(
         coords["start_measurements"] = Causes.of(model.task).start
     if actions:
         coords["action_name"] = list(dict.fromkeys(sum(actions.values(), ())))
-    return xarray.Dataset(
-        variables,
-        coords,
-        attrs={
-            "environment": model.task.id,
-            "scenario": scenario.name,
-            "keywords": keywords_as_text(plan.experiment.keywords),
-            "split": plan.experiment.split,
-            "seed": whole_number(plan.experiment.seed),
-            "cost": model.task.reward.cost,
-        },
-    )
+    return xarray.Dataset(variables, coords)

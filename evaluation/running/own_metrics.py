@@ -11,14 +11,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..statistics.bootstrap import Bootstrap
+from ..statistics.bootstrap import Bootstrap, Estimate
 from ..statistics.statistic import ALL, Key, Statistic
-from .metrics import Measure
 
 if TYPE_CHECKING:
     import xarray
 
 Arrays = Mapping[str, numpy.ndarray]
+
+
+class Measure(NamedTuple):
+    """A record before it is told whose it is; what an environment's own metrics return."""
+
+    metric: str
+    component: str
+    window: str
+    estimate: Estimate
+    unit: str
 
 
 class MetricInputs(NamedTuple):

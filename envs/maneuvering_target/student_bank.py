@@ -30,8 +30,8 @@ import gymnasium
 import numpy
 
 from ...filters.small_matrices import apply, outer, product, transpose
-from .filter import Bank, Initial, Measurement, TaskT
-from .observation import SIGNED_LOG, Array, Block
+from ..contract.filter import Bank, Initial, Measurement, TaskT
+from ..contract.observation import SIGNED_LOG, Array, Block
 
 GAIN_REACH = 5.0
 """Logits by which an answer of one moves a gain: from a half to 0.007 or 0.993."""
