@@ -175,7 +175,7 @@ def test_turns_are_taken_off_exactly():
     np.testing.assert_allclose(unwrap(moved, 3.0 + small, periods)[0], 3.0 + small[0], atol=2e-15)
 
 
-def test_a_smooth_function_of_many_turns_takes_none_off():
+def test_a_smooth_function_of_many_turns_takes_none_off(make):
     """Of a thousand steps of a fast sine one is a turn long by chance, for some starts."""
     wrapped = {"f": lambda x: [x[0], x[1], (x[2] + np.pi) % (2.0 * np.pi) - np.pi]}
     smooth = {"f": lambda x: [x[0] + x[1] * np.sin(x[2]), x[1], x[2]]}
@@ -184,6 +184,6 @@ def test_a_smooth_function_of_many_turns_takes_none_off():
         mean = [0.05 * i, 30.0 + 0.05 * i, 1.0]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            filtergym.state_space(f"tests/Smooth{i}-v0", **smooth, **given, mean=mean)
+            make(**smooth, **given, mean=mean)
         with pytest.warns(UserWarning, match="f takes whole turns off x3"):
-            filtergym.state_space(f"tests/Wrapped{i}-v0", **wrapped, **given, mean=mean)
+            make(**wrapped, **given, mean=mean)
