@@ -225,6 +225,9 @@ class Gated(Policy):
         ValueError: likewise.
     """
 
+    inner: ClassVar[str] = "policy"
+    """Attribute that holds the policy inside."""
+
     def __init__(
         self, model: Model, policy: Any, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
@@ -428,6 +431,7 @@ class GatedMaker:
     """
 
     kind: ClassVar[Kind] = "estimator"
+    traced_as: ClassVar[str] = "gated"
 
     def __init__(
         self,

@@ -53,6 +53,7 @@ class EstimatorMaker:
     """
 
     kind: ClassVar[Kind] = "estimator"
+    traced_as: ClassVar[str] = "learned estimator"
 
     def __init__(self, bank: str, policy: Callable[[Model], Policy]) -> None:
         self.bank, self.policy = bank, policy

@@ -79,6 +79,10 @@ class LearnedPolicy(Policy):
         ValueError: if the model does not show one of the fields.
     """
 
+    traced_as: ClassVar[str] = "network"
+    """In an export, whose code the network's own stands beside."""
+    observation_limit: ClassVar[float] = OBSERVATION_LIMIT
+
     traceable = True
 
     def __init__(

@@ -60,6 +60,9 @@ class ResidualPolicy(Policy):
         ValueError: if actions cannot be added.
     """
 
+    inner: ClassVar[str] = "agent"
+    """Attribute that holds the policy inside."""
+
     def __init__(self, model: Model, policy: Any, agent: Any) -> None:
         super().__init__(model)
         check_residual(model, policy)

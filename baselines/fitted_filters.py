@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..envs.contract.companions import find_companion
-from ..envs.contract.log_format import LogFormat, is_assumed
+from ..envs.contract.log_format import LogFormat, LogSetup
 from ..envs.contract.parameters import quote_shortened
 from ..evaluation.competitors.kinds import Competitor, Source
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
-from ..filters.geodesy import PlaneOrigin
 from .fitting import NOISE_SCALE, OUTLIER_SHARE, Fit, Interval, with_noise_scale, with_outliers
 from .problem import Problem
 from .table import Tunable, tunable
@@ -65,35 +64,6 @@ def own_family(name: str, cls: Any) -> Tunable:
                 f"{name!r}: {key} needs lower limit, value in force and upper limit, in this order, got {limits!r}"
             )
     return replace(tunable(cls, **declared), in_lanes=bool(getattr(cls, "lane_parameters", False)))
-
-
-class LogSetup(NamedTuple):
-    """How the log was read that a filter is advised for: what one needs to feed the filter in the same way."""
-
-    interval: float
-    """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
-    parameters: dict[str, Any]
-    """Of the task."""
-    columns: dict[str, str]
-    """Names in the log, by what the columns are called here; empty where the log was no table."""
-    deviations: dict[str, float]
-    """Of measurements that state none, in the names and units of the columns."""
-    deviations_from: str
-    """Who says so."""
-    origin: dict[str, float]
-    """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
-    were metres."""
-
-    @property
-    def plane(self) -> PlaneOrigin | None:
-        """That origin."""
-        return PlaneOrigin(**self.origin) if self.origin else None
-
-    @property
-    def assumed(self) -> dict[str, float]:
-        """Parameters under which a log without deviations is read as the fitted one was; empty where it stated any."""
-        isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
-        return {} if isotropic is None else {"range_sigma": isotropic}
 
 
 class Artefact(NamedTuple):

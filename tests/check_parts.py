@@ -66,7 +66,9 @@ def check(part: str) -> bool:
         modules = {module_of(file) for file in gone}
         tests = [copy / "tests" / f"{name}.py" for name in TESTS]
         left = [str(test) for test in tests if not imports_any(test, modules)]
-        smoke = subprocess.run([sys.executable, "-c", SMOKE], cwd=copy, capture_output=True, text=True, check=False)
+        smoke = subprocess.run(
+            [sys.executable, "-c", SMOKE], cwd=copy, capture_output=True, text=True, check=False
+        )
         words = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow and not claims", *left]
         done = subprocess.run(words, cwd=copy, capture_output=True, text=True, check=False)
     sound = smoke.returncode == done.returncode == 0

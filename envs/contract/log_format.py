@@ -6,6 +6,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy
 
+from ...filters.geodesy import PlaneOrigin
+
 TIME = ("time", "timestamp", "seconds")
 """Names of the column of times."""
 RECORDING = "recording"
@@ -183,3 +185,32 @@ class LogFormat:
     measurement is lost."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""
+
+
+class LogSetup(NamedTuple):
+    """How the log was read that a filter is advised for: what one needs to feed the filter in the same way."""
+
+    interval: float
+    """Median time between measurements, s: the filter was judged with a missed scan wherever more time passes."""
+    parameters: dict[str, Any]
+    """Of the task."""
+    columns: dict[str, str]
+    """Names in the log, by what the columns are called here; empty where the log was no table."""
+    deviations: dict[str, float]
+    """Of measurements that state none, in the names and units of the columns."""
+    deviations_from: str
+    """Who says so."""
+    origin: dict[str, float]
+    """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
+    were metres."""
+
+    @property
+    def plane(self) -> PlaneOrigin | None:
+        """That origin."""
+        return PlaneOrigin(**self.origin) if self.origin else None
+
+    @property
+    def assumed(self) -> dict[str, float]:
+        """Parameters under which a log without deviations is read as the fitted one was; empty where it stated any."""
+        isotropic = self.deviations.get("sigma_x") if is_assumed(self.deviations_from) else None
+        return {} if isotropic is None else {"range_sigma": isotropic}

@@ -1,11 +1,13 @@
 """A learned policy's network as C: loops over constant arrays of float, in which it was trained, summed as all else."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..agents.learned_policy import OBSERVATION_LIMIT, LearnedPolicy
 from ..compiler.c_text import FLOAT, Parameter, Scalar, array_text, function_text, literal
+
+if TYPE_CHECKING:
+    from ..agents.learned_policy import LearnedPolicy
 
 _LAYER = """/* One linear layer: the sums of all rows side by side, each in its order, so that they vectorise. */
 static void {name}_layer(
@@ -47,7 +49,7 @@ for (i = 0; i < {units}; ++i) {{
 }}"""
 
 
-def memory_size(network: LearnedPolicy) -> int:
+def memory_size(network: "LearnedPolicy") -> int:
     """Numbers that a network remembers."""
     arrays = network.arrays
     if "gru_memory_weight" in arrays:
@@ -55,7 +57,7 @@ def memory_size(network: LearnedPolicy) -> int:
     return 2 * int(arrays["lstm_memory_weight"].shape[1]) if "lstm_memory_weight" in arrays else 0
 
 
-def network_operations(network: LearnedPolicy) -> int:
+def network_operations(network: "LearnedPolicy") -> int:
     """Multiplications and additions of a network's layers; its activations are not counted."""
     sizes = {key: int(values.size) for key, values in network.arrays.items()}
     return sum(2 * size for key, size in sizes.items() if "weight" in key) + sum(
@@ -63,18 +65,18 @@ def network_operations(network: LearnedPolicy) -> int:
     )
 
 
-def scratch_size(network: LearnedPolicy) -> int:
+def scratch_size(network: "LearnedPolicy") -> int:
     """Numbers that a network holds on the stack while it answers."""
     return _width(network) * (3 if memory_size(network) else 2)
 
 
-def _width(network: LearnedPolicy) -> int:
+def _width(network: "LearnedPolicy") -> int:
     """Numbers of its widest layer, or of what it is shown."""
     outputs = [len(values) for key, values in network.arrays.items() if "weight" in key]
     return max([len(network.arrays["observation_mean"]), *outputs])
 
 
-def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str, int]:
+def network_text(network: "LearnedPolicy", name: str, scalar: Scalar) -> tuple[str, int]:
     """Write a network as ``NAME_network(shown, memory, answer)``.
 
     Args:
@@ -98,7 +100,7 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     words: dict[str, Any] = {"name": name, "real": scalar.name, "f": scalar.suffix}
     words |= {key: literal(value, scalar) for key, value in (("zero", 0.0), ("half", 0.5), ("one", 1.0))}
     body = [f"{scalar.name} x[{width}], a[{width}]{f', b[{width}]' if unit else ''};", "int i;"]
-    limit = literal(OBSERVATION_LIMIT, scalar)
+    limit = literal(network.observation_limit, scalar)
     body += [
         f"for (i = 0; i < {fields}; ++i) {{",
         f"    const {scalar.name} z = (shown[i] - ({scalar.name}){name}_observation_mean[i])"
@@ -136,7 +138,7 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     return "\n".join(text), sum(values.size for values in arrays.values()) * 4
 
 
-def _answer(network: LearnedPolicy, count: int, scalar: Scalar) -> list[str]:
+def _answer(network: "LearnedPolicy", count: int, scalar: Scalar) -> list[str]:
     """Statements that make an action of the last layer."""
     if network.output == "argmax":
         return [

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy
 
-from ..baselines.fitted_filters import LogSetup
 from ..compiler.c_text import (
     DOUBLE,
     FLOAT,
@@ -25,7 +24,7 @@ from ..compiler.c_text import (
     literal,
 )
 from ..envs.contract.companions import array_meanings, find_companion
-from ..envs.contract.log_format import TIME, LogFormat, PlainRows
+from ..envs.contract.log_format import TIME, LogFormat, LogSetup, PlainRows
 from ..evaluation.storage.files import whole_files
 from .c_filter import FilterText
 from .c_programs import INITIAL_IN_ROW, INITIAL_OF_MODEL, LOG, MAIN, PLAIN_LOG, POSITIONS, PROJECT, TEST

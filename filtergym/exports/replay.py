@@ -5,11 +5,10 @@ import copy
 import functools
 import math
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..agents.learned_policy import LearnedPolicy
 from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
 from ..compiler.interpretation import first_steps, interpret
 from ..compiler.library import portable
@@ -30,6 +29,9 @@ from .traced_filter import (
     TracedFilter,
     trace_filter,
 )
+
+if TYPE_CHECKING:
+    from ..agents.learned_policy import LearnedPolicy
 
 
 class Replay(NamedTuple):
@@ -132,7 +134,7 @@ class _Network:
         dtype: in which it computes.
     """
 
-    def __init__(self, network: LearnedPolicy, dtype: Any) -> None:
+    def __init__(self, network: "LearnedPolicy", dtype: Any) -> None:
         self.network = copy.copy(network)
         self.network.arrays = {name: values.astype(dtype) for name, values in network.arrays.items()}
         self.network.layers = [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in network.layers]

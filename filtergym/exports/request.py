@@ -5,8 +5,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ..baselines.fitted_filters import LogSetup
 from ..baselines.problem import Problem
+from ..envs.contract.log_format import LogSetup
 from ..names import file_endings, find_competitor
 
 

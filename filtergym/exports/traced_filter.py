@@ -9,14 +9,10 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from itertools import count as count_from
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..agents.gate import Gated, GatedMaker
-from ..agents.learned_estimator import EstimatorMaker
-from ..agents.learned_policy import LearnedPolicy
-from ..agents.residual import ResidualPolicy
 from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
@@ -28,6 +24,9 @@ from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.competitors.steered_filter import Decider, steer
+
+if TYPE_CHECKING:
+    from ..agents.learned_policy import LearnedPolicy
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
@@ -65,7 +64,7 @@ class TracedFilter(NamedTuple):
     """Rows of the argument ``ESTIMATE``."""
     shown: int
     """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
-    network: LearnedPolicy | None
+    network: "LearnedPolicy | None"
     """That answers between the two parts of ``update``; None where none is asked."""
 
 
@@ -120,7 +119,7 @@ def clear_missing(task: Task, measurement: Any) -> Any:
     return map_arrays(lambda own: clear(own, next(masked)), measurement)
 
 
-def count_answers(network: LearnedPolicy) -> int:
+def count_answers(network: "LearnedPolicy") -> int:
     """Numbers of an action."""
     return 1 if network.output == "argmax" else len(network.layers[-1][1])
 
@@ -133,7 +132,7 @@ class AskedNetwork(Policy):
         graph: of the inputs.
     """
 
-    def __init__(self, network: LearnedPolicy, graph: Graph) -> None:
+    def __init__(self, network: "LearnedPolicy", graph: Graph) -> None:
         super().__init__(network.model)
         self.network, self.graph = network, graph
         self.control = network.control  # type: ignore[misc]
@@ -175,11 +174,11 @@ def steps_of(
         graph: that is open.
     """
     traced = task(plain.task.parameters, namespace)
-    if isinstance(maker, EstimatorMaker):
+    if _traced_as(maker) == "learned estimator":
         policy, network = with_asked_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
         return FilterSteps(steered, functools.partial(clear_missing, traced), steered.decider), network
-    if isinstance(maker, GatedMaker):
+    if _traced_as(maker) == "gated":
         inside: list[AskedNetwork | None] = []
 
         def replace(policy: Any) -> Any:
@@ -210,16 +209,21 @@ def steps_of(
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
     """Put :class:`AskedNetwork` in the place of the network of a policy, wherever it is inside."""
-    if isinstance(policy, LearnedPolicy):
+    if _traced_as(policy) == "network":
         asked = AskedNetwork(policy, graph)
         return asked, asked
-    for outer, place in ((Gated, "policy"), (ResidualPolicy, "agent")):
-        if isinstance(policy, outer):
-            inner, asked_inside = with_asked_network(getattr(policy, place), graph)
-            policy = copy.copy(policy)
-            setattr(policy, place, inner)
-            return policy, asked_inside
-    return policy, None
+    place = getattr(policy, "inner", None)
+    if place is None:
+        return policy, None
+    inner, asked_inside = with_asked_network(getattr(policy, place), graph)
+    policy = copy.copy(policy)
+    setattr(policy, place, inner)
+    return policy, asked_inside
+
+
+def _traced_as(found: Any) -> str:
+    """What learned objects are in an export; learning is not imported for that, which may be absent."""
+    return getattr(found, "traced_as", "")
 
 
 # --- structures of arrays
