@@ -5,7 +5,7 @@ of the action space, as every action is. Training over many environments: ``to_s
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy

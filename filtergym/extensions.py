@@ -25,6 +25,9 @@ SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_poli
 WATCHES: Sequence[str] = ("agents.envelope:watch_live",)
 """Functions of a model, of the maker of a competitor and of its kind, which return what runs live in its place and what
 watches it (:class:`.evaluation.competitors.online_state.Watch`), or None."""
+DEPARTURES: Sequence[str] = ("agents.envelope:departure",)
+"""Functions of the class of a task, of the maker of an agent, of a scenario's data and of parameters, which return a
+sentence on how these depart from what the agent was trained on, or None."""
 MODEL_COMPANIONS: Sequence[str] = ("envs.logs.own_models:state_space_log_format",)
 """Functions of the definition of a model of one's own and of its defaults, each of which returns a companion of its
 task."""

@@ -9,7 +9,6 @@ import numpy
 import xarray
 from rich.table import Table
 
-from ..agents.envelope import departure
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
 from ..envs.contract.companions import find_companion
@@ -35,6 +34,7 @@ from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.storage.estimates import check_estimates, write_estimates
 from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
 from ..evaluation.storage.store import Store
+from ..extensions import DEPARTURES, load_present
 from ..names import find_competitors, ranked_names
 from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
@@ -409,9 +409,10 @@ def departure_lines(
             f"costs count in its square; --set {name}=VALUE names another"
         )
     for agent in learned:
-        found = departure(problem.task, agent.maker, data, keywords)
-        if found is not None:
-            yield f"{agent.name}: {found}"
+        for departure in load_present(DEPARTURES):
+            found = departure(problem.task, agent.maker, data, keywords)
+            if found is not None:
+                yield f"{agent.name}: {found}"
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:
