@@ -11,7 +11,7 @@ from .baselines.problem import Problem, import_problem
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
 from .evaluation.competitors.kinds import Competitor, Source, check_competitor
-from .extensions import PREFIXES, SOURCES, load
+from .extensions import PREFIXES, SOURCES, load, load_present
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """``module:Class`` of a user."""
@@ -71,8 +71,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
 
 
 def _sources() -> Iterator[Source]:
-    for place in SOURCES:
-        yield load(place)
+    yield from load_present(SOURCES)
 
 
 def _find_in_files(problem: Problem, name: str, trust: bool) -> Competitor | None:

@@ -28,7 +28,7 @@ filtergym.online("filtergym/ManeuveringTarget-v0", "imm")
 """
 TESTS = (
     "test_golden_trajectories", "test_observation", "test_parameters", "test_linear_systems", "test_bounds",
-    "test_files", "test_store", "test_vector_contract", "test_fleet", "test_compiled", "test_estimators",
+    "test_files", "test_store", "test_vector_contract", "test_compiled", "test_estimators",
     "test_evaluation", "test_bootstrap", "test_state_space", "test_draws", "test_kalman", "test_smoothers",
 )  # fmt: skip
 """Of the core."""
