@@ -31,7 +31,7 @@ class Replayed(NamedTuple):
     """Column of the last one."""
 
 
-class Tables(NamedTuple):
+class RecordedArrays(NamedTuple):
     """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
 
     measurements: Mapping[str, numpy.ndarray]
@@ -138,14 +138,14 @@ class RecordedWorld(_ForeignWorld):
     initial_normals = 1
     normals = 1
 
-    def __init__(self, task: Task, tables: Tables, name: str) -> None:
+    def __init__(self, task: Task, tables: RecordedArrays, name: str) -> None:
         super().__init__(task)
         self._name = name
         plain = type(task)(task.parameters)
         self._initial, self._measurement = measure_once(plain, tables.measurements)
-        # Tables of NumPy are read by compiled code as they are.
+        # RecordedArrays of NumPy are read by compiled code as they are.
         kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
-        self.tables = Tables(
+        self.tables = RecordedArrays(
             {name: kept(values) for name, values in tables.measurements.items()},
             {name: kept(values) for name, values in tables.initial.items()},
             None if tables.truth is None else kept(tables.truth),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..statistics.bootstrap import Bootstrap, Estimate
+from ..statistics.bootstrap import Bootstrap, IntervalEstimate
 from ..statistics.statistic import ALL, Key, Statistic
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class Measure(NamedTuple):
     metric: str
     component: str
     window: str
-    estimate: Estimate
+    estimate: IntervalEstimate
     unit: str
 
 
