@@ -36,8 +36,8 @@ from ..contract.observation import (
     nis_block,
     relative_likelihood_block,
 )
-from .equations import Equations
-from .state_space import Measurement, StateSpace, StateSpaceParameters
+from .equations import Equations, Measurement, StateSpaceProblem
+from .parameters import StateSpaceParameters
 
 AVERAGED = 0.1
 """Weight of the newest measurement in the averages that are shown."""
@@ -70,12 +70,12 @@ class Track(NamedTuple):
     """Of the state by the last update, in deviations of the process noise, ``(n, N)``; None where none sees it."""
 
 
-class KalmanBank(Bank[StateSpace, Measurement, Track]):
+class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
     """What the banks with one filter share."""
 
     parameters: StateSpaceParameters
 
-    def __init__(self, task: StateSpace, control: str) -> None:
+    def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
         self.equations: Equations = task.believed[0]
         own = self.equations.model
@@ -227,7 +227,7 @@ class KalmanNetBank(KalmanBank):
     written.
     """
 
-    def __init__(self, task: StateSpace, control: str) -> None:
+    def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
         usual = task.definition.usual_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
@@ -337,7 +337,7 @@ class Mixture(NamedTuple):
     """``(M, N)``."""
 
 
-class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
+class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
     """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
 
     Args:
@@ -353,7 +353,7 @@ class HypothesisBank(Bank[StateSpace, Measurement, Mixture]):
 
     def __init__(
         self,
-        task: StateSpace,
+        task: StateSpaceProblem,
         control: str,
         process_noise: Any = 1.0,
         measurement_noise: Any = 1.0,
