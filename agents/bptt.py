@@ -28,10 +28,10 @@ import numpy
 import torch
 
 from ..envs.contract.model import Model
-from ..envs.contract.parameters import Limits, check, check_integer
+from ..envs.contract.parameters import ParameterLimits, check, check_integer
 from ..envs.engine.catalogue import nearest
 from ..envs.engine.reward import LIKELIHOOD_WEIGHTS
-from ..envs.engine.rollout import Reward
+from ..envs.engine.rollout import TrainingObjective
 from ..envs.engine.scenario_choice import find_mixture
 from ..envs.interface.vector_environment import TaskVectorEnv
 from ..evaluation.competitors.kinds import Policy
@@ -109,7 +109,7 @@ class NetworkPolicy(torch.nn.Module):
             self.head.weight.mul_(0.1)
             self.head.bias.copy_(torch.as_tensor(numpy.arctanh(inside)))
             if self.gru is not None and longest_memory is not None:
-                check("longest_memory", longest_memory, float, Limits(above=1.0))
+                check("longest_memory", longest_memory, float, ParameterLimits(above=1.0))
                 # A unit whose update gate has the logit log T forgets over about T decisions (Tallec and Ollivier,
                 # "Can recurrent neural networks warp time?", ICLR 2018).
                 update = slice(hidden_size, 2 * hidden_size)
@@ -288,7 +288,7 @@ def _reward_to_descend(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
-def _reward_with_teacher(run: TrainingRun) -> Reward:
+def _reward_with_teacher(run: TrainingRun) -> TrainingObjective:
     """Reward whose gradient is followed, with the share of it that a teacher gives.
 
     Raises:
@@ -296,12 +296,12 @@ def _reward_with_teacher(run: TrainingRun) -> Reward:
     """
     kind, values = _reward_to_descend(run), run.hyperparameters
     if values.get("teacher") is None:
-        return Reward(kind)
+        return TrainingObjective(kind)
     if kind not in LIKELIHOOD_WEIGHTS:
         raise nearest("reward of a student", kind, LIKELIHOOD_WEIGHTS)
     share = values.get("teacher_share", 1.0)
-    check("teacher_share", share, float, Limits(above=0.0, at_most=1.0))
-    return Reward(kind, share)
+    check("teacher_share", share, float, ParameterLimits(above=0.0, at_most=1.0))
+    return TrainingObjective(kind, share)
 
 
 def _agent_of(policy: NetworkPolicy, gated: bool, model: Model) -> Policy:

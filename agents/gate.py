@@ -22,7 +22,7 @@ import numpy
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem, problem_of
 from ..envs.contract.failures import explain_errors
-from ..envs.contract.filter import Filter, Input, Likelihood
+from ..envs.contract.filter import Filter, FilterInput, Likelihood
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
@@ -56,7 +56,7 @@ NIS_MEMORY = 50.0
 ours."""
 
 
-class PaperAction(ConstantPolicy):
+class FallbackAction(ConstantPolicy):
     """The paper's algorithm as a constant action of a task's control.
 
     It is the one that the paper's policy has; under another control whose actions lie around zero, zero: the paper's
@@ -163,7 +163,7 @@ class Gate:
 
     Args:
         model: whose observations it is shown.
-        fallback: a policy, or what makes one for the model; default: :class:`PaperAction`.
+        fallback: a policy, or what makes one for the model; default: :class:`FallbackAction`.
         alarm: as of :class:`Trust`.
         window: likewise.
 
@@ -176,7 +176,7 @@ class Gate:
     ) -> None:
         self.trust = Trust(model, alarm, window)
         self.fallback: Any = check_competitor(
-            "fallback", make_competitor(fallback or PaperAction, model), "policy"
+            "fallback", make_competitor(fallback or FallbackAction, model), "policy"
         )
         own = getattr(self.fallback, "control", model.control)
         if own != model.control:
@@ -345,7 +345,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
             fallback=self.fallback.predict(state.fallback, measurement),
         )
 
-    def update(self, state: GatedState, given: Input) -> GatedState:
+    def update(self, state: GatedState, given: FilterInput) -> GatedState:
         """Let both take the measurement in, and decide who is trusted."""
         xp, measurement = self.xp, given.measurement
         agent, fallback = self.agent.update(state.agent, given), self.fallback.update(state.fallback, given)

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import numpy
 
 from ..compiler.functions import map_arrays
-from ..envs.contract.filter import Input
+from ..envs.contract.filter import FilterInput
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task
 from ..evaluation.competitors.kinds import Kind, Policy
-from ..evaluation.competitors.steered_filter import Steered, SteeredFilter, decider_of
+from ..evaluation.competitors.steered_filter import PolicyFilterState, SteeredFilter, decider_of
 
 
 class LearnedEstimator(SteeredFilter):
@@ -30,13 +30,13 @@ class LearnedEstimator(SteeredFilter):
         super().__init__(model, decider_of(model, network, interval))
         self.network = network
 
-    def predict(self, state: Steered, measurement: Any) -> Steered:
+    def predict(self, state: PolicyFilterState, measurement: Any) -> PolicyFilterState:
         """Predict in the bank."""
         return super().predict(state, fill_missing(measurement))
 
-    def update(self, state: Steered, given: Input) -> Steered:
+    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
         """Show the network what has come, and update as it answers."""
-        return super().update(state, Input(fill_missing(given.measurement)))
+        return super().update(state, FilterInput(fill_missing(given.measurement)))
 
 
 def fill_missing(measurement: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 from ..baselines.problem import Problem
 from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
-from ..evaluation.competitors.kinds import Competitor, Source
+from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
@@ -115,4 +115,4 @@ def _find_learned(name: str, problem: Problem, trust: bool, find_shipped: Any) -
     return Competitor(name, maker, True, hashlib.sha256(content).hexdigest() if shipped else None)
 
 
-LEARNED = Source(_find_learned, (".zip", ".safetensors"), pretrained_agents, with_normalisation)
+LEARNED = CompetitorFiles(_find_learned, (".zip", ".safetensors"), pretrained_agents, with_normalisation)

@@ -16,7 +16,7 @@ from ..envs.contract.model import Episode, Model
 from ..envs.contract.observation import Array, DecisionMeans
 from ..envs.engine.compiled import can_step
 from ..envs.engine.lanes import Lanes
-from ..envs.engine.rollout import Reward, Rollout
+from ..envs.engine.rollout import Rollout, TrainingObjective
 from ..envs.interface.vector_environment import TaskVectorEnv
 from ..evaluation.competitors.filters import put_in_loop
 from ..evaluation.competitors.kinds import kind_of
@@ -296,7 +296,7 @@ def _estimate(model: Model, episode: Episode) -> tuple[Array, Array]:
     return model.mean(episode), model.covariance(episode)
 
 
-COST = Reward("cost")
+COST = TrainingObjective("cost")
 
 
 class Unrolled:
@@ -318,7 +318,7 @@ class Unrolled:
         env: TaskVectorEnv,
         policy: Any,
         truncation: int,
-        reward: Reward = COST,
+        reward: TrainingObjective = COST,
         teacher: Teacher | None = None,
         gate: Gate | None = None,
         largest: float | None = None,
@@ -361,7 +361,7 @@ class Unrolled:
             ValueError: if an action is no finite number.
         """
         rollout, policy, count, interval = self._rollout, self._policy, self._lanes.count, self._interval
-        paid = 0.0
+        earned = 0.0
         policy.read()
         if self._teacher is not None:
             window = slice(self._flown, self._flown + decisions * interval)
@@ -377,7 +377,7 @@ class Unrolled:
                 rollout.action[measurement, :, :count] = action
                 rollout.noise[measurement] = self._lanes.next_row()
                 rollout.forward()
-                paid += float(rollout.reward[:count].sum())
+                earned += float(rollout.reward[:count].sum())
                 total = self._means.add(total, rollout.shown[:, :count])
             self._observation = numpy.array(self._means.show(rollout.shown[:, :count], total, numpy))
         if not numpy.isfinite(rollout.action[: decisions * interval]).all():
@@ -403,7 +403,7 @@ class Unrolled:
             rollout.shown_adjoint[self._means.columns] /= interval
         policy.add_gradients(decisions)
         rollout.go_on()
-        return -paid * share
+        return -earned * share
 
     def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:
         """Hold back actions ``(A, N)`` where nothing is wrong, and remember where they are not."""

@@ -27,7 +27,7 @@ from ..envs.data.recorded_world import fill_arrays, measure_once
 from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
-from ..evaluation.statistics.bootstrap import Estimate
+from ..evaluation.statistics.bootstrap import IntervalEstimate
 from ..evaluation.statistics.predictions import Predictions
 from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
@@ -181,7 +181,7 @@ class Advice(NamedTuple):
     """Shipped filter that one would take without the judged measurements."""
     best_shipped: str
     """Of smallest judged error, or prediction error where there is no truth: in hindsight."""
-    hindsight: Estimate
+    hindsight: IntervalEstimate
     """Judged error of the advised one over that of ``best_shipped``, less one."""
     diverging: tuple[str, ...]
     """Fitted filters that lose the track in the whole recording: no competitors."""
@@ -195,7 +195,7 @@ class Advice(NamedTuple):
     """None where the recording has no second sensor."""
     outliers: numpy.ndarray
     """Which measurements ``fitted`` takes for outliers, ``(E, T)``."""
-    dearer: tuple[str, Estimate] | None
+    dearer: tuple[str, IntervalEstimate] | None
     """Likeliest of all, and what it brings where filters were chosen, nats per measurement, its parameters paid for;
     None where it is the advised one."""
     prices: "Prices"

@@ -13,7 +13,7 @@ import numpy
 from ..envs.contract.companions import find_companion
 from ..envs.contract.log_format import LogFormat, is_assumed
 from ..envs.contract.parameters import quote_shortened
-from ..evaluation.competitors.kinds import Competitor, Source
+from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
 from ..evaluation.storage.files import write_text
 from ..evaluation.storage.stored import fits, read_json
 from ..filters.geodesy import PlaneOrigin
@@ -296,4 +296,4 @@ def _find_advised(
     return Competitor(name, shipped.maker, log=found.log)
 
 
-ADVISED = Source(_find_advised, (SUFFIX,))
+ADVISED = CompetitorFiles(_find_advised, (SUFFIX,))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.filter import Filter, Input, Likelihood
+from ..envs.contract.filter import Filter, FilterInput, Likelihood
 from ..envs.contract.observation import Array
 from ..envs.contract.task import Task
 from ..evaluation.competitors.filters import as_filter
@@ -104,9 +104,9 @@ class ScaledNoise(Filter[Task, Any, Any]):
         """Predict to the measurement as it is taken."""
         return self.own.predict(state, self.scaled(measurement, self.factor))
 
-    def update(self, state: Any, given: Input) -> Any:
+    def update(self, state: Any, given: FilterInput) -> Any:
         """Update with the measurement as it is taken."""
-        return self.own.update(state, Input(self.scaled(given.measurement, self.factor)))
+        return self.own.update(state, FilterInput(self.scaled(given.measurement, self.factor)))
 
     def mean(self, state: Any) -> Array:
         """That of the filter."""
@@ -167,7 +167,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         """Start as the filter does."""
         return RobustState(self.own.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: RobustState, given: Input) -> RobustState:
+    def update(self, state: RobustState, given: FilterInput) -> RobustState:
         """Update as stated and with wide deviations, and keep the likelier result; say the mixture's likelihood."""
         (usual, own), (wide, other), is_outlier, log_likelihood = self.compare(given.measurement, state.own)
         nis = None if own.nis is None else self.xp.where(is_outlier, other.nis, own.nis)
@@ -188,7 +188,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         return usual, wide, is_outlier, top + xp.log(xp.exp(one - top) + xp.exp(other - top))
 
     def _step(self, state: Any, measurement: Any) -> tuple[Any, Likelihood]:
-        after = self.own.step(state, Input(measurement))
+        after = self.own.step(state, FilterInput(measurement))
         return after, Likelihood.told(self.own.records(after, measurement))
 
     def mean(self, state: RobustState) -> Array:

@@ -12,7 +12,7 @@ import numpy
 
 from ..envs.data.recording import Recording
 from ..evaluation.competitors.likelihood import Span
-from ..evaluation.statistics.bootstrap import Estimate
+from ..evaluation.statistics.bootstrap import IntervalEstimate
 from ..evaluation.statistics.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from .fitting import Fit
 
@@ -83,21 +83,21 @@ class JudgedFilter(NamedTuple):
     log_likelihood: float
     """Mean of the measurements that chose, less one nat in all for each fitted parameter, nats; NaN where it says
     none."""
-    gain: Estimate
+    gain: IntervalEstimate
     """The same less that of the rival, paired."""
-    difference: Estimate
+    difference: IntervalEstimate
     """Judged log-likelihood per measurement less that of the rival, nats."""
     prediction: float
     """Root mean square of the judged prediction errors; NaN where the log format has no prediction."""
     error: float
     """Root mean square of the judged errors of the main components; NaN without truth."""
-    relative_error: Estimate
+    relative_error: IntervalEstimate
     """Judged error over that of the rival, less one; without truth of the prediction errors."""
     nis: float
     """Mean normalised innovation squared of judged measurements over its dimension."""
-    correlation: Estimate
+    correlation: IntervalEstimate
     """Of successive judged prediction errors; zero where they are white."""
-    correlations: Mapping[str, Estimate]
+    correlations: Mapping[str, IntervalEstimate]
     """Likewise of each number that is measured, by its name; empty where all are of one kind."""
 
 
@@ -183,17 +183,17 @@ class Judgement:
         """Shipped filter that is best on the measurements that judge."""
         return self._least(self._squares or self._predicted, self.judged)
 
-    def relative_error(self, name: str, other: str) -> Estimate:
+    def relative_error(self, name: str, other: str) -> IntervalEstimate:
         """Judged error over that of another, less one; without truth of the prediction errors."""
         squares = self._squares or self._predicted
         known = name in squares and other in squares
         return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
 
-    def difference(self, name: str, other: str) -> Estimate:
+    def difference(self, name: str, other: str) -> IntervalEstimate:
         """Chosen log-likelihood of a filter less that of another, their fitted parameters paid for, nats."""
         found = self.predictions.difference(name, other, self.chosen)
         penalty = (self.parameters.get(name, 0) - self.parameters.get(other, 0)) / self.chosen.sum()
-        return Estimate(*(value - penalty for value in found))
+        return IntervalEstimate(*(value - penalty for value in found))
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.
@@ -222,7 +222,7 @@ class Judgement:
             name in self.parameters,
             self.parameters.get(name, 0),
             mean_of(found.log_likelihood(name), self.chosen) - penalty,
-            Estimate(*(value - penalty for value in gain)),
+            IntervalEstimate(*(value - penalty for value in gain)),
             found.difference(name, rival, judged),
             math.sqrt(mean_of(self._predicted[name], judged)) if name in self._predicted else math.nan,
             math.sqrt(mean_of(self._squares[name], judged)) if self._squares else math.nan,

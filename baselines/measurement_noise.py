@@ -69,7 +69,7 @@ class FadingNoise(MeasurementNoise):
         self.forgetting, self.trust = 1.0 - 1.0 / memory, memory if trust is None else trust
 
 
-class SageHusa(FadingNoise):
+class SageHusaMeasurementNoise(FadingNoise):
     """By the fading mean square of the innovations; arguments as of :class:`FadingNoise`."""
 
     def start(self, stated: Array) -> adaptation.Level:
@@ -84,7 +84,7 @@ class SageHusa(FadingNoise):
         return level.value, level
 
 
-class VariationalBayes(FadingNoise):
+class VariationalBayesMeasurementNoise(FadingNoise):
     """By an inverse-gamma distribution; arguments as of :class:`FadingNoise`, with ``rho`` for ``b``."""
 
     iterations = 2
@@ -110,7 +110,13 @@ class VariationalBayes(FadingNoise):
 
 RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
     "mehra": (Mehra, "by the mean square of the last innovations (Mehra 1972)"),
-    "sage-husa": (SageHusa, "by the fading mean square of the innovations (Sage and Husa 1969)"),
-    "variational-bayes": (VariationalBayes, "by variational Bayes (Särkkä and Nummenmaa 2009)"),
+    "sage-husa": (
+        SageHusaMeasurementNoise,
+        "by the fading mean square of the innovations (Sage and Husa 1969)",
+    ),
+    "variational-bayes": (
+        VariationalBayesMeasurementNoise,
+        "by variational Bayes (Särkkä and Nummenmaa 2009)",
+    ),
 }
 """Rules by their names in tables, and how they estimate the noise."""

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.contract.filter import Filter, Initial, Input, Likelihood, Track
+from ..envs.contract.filter import EstimateState, Filter, FilterInput, Initial, Likelihood
 from ..envs.contract.model import Model
 from ..envs.contract.observation import Array
 from ..envs.linear.equations import Equations
-from ..envs.linear.state_space import Measurement, StateSpace, Truth
-from ..envs.linear.state_space_banks import HypothesisBank, Mixture
+from ..envs.linear.state_space import StateSpace, StateSpaceMeasurement, StateSpaceTruth
+from ..envs.linear.state_space_banks import Mixture, MultipleModelBank
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, smoothing, unscented
 from ..filters.array_namespace import namespace, select_nested
@@ -27,7 +27,7 @@ UNCERTAIN = 1e-9
 """Of Q, added to the initial covariance of sigma points: they need a positive definite one."""
 
 
-class Kalman(ConstantPolicy):
+class StateSpaceKalman(ConstantPolicy):
     """The Kalman filter as written, extended where the model is not linear."""
 
     control = "noise"
@@ -53,7 +53,7 @@ class CovarianceMatching(Policy):
         return numpy.stack([process, 0.0 * process], axis=1), None
 
 
-class InteractingMultipleModel(ConstantPolicy):
+class StateSpaceInteractingMultipleModel(ConstantPolicy):
     """The interacting multiple model of the hypotheses."""
 
     control = "evidence"
@@ -74,7 +74,7 @@ def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
     )
 
 
-def _numbers(measurement: Measurement, xp: Any) -> Array:
+def _numbers(measurement: StateSpaceMeasurement, xp: Any) -> Array:
     """Values with zero in place of what was not received."""
     return xp.where(measurement.available > 0.0, measurement.values, 0.0)
 
@@ -82,7 +82,7 @@ def _numbers(measurement: Measurement, xp: Any) -> Array:
 class Past(NamedTuple):
     """A measurement that something may still come for."""
 
-    measurement: Measurement
+    measurement: StateSpaceMeasurement
     truth: Any
     """What a reference was told with it; None for everyone else."""
     happened: Array
@@ -125,7 +125,7 @@ def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
     own, none = task.definition, 0.0 * begun.mean[0]
     zeros = lambda rows: task.xp.stack([none] * rows)  # noqa: E731
     m = own.filters[0].h.size
-    empty = Measurement(
+    empty = StateSpaceMeasurement(
         zeros(m),
         zeros(m),
         none + task.parameters.sampling_interval if own.filters[0].timed else None,
@@ -135,7 +135,9 @@ def _buffer(task: StateSpace, begun: Any, truth: Any = None) -> Any:
     return Buffered(begun, begun, (past,) * task.parameters.lateness)
 
 
-def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], truth: Any = None) -> Any:
+def _in_order(
+    state: Any, measurement: StateSpaceMeasurement, step: Callable[..., Any], truth: Any = None
+) -> Any:
     """Take a measurement in; where something comes late with it, that first, where it belongs, and again what followed.
 
     Args:
@@ -161,7 +163,7 @@ def _in_order(state: Any, measurement: Measurement, step: Callable[..., Any], tr
     return Buffered(step(now, past[-1]), settled, past)
 
 
-class Extended(Filter[StateSpace, Measurement, Track]):
+class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
     """The Kalman filter as written, extended where the model is not linear, as an estimator.
 
     A late measurement is taken in where it belongs.
@@ -182,35 +184,37 @@ class Extended(Filter[StateSpace, Measurement, Track]):
         self.of_sources, of_sensors = _split(task, noises)
         self.sensor_factors = measurement_noise, of_sensors
 
-    def process_noise(self, mean: Array, measurement: Measurement) -> Array:
+    def process_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
         """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.factor * self.equations.process_noise(mean, measurement, self.of_sources)
 
-    def sensor_noise(self, mean: Array, measurement: Measurement) -> Array:
+    def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
         """R with its factors at a predicted mean ``(n, N)``, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement, *self.sensor_factors)
 
     def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
-        begun = Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun)
 
-    def update(self, state: Any, given: Input) -> Any:
+    def update(self, state: Any, given: FilterInput) -> Any:
         """Predict and update."""
         return _in_order(state, given.measurement, self.take)
 
-    def take(self, state: Track, one: Past) -> Track:
+    def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Predict to a measurement and take it in."""
         measurement = one.measurement
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         Q = self.process_noise(mean, measurement)
         R = self.sensor_noise(mean, measurement)
         result = _update(self.equations, mean, carried + Q, R, measurement, self.xp)
-        return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
+        return EstimateState(
+            result.mean, result.covariance, _likelihood(result, measurement.available, self.xp)
+        )
 
 
 def _update(
-    equations: Equations, mean: Array, P: Array, R: Array, measurement: Measurement, xp: Any
+    equations: Equations, mean: Array, P: Array, R: Array, measurement: StateSpaceMeasurement, xp: Any
 ) -> kalman.Update:
     received = equations.receive(measurement._replace(values=_numbers(measurement, xp)), mean, R)
     return update_with_gain(mean, P, received, equations.gain(P, received))
@@ -241,20 +245,22 @@ class ExtendedSmoother(Extended):
         super().__init__(task, process_noise, measurement_noise, **noises)
         self.lag = lag
 
-    def smooth(self, measurements: Sequence[Measurement], states: Sequence[Any]) -> tuple[Array, Array]:
+    def smooth(
+        self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
+    ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
         if isinstance(states[0], Buffered):
             measurements = _put_in_order(measurements, self.task.parameters.lateness, self.xp)
             states = [states[0].now]
             for measurement in measurements:
                 states.append(self.take(states[-1], Past(measurement, None, None)))
-        filtered = smoothing.Estimate(*smoothing.stack_scans([state[:2] for state in states]))
+        filtered = smoothing.Gaussian(*smoothing.stack_scans([state[:2] for state in states]))
         before = smoothing.drop_last(filtered.mean)
         motion = smoothing.over_time(self._motion, before, smoothing.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
-    def _motion(self, mean: Array, measurement: Measurement) -> smoothing.Motion:
+    def _motion(self, mean: Array, measurement: StateSpaceMeasurement) -> smoothing.Motion:
         """How the state moves from a mean ``(n, N)`` to a measurement."""
         equations, each = self.equations, 0.0 * mean[0]
         predicted = equations.move(mean, measurement)
@@ -264,7 +270,9 @@ class ExtendedSmoother(Extended):
         )
 
 
-def _put_in_order(measurements: Sequence[Measurement], lateness: int, xp: Any) -> list[Measurement]:
+def _put_in_order(
+    measurements: Sequence[StateSpaceMeasurement], lateness: int, xp: Any
+) -> list[StateSpaceMeasurement]:
     """Measurements with what came late among those that it belongs to."""
     found = []
     for k, own in enumerate(measurements):
@@ -298,7 +306,7 @@ class Unscented(Extended):
         """Start where everyone starts, nowhere certain."""
         return super().start(initial._replace(covariance=initial.covariance + self.uncertain))
 
-    def take(self, state: Track, one: Past) -> Track:
+    def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Predict to a measurement and take it in by sigma points."""
         measurement = one.measurement
         own = self.equations
@@ -317,10 +325,12 @@ class Unscented(Extended):
             points,
             own.subtract,
         )
-        return Track(result.mean, result.covariance, _likelihood(result, measurement.available, self.xp))
+        return EstimateState(
+            result.mean, result.covariance, _likelihood(result, measurement.available, self.xp)
+        )
 
 
-class InteractingKalman(Filter[StateSpace, Measurement, Any]):
+class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
     """The interacting multiple model as an estimator; arguments as of :class:`Extended`."""
 
     def __init__(
@@ -328,13 +338,13 @@ class InteractingKalman(Filter[StateSpace, Measurement, Any]):
     ) -> None:
         super().__init__(task)
         factors = process_noise, measurement_noise
-        self.bank = HypothesisBank(task, "evidence", *factors, *_split(task, noises))
+        self.bank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
         return _buffer(self.task, self.bank.start(initial))
 
-    def update(self, state: Any, given: Input) -> Any:
+    def update(self, state: Any, given: FilterInput) -> Any:
         """Predict and update, without evidence."""
         return _in_order(state, given.measurement, self.take)
 
@@ -344,7 +354,7 @@ class InteractingKalman(Filter[StateSpace, Measurement, Any]):
         predicted = self.bank.predict(state, measurement)
         return self.bank.act(predicted, measurement, 0.0 * predicted.action)
 
-    def records(self, state: Any, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: Any, measurement: StateSpaceMeasurement) -> dict[str, Array]:
         """How likely the measurement was."""
         own = state.now if isinstance(state, Buffered) else state
         return {"log_likelihood": self.bank.records(own, measurement)["log_likelihood"]}
@@ -362,24 +372,24 @@ class KnownModel:
     def __init__(self, task: StateSpace) -> None:
         self.task, self.xp = task, task.xp
 
-    def start(self, initial: Initial, truth: Truth) -> Any:
+    def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
         """Start where everyone starts."""
-        begun = Track(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
+        begun = EstimateState(initial.mean, initial.covariance, Likelihood.unknown(initial.mean[0]))
         return _buffer(self.task, begun, self._told(truth))
 
     def update(
-        self, memory: Any, measurement: Measurement, truth: Truth
+        self, memory: Any, measurement: StateSpaceMeasurement, truth: StateSpaceTruth
     ) -> tuple[Array, Array, Any, Likelihood]:
         """Predict and update with the model in force."""
         after = _in_order(memory, measurement, self.take, self._told(truth))
         return after.mean, after.covariance, after, after.likelihood
 
     @staticmethod
-    def _told(truth: Truth) -> Truth:
+    def _told(truth: StateSpaceTruth) -> StateSpaceTruth:
         """What is needed of it."""
         return truth._replace(state=None, inputs=None, sensors=None, waiting=None)
 
-    def take(self, state: Track, one: Past) -> Track:
+    def take(self, state: EstimateState, one: Past) -> EstimateState:
         """Predict to a measurement and take it in."""
         (measurement, truth, _), xp, chosen = one, self.xp, None
         world: Any = self.task.world
@@ -395,7 +405,7 @@ class KnownModel:
                 else kalman.Update(*(xp.where(held, a, b) for a, b in zip(result, chosen, strict=True)))
             )
         assert chosen is not None
-        return Track(chosen.mean, chosen.covariance, _likelihood(chosen, measurement.available, xp))
+        return EstimateState(chosen.mean, chosen.covariance, _likelihood(chosen, measurement.available, xp))
 
 
 def _split(task: StateSpace, noises: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -438,7 +448,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
     several = len(task.definition.filters) > 1
     linear = all(model.is_linear for model in task.definition.filters)
     policies: dict[str, Any] = {
-        "kalman": Kalman,
+        "kalman": StateSpaceKalman,
         "covariance-matching": CovarianceMatching,
         "random": RandomPolicy,
     }
@@ -446,7 +456,7 @@ def state_space_baselines(task: type[StateSpace]) -> Baselines:
     if not linear:
         estimators["unscented"] = Unscented
     if several:
-        policies = {"imm": InteractingMultipleModel, **policies}
+        policies = {"imm": StateSpaceInteractingMultipleModel, **policies}
         estimators["kalman-imm"] = InteractingKalman
     paper = next(iter(policies))
     families = {name: tunable(make, **_scales(task)) for name, make in estimators.items()}

@@ -29,7 +29,7 @@ from filtergym.baselines.problem import Problem, problem_of
 from filtergym.compiler.c_text import DOUBLE, FLOAT, Scalar
 from filtergym.compiler.functions import empty_lanes
 from filtergym.compiler.native import native
-from filtergym.envs.contract.filter import Input
+from filtergym.envs.contract.filter import FilterInput
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue
 from filtergym.evaluation.competitors.filters import as_filter
@@ -210,7 +210,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
     else:
         filter = steer(plain, make_competitor(maker, plain))
     state = filter.start(started[0])
-    return least_time(lambda: filter.step(state, Input(measurement)), 3)
+    return least_time(lambda: filter.step(state, FilterInput(measurement)), 3)
 
 
 def least_time(call: Any, count: int) -> float:

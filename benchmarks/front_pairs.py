@@ -17,7 +17,7 @@ import xarray
 import filtergym
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.evaluation.running.times import EQUAL_TIMES, FRONT_MARK, Point, front, time_of, time_text
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from filtergym.papers.grid import markdown_table
 
 CLASSICAL: dict[str, tuple[int, tuple[str, ...]]] = {
@@ -103,7 +103,7 @@ def rows_of(results: xarray.Dataset, environment: str, learned: Collection[str])
     return rows
 
 
-def percent(found: Estimate) -> str:
+def percent(found: IntervalEstimate) -> str:
     """Return a difference and its interval."""
     return f"{100.0 * found.value:+.1f} [{100.0 * found.low:+.1f}, {100.0 * found.high:+.1f}]"
 

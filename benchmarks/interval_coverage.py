@@ -20,7 +20,7 @@ from filtergym.envs.contract.companions import lost_cost
 from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.evaluation.running.metrics import mean_over_time
 from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate, share_interval
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.names import find_competitor
 
@@ -71,7 +71,7 @@ def truths(pool: Pool) -> list[float]:
     ]
 
 
-def intervals(pool: Pool, bootstrap: Bootstrap) -> list[Estimate]:
+def intervals(pool: Pool, bootstrap: Bootstrap) -> list[IntervalEstimate]:
     """Every statistic of some episodes with its interval, likewise."""
     own, paper = bootstrap.means(numpy.stack([pool.own, pool.paper], axis=1)).T
     return [

@@ -25,7 +25,7 @@ from filtergym.baselines.fitting import fit
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.state_space import Extended
 from filtergym.baselines.table import Variant, without_logarithms
-from filtergym.envs.contract.filter import Input
+from filtergym.envs.contract.filter import FilterInput
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from filtergym.evaluation.statistics.bootstrap import Bootstrap
@@ -149,7 +149,7 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
     state, total = own.start(tile(windows.initial)), 0.0
     counts = [i for i, weight in enumerate(task.definition.weights) if weight]
     for k, measurement in enumerate(windows.measurements):
-        state = own.update(state, Input(tile(measurement)))
+        state = own.update(state, FilterInput(tile(measurement)))
         truth = recording.truth[:, min(k, recording.truth.shape[1] - 1), counts].T
         squares = ((own.mean(state)[counts] - lanes(truth)) ** 2).sum(axis=0)
         total = total + np.where(k < np.tile(recording.rows, count), squares, 0.0)

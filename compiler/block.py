@@ -10,7 +10,7 @@ LANES = 8
 """Lanes that the width of every array is a multiple of: those of the widest block."""
 
 
-class Block:
+class LaneBlock:
     """So many lanes side by side.
 
     Args:
@@ -51,7 +51,7 @@ class Block:
 
 
 @functools.cache
-def block_for(features: str) -> Block:
+def block_for(features: str) -> LaneBlock:
     """Return the block of one register: eight lanes with AVX-512, four on any other processor.
 
     Args:
@@ -61,6 +61,6 @@ def block_for(features: str) -> Block:
 
 
 @functools.cache
-def block_of(lanes: int) -> Block:
+def block_of(lanes: int) -> LaneBlock:
     """Return the block of so many lanes."""
-    return Block(lanes)
+    return LaneBlock(lanes)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .c_text import WIDTH, Scalar, array_text, comment, expression, literal
-from .program import Program
+from .program import StraightLineProgram
 from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, steady
 
 MOST = 4
@@ -51,7 +51,7 @@ class Loops:
 
     def __init__(
         self,
-        program: Program,
+        program: StraightLineProgram,
         name: str,
         read: Callable[[int, int], str],
         write: Callable[[int, int], str],

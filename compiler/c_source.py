@@ -24,7 +24,7 @@ from .c_text import (
 )
 from .interpretation import first_steps
 from .parts import FREE, Statement, cut_parts, scratch_slots
-from .program import Program
+from .program import StraightLineProgram
 from .rolling import roll_where_shorter
 
 PART = 200
@@ -34,7 +34,7 @@ INLINED = 8_000
 take it more than three minutes in place of half of one, and 9,500 run a quarter slower; 2,700 run twice as fast."""
 
 
-class Source(NamedTuple):
+class ProgramSource(NamedTuple):
     """A program as text."""
 
     functions: str
@@ -68,7 +68,9 @@ _HELPERS = {
 }
 
 
-def helper_functions(programs: Sequence[Program], scalar: Scalar = DOUBLE, qualifier: str = "static ") -> str:
+def helper_functions(
+    programs: Sequence[StraightLineProgram], scalar: Scalar = DOUBLE, qualifier: str = "static "
+) -> str:
     """Return the functions that statements of these programs call beside those of ``math.h``."""
     used = {name for program in programs for name in program.steps.operations}
     words = {
@@ -80,11 +82,15 @@ def helper_functions(programs: Sequence[Program], scalar: Scalar = DOUBLE, quali
     return "\n".join(qualifier + text.format(**words) for name, text in _HELPERS.items() if name in used)
 
 
-class _Text:
+class _ProgramText:
     """Statements of a program; values are named by the steps that they come from."""
 
     def __init__(
-        self, program: Program, read: Callable[[int, int], str], scalar: Scalar, tables: Mapping[int, str]
+        self,
+        program: StraightLineProgram,
+        read: Callable[[int, int], str],
+        scalar: Scalar,
+        tables: Mapping[int, str],
     ) -> None:
         self.program, self.read, self.scalar, self.tables = program, read, scalar, tables
         self.steps = program.steps.all()
@@ -123,7 +129,7 @@ class _Text:
 
 
 def write_program(
-    program: Program,
+    program: StraightLineProgram,
     name: str,
     parameters: Sequence[Parameter],
     read: Callable[[int, int], str],
@@ -133,7 +139,7 @@ def write_program(
     between: Sequence[str] = (),
     results: int = 0,
     arrays: Arrays | None = None,
-) -> Source:
+) -> ProgramSource:
     """Write a program as statements, in loops where that is shorter.
 
     A result is written as soon as it is computed: what is written must not be what is read.
@@ -167,7 +173,7 @@ def write_program(
         count, together = rolled.scratch, len(blocks) == 1
     else:
         together = count_operations <= PART
-        text = _Text(program, read, scalar, tables)
+        text = _ProgramText(program, read, scalar, tables)
         parts, before = cut_parts(program, PART, first_steps(program, results) if between else 0)
         slots = {} if together else scratch_slots(program, parts)
         everything: set[Statement] = set(range(len(program.steps)))
@@ -193,7 +199,7 @@ def write_program(
         if not step.logical
     ]
     replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
-    return Source("\n".join(defined), body, count_operations, count, replaced)
+    return ProgramSource("\n".join(defined), body, count_operations, count, replaced)
 
 
 def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], int]:
@@ -209,7 +215,7 @@ def _packed(blocks: Sequence[list[str]], pause: int) -> tuple[list[list[str]], i
 
 
 def _statements(
-    text: _Text,
+    text: _ProgramText,
     part: Sequence[Statement],
     own: Set[Statement],
     write: Callable[[int, int], str],
@@ -240,7 +246,9 @@ def _function(name: str, parameters: Sequence[Parameter], body: Sequence[str], q
     return function_text(f"{qualifier}void", name, parameters, body)
 
 
-def write_lanes(program: Program, name: str, lane_first: Sequence[bool], cuda: bool = False) -> str:
+def write_lanes(
+    program: StraightLineProgram, name: str, lane_first: Sequence[bool], cuda: bool = False
+) -> str:
     """Write a program as a function that goes through lanes, in double; of CUDA as a kernel, a thread for each lane.
 
     The function takes ``a``, the arrays one after another, ``stride``, numbers from one row of each to the next, and

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy
 
-from .block import Block, block_for
+from .block import LaneBlock, block_for
 from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
 from .functions import Call, address_of
 from .native import Code, native_text, processor
@@ -27,7 +27,7 @@ class Value:
         whole: which of the two it is.
     """
 
-    def __init__(self, text: "_Text", name: str, whole: bool) -> None:
+    def __init__(self, text: "_VectorText", name: str, whole: bool) -> None:
         self.text, self.name, self.whole = text, name, whole
 
     def _with(self, operator: str, other: "Value | int | float") -> "Value":
@@ -62,7 +62,7 @@ class Value:
         return self._with(">>", other)
 
 
-class _Text:
+class _VectorText:
     """Vector code for a block of lanes, and the :class:`~.counter_numbers.Machine` of its values.
 
     Args:
@@ -70,7 +70,7 @@ class _Text:
         block: the lanes.
     """
 
-    def __init__(self, prefix: str, block: Block) -> None:
+    def __init__(self, prefix: str, block: LaneBlock) -> None:
         self.lines: list[str] = []
         self._prefix, self._count = prefix, 0
         self.block = block
@@ -132,17 +132,17 @@ class _Text:
 Make = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
-def _write_pair(text: _Text, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
+def _write_pair(text: _VectorText, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
     """Write how two numbers are made of key, episode, measurement and pair; returns their names."""
     one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
     return one.name, other.name
 
 
 def _loop(
-    block: Block, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
+    block: LaneBlock, kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str
 ) -> list[str]:
     """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
-    text = _Text(f"%{kind}", block)
+    text = _VectorText(f"%{kind}", block)
     one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
     return [
         f"%some_{kind} = icmp sgt i64 {count}, 0",
@@ -173,7 +173,7 @@ def _loop(
 
 
 @functools.cache
-def llvm_text(block: Block) -> str:
+def llvm_text(block: LaneBlock) -> str:
     """Text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes its numbers.
 
     The table holds nothing, then address and stride of identities, of measurements and of the rows, then how many of

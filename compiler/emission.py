@@ -11,12 +11,12 @@ import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from .block import Block
+from .block import LaneBlock
 from .instructions import HEADER, INTRINSIC, Instructions
 from .library import BINARY, Library
-from .loop_emission import LoopText, Tables
+from .loop_emission import DistanceTables, LoopText
 from .parts import cut_parts, product_places, scratch_slots
-from .program import BAND, FUNCTIONS, OPERATIONS, Program
+from .program import BAND, FUNCTIONS, OPERATIONS, StraightLineProgram
 from .rolling import roll_where_shorter
 
 LONG = 5000
@@ -37,7 +37,9 @@ class _Places(NamedTuple):
 class _Part(Instructions):
     """Text of one part; values are named by the steps that they come from."""
 
-    def __init__(self, program: Program, lane_first: Sequence[bool], places: "_Places", block: Block) -> None:
+    def __init__(
+        self, program: StraightLineProgram, lane_first: Sequence[bool], places: "_Places", block: LaneBlock
+    ) -> None:
         super().__init__(lane_first, block)
         self.steps, self.places = program.steps.all(), places
         self.known: set[int] = set()
@@ -110,10 +112,10 @@ class _Part(Instructions):
 
 
 def emit(
-    program: Program,
+    program: StraightLineProgram,
     lane_first: Sequence[bool],
     library: Library,
-    block: Block,
+    block: LaneBlock,
     part: int,
     loops: bool = False,
 ) -> str:
@@ -135,7 +137,7 @@ def emit(
     if rolled is None:
         functions, slots = _parts(program, lane_first, block, part)
     else:
-        tables = Tables()
+        tables = DistanceTables()
         functions = [
             LoopText(loop, lane_first, block, tables).text(number) for number, loop in enumerate(rolled.loops)
         ]
@@ -146,7 +148,7 @@ def emit(
 
 
 def _parts(
-    program: Program, lane_first: Sequence[bool], block: Block, size: int
+    program: StraightLineProgram, lane_first: Sequence[bool], block: LaneBlock, size: int
 ) -> tuple[list[list[str]], int]:
     """Functions of a straight line, and the places of the scratch array that they use."""
     parts, _ = cut_parts(program, size)
@@ -167,7 +169,7 @@ def _parts(
     return functions, places.vector + max(vectors, default=0)
 
 
-def _entry(block: Block, parts: int, slots: int) -> Iterator[str]:
+def _entry(block: LaneBlock, parts: int, slots: int) -> Iterator[str]:
     yield "define void @program(ptr %table, i64 %first, i64 %last) {"
     yield "entry:"
     yield f"%scratch = alloca {block.numbers}, i64 {slots}, align {block.alignment}"
@@ -186,13 +188,13 @@ def _entry(block: Block, parts: int, slots: int) -> Iterator[str]:
     yield "}"
 
 
-def product_symbol(block: Block) -> str:
+def product_symbol(block: LaneBlock) -> str:
     """Name of the function that programs call for the product of a matrix."""
     return f"filtergym_product_{block.lanes}"
 
 
 @functools.cache
-def product_text(block: Block) -> str:
+def product_text(block: LaneBlock) -> str:
     """Text whose ``@program(matrix, vector, result, columns, bands)`` is the product of a matrix of constants with a
     vector of lane values: bands of rows side by side, each row's terms added one after the other.
 
@@ -204,7 +206,7 @@ def product_text(block: Block) -> str:
     return "\n".join(_product_lines(block))
 
 
-def _product_lines(block: Block) -> Iterator[str]:
+def _product_lines(block: LaneBlock) -> Iterator[str]:
     sums = range(BAND)
     yield "define void @program(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
     yield "                     ptr noalias %result, i64 %columns, i64 %bands) {"
@@ -246,7 +248,7 @@ def _product_lines(block: Block) -> Iterator[str]:
     yield "}"
 
 
-def _declarations(program: Program, library: Library, block: Block) -> Iterator[str]:
+def _declarations(program: StraightLineProgram, library: Library, block: LaneBlock) -> Iterator[str]:
     """Intrinsics, and functions of a block made of the library's."""
     used = program.steps.operations
     if "product" in used:
@@ -262,7 +264,7 @@ def _declarations(program: Program, library: Library, block: Block) -> Iterator[
         yield from _of_block(block, name, *library.functions[name][:2])
 
 
-def _of_block(block: Block, name: str, symbol: str, lanes: int) -> Iterator[str]:
+def _of_block(block: LaneBlock, name: str, symbol: str, lanes: int) -> Iterator[str]:
     """A function of a block, made of one of the library's that takes so many lanes."""
     width, numbers = block.lanes, block.numbers
     kind = "double" if lanes == 1 else f"<{lanes} x double>"

@@ -13,7 +13,7 @@ from . import namespace
 from .block import LANES
 from .library import Library
 from .native import Code, Native, native
-from .program import Graph, Program, Result, program
+from .program import Graph, ProgramResult, StraightLineProgram, program
 
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
 UNCOUNTED = 65_536
@@ -119,12 +119,12 @@ class Specialised:
             for output, i in enumerate(same)
         ]
         wanted = [
-            Result(len(self.inputs) + place, row, node)
+            ProgramResult(len(self.inputs) + place, row, node)
             for place, array in enumerate(made)
             if self.same[place] is None
             for row, node in enumerate(array.nodes.ravel().tolist())
         ]
-        self.program: Program = program(graph, wanted)
+        self.program: StraightLineProgram = program(graph, wanted)
         self.lane_first = [False] * (len(self.inputs) + len(self.outputs))
         self.lane_first[-1] = turned
         self.lane_first[0] |= given_turned
@@ -264,7 +264,7 @@ def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
     return array if leaf.kind == "f" else namespace.Traced(array.nodes, namespace.int64)
 
 
-class Function:
+class CompiledFunction:
     """A function that is traced and compiled for every structure of arguments that it meets.
 
     Args:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from .block import Block
+from .block import LaneBlock
 
 _INFIX = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
 _COMPARE = {"less": "olt", "less_equal": "ole", "greater": "ogt", "greater_equal": "oge"}
@@ -25,7 +25,7 @@ class Instructions:
         lines: the text.
     """
 
-    def __init__(self, lane_first: Sequence[bool], block: Block, head: list[str] | None = None) -> None:
+    def __init__(self, lane_first: Sequence[bool], block: LaneBlock, head: list[str] | None = None) -> None:
         self.lane_first = lane_first
         self.block, self.numbers, self.truths = block, block.numbers, block.truths
         self.lines: list[str] = []

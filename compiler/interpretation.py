@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy
 
-from .program import BAND, FUNCTIONS, OPERATIONS, Program, unband
+from .program import BAND, FUNCTIONS, OPERATIONS, StraightLineProgram, unband
 
 _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": numpy.where}
 
 
-def first_steps(program: Program, results: int) -> int:
+def first_steps(program: StraightLineProgram, results: int) -> int:
     """Number of steps after which the first results are known."""
     return 1 + max((result.node for result in program.results[:results]), default=-1)
 
 
 def interpret(
-    program: Program,
+    program: StraightLineProgram,
     read: Callable[[int, int], Any],
     dtype: Any = numpy.float64,
     between: Callable[[Sequence[numpy.ndarray]], None] | None = None,

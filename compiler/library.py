@@ -19,7 +19,7 @@ ROUNDING = ("floor", "ceil", "trunc", "rint", "fma")
 """What LLVM asks the C library for where the processor has no instruction."""
 
 
-class Function(NamedTuple):
+class LibraryFunction(NamedTuple):
     """Function of a library."""
 
     symbol: str
@@ -32,7 +32,7 @@ class Library(NamedTuple):
     """Where functions come from."""
 
     name: str
-    functions: dict[str, Function]
+    functions: dict[str, LibraryFunction]
     """By the names of :data:`~.program.FUNCTIONS`, and those of ``ROUNDING``."""
 
 
@@ -59,7 +59,7 @@ def portable() -> Library:
     for name in (*FUNCTIONS, *ROUNDING):
         address = library and _address(library, name)
         if address:
-            functions[name] = Function(name, 1, address)
+            functions[name] = LibraryFunction(name, 1, address)
     return Library("C library", functions)
 
 
@@ -83,5 +83,5 @@ def fastest(features: str) -> Library:
         symbol = f"_ZGV{letter}N{lanes}{'vv' if name in BINARY else 'v'}_{name}"
         address = _address(vectors, symbol)
         if address:
-            functions[name] = Function(symbol, lanes, address)
+            functions[name] = LibraryFunction(symbol, lanes, address)
     return Library(f"libmvec, {lanes} numbers a call", functions)

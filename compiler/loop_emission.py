@@ -5,12 +5,12 @@ A member's number lies where the turn says: a multiple of its number away from t
 
 from collections.abc import Sequence
 
-from .block import Block
+from .block import LaneBlock
 from .instructions import HEADER, Instructions
 from .rolling import CONSTANTS, SCRATCH, TURN, Loop, Operand, Statement, steady
 
 
-class Tables:
+class DistanceTables:
     """Distances of members that are not always the same, as constants of the text."""
 
     def __init__(self) -> None:
@@ -46,7 +46,9 @@ class LoopText(Instructions):
         tables: of all loops.
     """
 
-    def __init__(self, loop: Loop, lane_first: Sequence[bool], block: Block, tables: Tables) -> None:
+    def __init__(
+        self, loop: Loop, lane_first: Sequence[bool], block: LaneBlock, tables: DistanceTables
+    ) -> None:
         super().__init__(lane_first, block, [])
         self.loop, self.tables = loop, tables
         self._values: dict[Operand, str] = {}

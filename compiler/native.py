@@ -18,7 +18,7 @@ from . import cache, emission
 from .block import LANES, block_for, block_of
 from .emission import emit, product_symbol, product_text
 from .library import Library, fastest
-from .program import LOCK, Program
+from .program import LOCK, StraightLineProgram
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether programs can be compiled here."""
@@ -188,7 +188,7 @@ class Code:
         return self._run
 
 
-def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Code:
+def native(program: StraightLineProgram, lane_first: Sequence[bool], library: Library | None = None) -> Code:
     """Return the code of a program; one for all programs that differ in nothing but constants.
 
     Args:
@@ -253,7 +253,7 @@ def _key(*texts: str) -> str:
     return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
 
 
-def _text_of(program: Program) -> str:
+def _text_of(program: StraightLineProgram) -> str:
     """Text that tells programs apart that have other steps or results: it takes less time than that which is emitted,
     and other numbers leave it as it is.
     """

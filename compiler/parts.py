@@ -5,15 +5,15 @@ What crosses a cut lies in a scratch array; inputs and constants are read again 
 
 import heapq
 
-from .program import BAND, Program, Result
+from .program import BAND, ProgramResult, StraightLineProgram
 
 FREE = ("input", "constant", "entry")
 """Steps that every part makes again instead of fetching them from a slot of the scratch array."""
-Statement = int | Result
+Statement = int | ProgramResult
 """What takes a compiler time: a step that is computed, or a result that is written."""
 
 
-def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
+def cut_parts(program: StraightLineProgram, size: int, pause: int = 0) -> tuple[list[list[Statement]], int]:
     """Statements of each part: every step but those that are free, and every result right after its step.
 
     Args:
@@ -37,7 +37,7 @@ def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[St
     return [*first, *second] or [[]], len(first)
 
 
-def scratch_slots(program: Program, parts: list[list[Statement]]) -> dict[int, int]:
+def scratch_slots(program: StraightLineProgram, parts: list[list[Statement]]) -> dict[int, int]:
     """Place in the scratch array of every step that crosses a cut; places are used again.
 
     Args:
@@ -64,7 +64,7 @@ def scratch_slots(program: Program, parts: list[list[Statement]]) -> dict[int, i
     return found
 
 
-def product_places(program: Program, first: int) -> tuple[dict[int, int], int]:
+def product_places(program: StraightLineProgram, first: int) -> tuple[dict[int, int], int]:
     """Place in the scratch array of what comes out of every product, and behind all of them that of a vector.
 
     Args:

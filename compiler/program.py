@@ -393,7 +393,7 @@ def _stem_outside(path: str) -> str | None:
     return None if Path(path).parent == Path(__file__).parent else Path(path).stem
 
 
-class Result(NamedTuple):
+class ProgramResult(NamedTuple):
     """Where a program writes an expression."""
 
     argument: int
@@ -401,7 +401,7 @@ class Result(NamedTuple):
     node: int
 
 
-class Step(NamedTuple):
+class ProgramStep(NamedTuple):
     """One operation of a program."""
 
     operation: str
@@ -418,14 +418,14 @@ class Step(NamedTuple):
     logical: bool
 
 
-class Steps(Sequence[Step]):
+class ProgramSteps(Sequence[ProgramStep]):
     """Operations one after the other, as columns of numbers: a step is made where somebody looks at it.
 
     Args:
         names: what the operations are called.
         kinds: ``(n,)``: for each step which of them it is.
         begins: ``(n + 1,)``: where the arguments of each step begin in ``arguments``.
-        arguments: those of :class:`Step`, one after the other.
+        arguments: those of :class:`ProgramStep`, one after the other.
         logical: ``(n,)``.
     """
 
@@ -439,7 +439,7 @@ class Steps(Sequence[Step]):
     ) -> None:
         self.names, self.kinds, self.begins = names, kinds, begins
         self.arguments, self.logical = arguments, logical
-        self._made: list[Step] | None = None
+        self._made: list[ProgramStep] | None = None
 
     @functools.cached_property
     def operations(self) -> frozenset[str]:
@@ -450,7 +450,7 @@ class Steps(Sequence[Step]):
         """For each step whether it is one of some operations, ``(n,)``."""
         return numpy.isin(self.kinds, [kind for kind, name in enumerate(self.names) if name in operations])
 
-    def named(self, operation: str) -> list[Step]:
+    def named(self, operation: str) -> list[ProgramStep]:
         """Return the steps of an operation."""
         return [self[index] for index in numpy.flatnonzero(self.which(operation)).tolist()]
 
@@ -458,25 +458,25 @@ class Steps(Sequence[Step]):
         return len(self.kinds)
 
     @overload
-    def __getitem__(self, place: int) -> Step: ...
+    def __getitem__(self, place: int) -> ProgramStep: ...
 
     @overload
-    def __getitem__(self, place: slice) -> "Steps": ...
+    def __getitem__(self, place: slice) -> "ProgramSteps": ...
 
-    def __getitem__(self, place: int | slice) -> "Step | Steps":
+    def __getitem__(self, place: int | slice) -> "ProgramStep | ProgramSteps":
         if not isinstance(place, slice):
             if self._made is not None:
                 return self._made[place]
             given = self.arguments[self.begins[place] : self.begins[place + 1]].tolist()
-            return Step(self.names[int(self.kinds[place])], tuple(given), bool(self.logical[place]))
+            return ProgramStep(self.names[int(self.kinds[place])], tuple(given), bool(self.logical[place]))
         begins = self.begins[place.start or 0 : len(self.begins[:-1][: place.stop]) + 1]
         given = self.arguments[begins[0] : begins[-1]]
-        return Steps(self.names, self.kinds[place], begins - begins[0], given, self.logical[place])
+        return ProgramSteps(self.names, self.kinds[place], begins - begins[0], given, self.logical[place])
 
-    def __iter__(self) -> Iterator[Step]:
+    def __iter__(self) -> Iterator[ProgramStep]:
         return iter(self.all())
 
-    def all(self) -> list[Step]:
+    def all(self) -> list[ProgramStep]:
         """Return all steps; from then on they are kept."""
         if self._made is None:
             numbers, names = self.arguments.tolist(), self.names
@@ -484,21 +484,21 @@ class Steps(Sequence[Step]):
             parts = zip(
                 [names[kind] for kind in self.kinds.tolist()], given, self.logical.tolist(), strict=True
             )
-            # Step itself takes twice as long.
-            self._made = list(map(tuple.__new__, itertools.repeat(Step), parts))
+            # ProgramStep itself takes twice as long.
+            self._made = list(map(tuple.__new__, itertools.repeat(ProgramStep), parts))
         return self._made
 
 
-class Program(NamedTuple):
+class StraightLineProgram(NamedTuple):
     """Straight line that computes some expressions of a graph.
 
     Constants are told apart from the steps, so that programs that differ only in numbers have the same code.
     """
 
-    steps: Steps
+    steps: ProgramSteps
     constants: numpy.ndarray
     """``(n,)``: scalars, then the tables one after the other."""
-    results: list[Result]
+    results: list[ProgramResult]
     """``node`` is a step's place."""
     origins: numpy.ndarray
     """``(n, 2)``: for each step the number of the array operation that made it, and one that grows from member to
@@ -508,7 +508,7 @@ class Program(NamedTuple):
 
 
 @without_collection()
-def program(graph: Graph, wanted: Sequence[Result]) -> Program:
+def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgram:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
     operations = list(map(graph.operations.__getitem__, order))
@@ -544,12 +544,12 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     constants = numpy.concatenate(
         [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
     )
-    results = [Result(r.argument, r.row, int(place[r.node])) for r in wanted]
+    results = [ProgramResult(r.argument, r.row, int(place[r.node])) for r in wanted]
     logical = numpy.array(list(map(graph.logical.__getitem__, order)), dtype=bool)
-    steps = Steps(names, kinds, begins, arguments, logical)
+    steps = ProgramSteps(names, kinds, begins, arguments, logical)
     groups = _integers(map(graph.groups.__getitem__, order), len(order))
     origins = numpy.column_stack([groups, _integers(order, len(order))])
-    return Program(steps, constants, results, origins, graph.callers or {})
+    return StraightLineProgram(steps, constants, results, origins, graph.callers or {})
 
 
 def _integers(numbers: Iterable[int], count: int) -> numpy.ndarray:

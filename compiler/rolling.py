@@ -1,10 +1,10 @@
 """A straight line rolled up: what one array operation has made is one statement again, in a loop over its members.
 
-A trace leaves scalars behind, each with the number of the array operation that made it (:attr:`.Program.origins`).
-Members of one operation do not depend on one another: they become a :class:`Statement` of so many members. Statements
-of equal count stand in one loop, where a member may take what the same turn has computed; all else crosses loops
-through a scratch array. What is computed, of what, and in which order its operands stand is as in the straight line, so
-that every bit is.
+A trace leaves scalars behind, each with the number of the array operation that made it
+(:attr:`.StraightLineProgram.origins`). Members of one operation do not depend on one another: they become a
+:class:`Statement` of so many members. Statements of equal count stand in one loop, where a member may take what the
+same turn has computed; all else crosses loops through a scratch array. What is computed, of what, and in which order
+its operands stand is as in the straight line, so that every bit is.
 """
 
 import heapq
@@ -16,7 +16,7 @@ import numpy
 
 from .interpretation import first_steps
 from .parts import FREE
-from .program import Program, without_collection
+from .program import StraightLineProgram, without_collection
 
 LEAST = 3
 """Members of a statement: fewer are statements of their own."""
@@ -109,7 +109,7 @@ class _Draft:
 class _Roller:
     """What :func:`roll` is made with."""
 
-    def __init__(self, program: Program, results: int) -> None:
+    def __init__(self, program: StraightLineProgram, results: int) -> None:
         self.program, self.steps = program, program.steps
         self.pause = first_steps(program, results)
         self.drafts: list[_Draft] = []
@@ -413,7 +413,7 @@ def _joined(columns: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndar
 
 
 @without_collection()
-def roll(program: Program, results: int = 0) -> Rolled:
+def roll(program: StraightLineProgram, results: int = 0) -> Rolled:
     """Roll a program up.
 
     Args:
@@ -423,7 +423,7 @@ def roll(program: Program, results: int = 0) -> Rolled:
     return _Roller(program, results).finish()
 
 
-def roll_where_shorter(program: Program, results: int = 0) -> Rolled | None:
+def roll_where_shorter(program: StraightLineProgram, results: int = 0) -> Rolled | None:
     """Roll a program up where that makes less code; None: it stays a straight line.
 
     Args:

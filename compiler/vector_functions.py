@@ -15,7 +15,7 @@ import numpy
 from . import namespace
 from .gradients import pullback
 from .namespace import NotTraceable, Traced
-from .program import Graph, Program, Result, program
+from .program import Graph, ProgramResult, StraightLineProgram, program
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
@@ -121,11 +121,11 @@ class VectorFunction:
         return xp.stack([xp.stack(entries[i * n : (i + 1) * n]) for i in range(self.size)])
 
 
-def _program(graph: Graph, nodes: Sequence[int]) -> Program:
-    return program(graph, [Result(1, row, node) for row, node in enumerate(nodes)])
+def _program(graph: Graph, nodes: Sequence[int]) -> StraightLineProgram:
+    return program(graph, [ProgramResult(1, row, node) for row, node in enumerate(nodes)])
 
 
-def _compute(program: Program, x: Any, xp: Any) -> list[Any]:
+def _compute(program: StraightLineProgram, x: Any, xp: Any) -> list[Any]:
     """Results of a program on lanes ``(n, N)``, each ``(N,)``."""
     values: list[Any] = []
 

@@ -21,7 +21,7 @@ PREFIXES: Mapping[str, str] = {
 """Before a competitor's name: a function of the name, of what follows the prefix, of the problem and of what finds
 other competitors of it, that returns a :class:`.evaluation.competitors.kinds.Competitor`."""
 SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_policies:LEARNED")
-"""Each a :class:`.evaluation.competitors.kinds.Source`, of competitors in files and folders."""
+"""Each a :class:`.evaluation.competitors.kinds.CompetitorFiles`, of competitors in files and folders."""
 WATCHES: Sequence[str] = ("agents.envelope:watch_live",)
 """Functions of a model, of the maker of a competitor and of its kind, which return what runs live in its place and what
 watches it (:class:`.evaluation.competitors.online_state.Watch`), or None."""

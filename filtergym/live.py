@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from .baselines.problem import import_problem
-from .envs.contract.parameters import Limits, check
+from .envs.contract.parameters import ParameterLimits, check
 from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
 from .envs.engine.scenario_choice import find_scenario
@@ -59,7 +59,7 @@ def online(
     """
     problem = import_problem(env)
     for what, value in (("regular", regular), ("second_sensor", second_sensor), ("trust", trust)):
-        check(what, value, bool, Limits())
+        check(what, value, bool, ParameterLimits())
     named = isinstance(policy, str | Path)
     name = str(policy) if named else type(policy).__name__
     found = find_competitor(problem, policy, trust) if named else Competitor(name, adopt(policy))

@@ -10,7 +10,7 @@ from typing import Any
 from .baselines.problem import Problem, import_problem
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
-from .evaluation.competitors.kinds import Competitor, Source, check_competitor
+from .evaluation.competitors.kinds import Competitor, CompetitorFiles, check_competitor
 from .extensions import PREFIXES, SOURCES, load
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -70,7 +70,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     return Competitor(name, check_competitor(name, getattr(holder, attribute)))
 
 
-def _sources() -> Iterator[Source]:
+def _sources() -> Iterator[CompetitorFiles]:
     for place in SOURCES:
         yield load(place)
 

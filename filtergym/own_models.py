@@ -13,7 +13,7 @@ import numpy
 from . import register_task
 from .baselines.state_space import state_space_baselines
 from .envs.contract.model import Model
-from .envs.contract.parameters import Limits, check, check_integer, quote_shortened
+from .envs.contract.parameters import ParameterLimits, check, check_integer, quote_shortened
 from .envs.contract.task import Component
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition, StateSpaceModel
@@ -133,7 +133,7 @@ def state_space(
             ("measured", measured),
         )
     )
-    check("switching", switching, bool, Limits())
+    check("switching", switching, bool, ParameterLimits())
     sensors = _sensors(sensors, (h, R, measured))
     first = {"f": f, "Q": Q, "drift": drift, "diffusion": diffusion, "h": h, "R": R, "sensors": sensors}
     _check_motion(first)
@@ -342,12 +342,12 @@ class _EstimatedReward:
 
     @functools.cached_property
     def unit(self) -> float:
-        """What an episode is charged, typically."""
+        """Typical cost of an episode."""
         return _typical_cost(self._cls, self._parameters)
 
 
 def _typical_cost(cls: type[StateSpace], parameters: StateSpaceParameters) -> float:
-    """Median over some episodes of what the filter as written is charged, to two digits; 1 where that is no unit."""
+    """Median over some episodes of the cost of the filter as written, to two digits; 1 where that is no unit."""
     model: Any = Model(cls(parameters), cls.paper_policy.control)
     episodes, measurements = TRIED
     share = min(1.0, SMALL / cls.definition.world[0].f.size) ** 3

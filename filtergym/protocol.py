@@ -30,7 +30,7 @@ from .evaluation.running.parallel import Workers
 from .evaluation.running.rollout import ProcessorTime, Progress
 from .evaluation.running.summary import EvaluationRequest, Summary, combine_summaries, summaries
 from .evaluation.running.times import times_of_records
-from .evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, share_interval
+from .evaluation.statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, share_interval
 from .names import find_competitor
 
 FOLDER = files(__name__.rpartition(".")[0]) / "protocols"
@@ -45,7 +45,7 @@ class ProtocolEnvironment(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     id: str
     """Gymnasium id."""
     interface: int
-    """Version of what an agent sees and is paid."""
+    """Version of what an agent observes and of its reward."""
     paper: str
     """Name of the paper's algorithm, in its stronger reading."""
     lost_cost: float
@@ -204,9 +204,9 @@ class EnvironmentResult(NamedTuple):
     """What came out in one environment."""
 
     entry: Entry
-    cost: Estimate
+    cost: IntervalEstimate
     """Geometric mean of the cost ratios, less one, in the training distribution."""
-    lost: Estimate
+    lost: IntervalEstimate
     """Share of the episodes whose track is lost."""
     anees: Record | None
     worst: tuple[str, float] | None
@@ -246,7 +246,7 @@ class ProtocolResult(NamedTuple):
         return len(self.environments) == len(self.protocol.environments)
 
     @property
-    def cost(self) -> Estimate | None:
+    def cost(self) -> IntervalEstimate | None:
         """The number: geometric mean over the environments of the cost ratios, less one; None if not complete."""
         if not self.complete:
             return None
@@ -338,9 +338,11 @@ def _result(entry: Entry, cells: Mapping[str, list[Summary]]) -> tuple[Environme
         for scenario, each in records.items()
     }
 
-    def estimate(scenario: str, metric: str) -> Estimate:
+    def estimate(scenario: str, metric: str) -> IntervalEstimate:
         record = tables[scenario][name, metric, ""]
-        return Estimate(*(math.nan if v is None else v for v in (record.value, record.low, record.high)))
+        return IntervalEstimate(
+            *(math.nan if v is None else v for v in (record.value, record.low, record.high))
+        )
 
     held = {scenario: estimate(scenario, "geometric_cost_difference").value for scenario in own.held_out}
     worst = max(held, key=held.__getitem__, default=None)

@@ -234,7 +234,7 @@ def predict_augmented(
     )
 
 
-class AugmentedGain(NamedTuple):
+class AugmentedFilterGain(NamedTuple):
     """Gains of (delta, beta, eta)."""
 
     position: Array
@@ -246,7 +246,7 @@ class AugmentedGain(NamedTuple):
 
 def update_augmented(
     P: AugmentedCovariance, R: Array, available: Array
-) -> tuple[AugmentedGain, AugmentedCovariance]:
+) -> tuple[AugmentedFilterGain, AugmentedCovariance]:
     """Gains and covariance of a measurement of delta.
 
     ``K = P H^T / S``, ``P - K S K^T``; with this gain, which is Kalman's, and one measurement the position
@@ -258,7 +258,7 @@ def update_augmented(
         available: one where there is a measurement, zero where there is none.
     """
     weight = available / (P.position + R)
-    gain = AugmentedGain(weight * P.position, weight * P.position_drift, weight * P.position_coloured)
+    gain = AugmentedFilterGain(weight * P.position, weight * P.position_drift, weight * P.position_coloured)
     return gain, AugmentedCovariance(
         P.position - gain.position * P.position,
         P.position_drift - gain.position * P.position_drift,
@@ -269,7 +269,7 @@ def update_augmented(
     )
 
 
-def update_augmented_by(P: AugmentedCovariance, R: Array, gain: AugmentedGain) -> AugmentedCovariance:
+def update_augmented_by(P: AugmentedCovariance, R: Array, gain: AugmentedFilterGain) -> AugmentedCovariance:
     """Covariance after a measurement of delta that was taken in with any gain, ``(I - K H) P (I - K H)^T + K R K^T``
     (Joseph form).
 

@@ -34,7 +34,7 @@ LEAST_PROBABILITY = 1e-30
 """Of a hypothesis before a step: it can come back, and no weight is zero by zero."""
 
 
-class Hypotheses(NamedTuple):
+class LevelHypotheses(NamedTuple):
     """Filters by what they believe of the noise."""
 
     mean: Array
@@ -46,9 +46,9 @@ class Hypotheses(NamedTuple):
     sensors: tuple[Array, ...]
     """Probabilities of the levels of each sensor, ``(L, H, N)``."""
 
-    def take(self, some: slice) -> "Hypotheses":
+    def take(self, some: slice) -> "LevelHypotheses":
         """Return some of them."""
-        return Hypotheses(
+        return LevelHypotheses(
             self.mean[:, some],
             self.covariance[:, some],
             self.probability[some],
@@ -90,8 +90,8 @@ def merge(mean: Array, covariance: Array, weights: Array) -> Moments:
 
 
 def switch(
-    before: Hypotheses, change: Array, prior: Array, sensor_change: Array, levels: Array
-) -> Hypotheses:
+    before: LevelHypotheses, change: Array, prior: Array, sensor_change: Array, levels: Array
+) -> LevelHypotheses:
     """Let levels change before a step, equations (1) to (4).
 
     Args:
@@ -115,7 +115,7 @@ def switch(
         pooled = ordered_sum(pool.shares[i] * q[:, i] for i in range(q.shape[1]))
         mixed = own * q + other * pooled[:, None]
         sensors.append((1.0 - sensor_change) * mixed + sensor_change * levels)
-    return Hypotheses(
+    return LevelHypotheses(
         mean - other * deviation,
         own * covariance + other * pool.covariance[:, None] + (own * other) * squares(deviation),
         after,

@@ -67,7 +67,7 @@ def propagator(F: numpy.ndarray) -> numpy.ndarray:
     return M
 
 
-class Update(NamedTuple):
+class PackedUpdate(NamedTuple):
     """Result of measurements of single coordinates."""
 
     mean: Array
@@ -87,7 +87,7 @@ def update_coordinates(
     coordinates: Sequence[int | tuple[int, ...]],
     R: Array,
     available: Array,
-) -> Update:
+) -> PackedUpdate:
     """Take in measurements of single coordinates, or of sums of some, with independent noise.
 
     Args:
@@ -115,7 +115,7 @@ def update_coordinates(
         volume = xp.where(available[k] > 0.0, 2.0 * math.pi * S, 1.0)
         squared_distance = distance if squared_distance is None else squared_distance + distance
         determinant = volume if determinant is None else determinant * volume
-    return Update(mean, covariance, -0.5 * (squared_distance + xp.log(determinant)), squared_distance)
+    return PackedUpdate(mean, covariance, -0.5 * (squared_distance + xp.log(determinant)), squared_distance)
 
 
 class GainModel(NamedTuple):

@@ -123,7 +123,7 @@ def observe(
     return namespace(state).concat([expected[:S] + errors, expected[S:]]), [*ranges, *rows[S:]]
 
 
-class Posterior(NamedTuple):
+class SequentialUpdate(NamedTuple):
     """State while the observations of one measurement are taken in, one after the other."""
 
     shift: Array
@@ -136,13 +136,13 @@ class Posterior(NamedTuple):
     """Normalised innovation squared of the same, ``(...)``."""
 
 
-def begin(mean: Array, covariance: Array) -> Posterior:
+def begin(mean: Array, covariance: Array) -> SequentialUpdate:
     """Before the first observation."""
     none = 0.0 * mean[0]
-    return Posterior(0.0 * mean, covariance, none, none)
+    return SequentialUpdate(0.0 * mean, covariance, none, none)
 
 
-def innovation_of(state: Posterior, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
+def innovation_of(state: SequentialUpdate, residual: Array, row: JacobianRow) -> tuple[Array, Array, Array]:
     """Innovation given what was taken in, its covariance with the state ``P h^T``, ``(n, ...)``, and ``h P h^T``.
 
     Args:
@@ -161,8 +161,13 @@ def innovation_of(state: Posterior, residual: Array, row: JacobianRow) -> tuple[
 
 
 def take_reading(
-    state: Posterior, residual: Array, row: JacobianRow, levels: Array, probabilities: Array, available: Array
-) -> tuple[Posterior, Array]:
+    state: SequentialUpdate,
+    residual: Array,
+    row: JacobianRow,
+    levels: Array,
+    probabilities: Array,
+    available: Array,
+) -> tuple[SequentialUpdate, Array]:
     """Take in a scalar observation whose noise is a Gaussian sum.
 
     Args:
@@ -181,7 +186,7 @@ def take_reading(
     square = error * error
     noise = weigh_levels(square, 1, variance, levels, probabilities)
     weight = available * (noise.score - noise.spread * square)
-    after = Posterior(
+    after = SequentialUpdate(
         state.shift + cross * (available * noise.score * error),
         state.covariance - weight * (cross[:, None] * cross[None]),
         state.log_likelihood + available * noise.log_density,
@@ -202,7 +207,7 @@ class Renewal(NamedTuple):
 
 
 def take_pseudorange(
-    state: Posterior,
+    state: SequentialUpdate,
     predicted: Array,
     place: int,
     residual: Array,
@@ -210,7 +215,7 @@ def take_pseudorange(
     variance: float,
     renewal: Renewal,
     available: Array,
-) -> Posterior:
+) -> SequentialUpdate:
     """Take in a pseudorange whose error may have been drawn anew, equations (2) and (3).
 
     Args:
@@ -248,7 +253,7 @@ def take_pseudorange(
     )
     error, cross, known = innovation_of(state._replace(shift=shift, covariance=merged), residual, row)
     total = available / (known + variance)
-    return Posterior(
+    return SequentialUpdate(
         shift + cross * (total * error),
         merged - total * (cross[:, None] * cross[None]),
         state.log_likelihood + available * log_density,

@@ -36,7 +36,7 @@ LEAST_PROBABILITY = 1e-30
 """Of a hypothesis: it can always come back, and weights of what is merged are never zero by zero."""
 
 
-class Hypotheses(NamedTuple):
+class AgedHypotheses(NamedTuple):
     """Hypotheses of one kind, by age."""
 
     mean: Array
@@ -46,17 +46,17 @@ class Hypotheses(NamedTuple):
     probability: Array
     """``(H, N)``."""
 
-    def take(self, ages: slice, state: int | None = None) -> "Hypotheses":
+    def take(self, ages: slice, state: int | None = None) -> "AgedHypotheses":
         """Return those of some ages, with the first components of their states."""
-        return Hypotheses(
+        return AgedHypotheses(
             self.mean[:state, ages], self.covariance[:state, :state, ages], self.probability[ages]
         )
 
-    def pack(self) -> "Hypotheses":
+    def pack(self) -> "AgedHypotheses":
         """Return them with the lower triangles of their covariances, as memory keeps them."""
         return self._replace(covariance=packed_covariance.pack(self.covariance))
 
-    def unpack(self) -> "Hypotheses":
+    def unpack(self) -> "AgedHypotheses":
         """Undo :meth:`pack`."""
         return self._replace(covariance=packed_covariance.unpack(self.covariance, self.mean.shape[0]))
 
@@ -75,24 +75,24 @@ def hazards(durations: Sequence[float], ages: int) -> list[float]:
     return [*exact, sum(rest) / sum((d + 1) * f for d, f in enumerate(rest))]
 
 
-def join(tables: Sequence[Hypotheses]) -> Hypotheses:
+def join(tables: Sequence[AgedHypotheses]) -> AgedHypotheses:
     """Hypotheses of several tables, whose states are of the same size, one table after another."""
     xp = namespace(tables[0].mean)
-    return Hypotheses(
+    return AgedHypotheses(
         xp.concat([table.mean for table in tables], axis=1),
         xp.concat([table.covariance for table in tables], axis=2),
         xp.concat([table.probability for table in tables]),
     )
 
 
-def merge(hypotheses: Hypotheses) -> Hypotheses:
+def merge(hypotheses: AgedHypotheses) -> AgedHypotheses:
     """One hypothesis with the probability, mean and covariance of several together."""
     total = ordered_sum(hypotheses.probability)
     mean, covariance = imm.combine(hypotheses.mean, hypotheses.covariance, hypotheses.probability / total)
-    return Hypotheses(mean[:, None], covariance[:, :, None], total[None])
+    return AgedHypotheses(mean[:, None], covariance[:, :, None], total[None])
 
 
-def grow_older(table: Hypotheses, begun: Hypotheses) -> Hypotheses:
+def grow_older(table: AgedHypotheses, begun: AgedHypotheses) -> AgedHypotheses:
     """Table one step later: each hypothesis is of the next age, and the last two together are of the last.
 
     Args:
@@ -107,7 +107,7 @@ def grow_older(table: Hypotheses, begun: Hypotheses) -> Hypotheses:
 class Mode(NamedTuple):
     """A kind of mode and its hypotheses."""
 
-    table: Hypotheses
+    table: AgedHypotheses
     hazard: Array
     """(1), ``(H, 1)``."""
     begin: float
@@ -116,7 +116,7 @@ class Mode(NamedTuple):
     """From mean ``(4, N)`` and covariance of the state at rest to those of the mode that begins."""
 
 
-def switch(rest: Hypotheses, modes: Sequence[Mode]) -> tuple[Hypotheses, list[Hypotheses]]:
+def switch(rest: AgedHypotheses, modes: Sequence[Mode]) -> tuple[AgedHypotheses, list[AgedHypotheses]]:
     """Let modes end, begin and grow older, equations (2) to (5).
 
     Args:
@@ -142,7 +142,7 @@ def switch(rest: Hypotheses, modes: Sequence[Mode]) -> tuple[Hypotheses, list[Hy
     tables = []
     for mode in modes:
         mean, covariance = mode.augment(ready.mean[:, 0], ready.covariance[:, :, 0])
-        begun = Hypotheses(mean[:, None], covariance[:, :, None], mode.begin * ready.probability)
+        begun = AgedHypotheses(mean[:, None], covariance[:, :, None], mode.begin * ready.probability)
         lasting = mode.table._replace(probability=(1.0 - mode.hazard) * mode.table.probability)
         tables.append(grow_older(lasting, begun))
     older = grow_older(rest, ended)
@@ -150,7 +150,7 @@ def switch(rest: Hypotheses, modes: Sequence[Mode]) -> tuple[Hypotheses, list[Hy
     return _keep_possible(older), [_keep_possible(table) for table in tables]
 
 
-def _keep_possible(table: Hypotheses) -> Hypotheses:
+def _keep_possible(table: AgedHypotheses) -> AgedHypotheses:
     """Give every hypothesis the least probability, whether a measurement or the hazard has ruled it out."""
     probability = namespace(table.mean).clip(table.probability, LEAST_PROBABILITY, None)
     return table._replace(probability=probability)

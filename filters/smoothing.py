@@ -46,7 +46,7 @@ from .small_matrices import apply, product, transpose
 Carried = TypeVar("Carried", bound=tuple[Any, ...])
 
 
-class Estimate(NamedTuple):
+class Gaussian(NamedTuple):
     """Mean and covariance."""
 
     mean: Array
@@ -69,7 +69,7 @@ class Motion(NamedTuple):
 # --- one model
 
 
-def rauch_tung_striebel_step(filtered: Estimate, motion: Motion, later: Estimate) -> Estimate:
+def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian) -> Gaussian:
     """Smooth one scan.
 
     Args:
@@ -81,13 +81,13 @@ def rauch_tung_striebel_step(filtered: Estimate, motion: Motion, later: Estimate
     FP = product(F, filtered.covariance)
     gain = transpose(_solve(semidefinite_root(product(FP, transpose(F)) + Q), FP))
     rest = _identity(filtered.mean) - product(gain, F)
-    return Estimate(
+    return Gaussian(
         filtered.mean + apply(gain, later.mean - motion.predicted),
         _symmetrize(_congruence(rest, filtered.covariance) + _congruence(gain, later.covariance + Q)),
     )
 
 
-def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estimate:
+def smooth(filtered: Gaussian, motion: Motion, lag: int | None = None) -> Gaussian:
     """Smooth a track of one Kalman filter, or extended Kalman filter.
 
     Args:
@@ -108,7 +108,7 @@ def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estima
 # --- several models
 
 
-class Bank(NamedTuple):
+class GaussianMixture(NamedTuple):
     """Estimates of M models, with the probabilities of their modes."""
 
     mean: Array
@@ -132,7 +132,7 @@ class Arrival(NamedTuple):
     """Measurement, ``(m, ...)``; anything finite where nothing was received."""
 
 
-class Likelihood(NamedTuple):
+class QuadraticLikelihood(NamedTuple):
     """Logarithm of a likelihood, ``value + gradient^T d - d^T curvature d / 2`` with ``d = x - centre``."""
 
     centre: Array
@@ -148,12 +148,14 @@ class Likelihood(NamedTuple):
 class SmoothedBank(NamedTuple):
     """Smoothed estimates, and the likelihood of everything later that they have used."""
 
-    bank: Bank
-    later: Likelihood
+    bank: GaussianMixture
+    later: QuadraticLikelihood
     """Of each mode, about the filtered mean."""
 
 
-def imm_step(filtered: Bank, arrival: Arrival, next_scan: SmoothedBank, transition: Array) -> SmoothedBank:
+def imm_step(
+    filtered: GaussianMixture, arrival: Arrival, next_scan: SmoothedBank, transition: Array
+) -> SmoothedBank:
     """Smooth one scan of an IMM.
 
     Args:
@@ -169,13 +171,13 @@ def imm_step(filtered: Bank, arrival: Arrival, next_scan: SmoothedBank, transiti
     # Pairs [j, i]: mode i at this scan, then mode j. Errors are counted in standard deviations of the filter,
     # x = mean + root e with e ~ N(0, I), in which nothing needs an inverse of the covariance.
     root = semidefinite_root(filtered.covariance)
-    pairs = Likelihood(*(_insert_axis(part, -2) for part in seen_from_here))
+    pairs = QuadraticLikelihood(*(_insert_axis(part, -2) for part in seen_from_here))
     pairs = _expand_about(pairs, filtered.mean[:, None])
     errors, log_evidence = _posterior(pairs, root[:, :, None])
     log_weights = imm.log_probabilities(transition.T)[:, :, None] + log_evidence
     of_mode = imm.log_mixture_density(0.0 * log_weights, log_weights)
-    error = Estimate(*imm.combine(*errors, xp.exp(log_weights - of_mode)))
-    bank = Bank(
+    error = Gaussian(*imm.combine(*errors, xp.exp(log_weights - of_mode)))
+    bank = GaussianMixture(
         filtered.mean + apply(root, error.mean),
         _symmetrize(_congruence(root, error.covariance)),
         imm.softmax(imm.log_probabilities(filtered.probabilities) + of_mode),
@@ -183,7 +185,9 @@ def imm_step(filtered: Bank, arrival: Arrival, next_scan: SmoothedBank, transiti
     return SmoothedBank(bank, _likelihood_from_moments(filtered.mean, root, error, of_mode))
 
 
-def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | None = None) -> Bank:
+def smooth_imm(
+    filtered: GaussianMixture, arrival: Arrival, transition: Array, lag: int | None = None
+) -> GaussianMixture:
     """Smooth a track of an IMM; :func:`.imm.combine` makes one estimate of each scan.
 
     Args:
@@ -198,7 +202,7 @@ def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | N
     Raises:
         ValueError: for a negative lag.
     """
-    nothing = Likelihood(
+    nothing = QuadraticLikelihood(
         filtered.mean, 0.0 * filtered.probabilities, 0.0 * filtered.mean, 0.0 * filtered.covariance
     )
     step = functools.partial(imm_step, transition=transition)
@@ -303,15 +307,15 @@ def _flatten_time(values: Array) -> Array:
 # --- likelihoods as quadratic forms
 
 
-def _expand_about(likelihood: Likelihood, centre: Array) -> Likelihood:
+def _expand_about(likelihood: QuadraticLikelihood, centre: Array) -> QuadraticLikelihood:
     """Write a likelihood about another centre."""
     step = centre - likelihood.centre
     bent = apply(likelihood.curvature, step)
     value = likelihood.value + _dot(likelihood.gradient - 0.5 * bent, step)
-    return Likelihood(centre, value, likelihood.gradient - bent, likelihood.curvature)
+    return QuadraticLikelihood(centre, value, likelihood.gradient - bent, likelihood.curvature)
 
 
-def _add_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
+def _add_measurement(later: QuadraticLikelihood, arrival: Arrival) -> QuadraticLikelihood:
     """Add what is measured at a scan to what follows it, about the predicted means."""
     likelihood = _expand_about(later, arrival.motion.predicted)
     H, precision = (_insert_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
@@ -324,7 +328,7 @@ def _add_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
     )
 
 
-def _pull_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelihood:
+def _pull_back(likelihood: QuadraticLikelihood, motion: Motion, centre: Array) -> QuadraticLikelihood:
     """Integrate over the process noise: the likelihood of a state one scan before, about ``centre``, from which the
     centre of the given one is predicted.
     """
@@ -336,7 +340,7 @@ def _pull_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelih
     rest = _identity(centre) - product(gain, transpose(root))
     curvature = _congruence(rest, likelihood.curvature) + product(gain, transpose(gain))
     back = transpose(motion.F)
-    return Likelihood(
+    return QuadraticLikelihood(
         centre,
         likelihood.value + 0.5 * _dot(error, _solve(inner, error)) - _log_diagonal(inner),
         apply(back, likelihood.gradient - apply(gain, error)),
@@ -344,7 +348,7 @@ def _pull_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelih
     )
 
 
-def _posterior(likelihood: Likelihood, root: Array) -> tuple[Estimate, Array]:
+def _posterior(likelihood: QuadraticLikelihood, root: Array) -> tuple[Gaussian, Array]:
     """Bayes' rule for ``x = centre + root e`` with ``e ~ N(0, I)``.
 
     Returns:
@@ -356,10 +360,12 @@ def _posterior(likelihood: Likelihood, root: Array) -> tuple[Estimate, Array]:
     mean = _solve(inner, pull)
     covariance = _solve(inner, _identity(likelihood.centre) + 0.0 * inner)
     evidence = likelihood.value + 0.5 * _dot(pull, mean) - _log_diagonal(inner)
-    return Estimate(mean, _symmetrize(covariance)), evidence
+    return Gaussian(mean, _symmetrize(covariance)), evidence
 
 
-def _likelihood_from_moments(centre: Array, root: Array, error: Estimate, log_evidence: Array) -> Likelihood:
+def _likelihood_from_moments(
+    centre: Array, root: Array, error: Gaussian, log_evidence: Array
+) -> QuadraticLikelihood:
     """Likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre + root e``.
 
     In a direction in which the variance is not below one it says nothing.
@@ -376,7 +382,7 @@ def _likelihood_from_moments(centre: Array, root: Array, error: Estimate, log_ev
     along = xp.where(informed, apply(transpose(directions), error.mean), 0.0)
     curvature = 1.0 / variances - 1.0
     directions = _solve_upper(root, directions)
-    return Likelihood(
+    return QuadraticLikelihood(
         centre,
         log_evidence - 0.5 * ordered_sum(along**2 / variances + xp.log(variances)),
         apply(directions, along / variances),

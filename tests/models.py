@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from filtergym.baselines import catalogue as baselines
-from filtergym.envs.contract.filter import Filter, Input, Likelihood
+from filtergym.envs.contract.filter import Filter, FilterInput, Likelihood
 from filtergym.envs.contract.model import Model
 from filtergym.envs.engine import backend, registration
 from filtergym.envs.engine.catalogue import task_class
@@ -76,7 +76,7 @@ class Asked:
         return self.filter.start(initial)
 
     def update(self, memory: Any, measurement: Any) -> tuple[Any, ...]:
-        own, state = self.filter, self.filter.step(memory, Input(measurement))
+        own, state = self.filter, self.filter.step(memory, FilterInput(measurement))
         told = Likelihood.told(own.records(state, measurement))
         return own.mean(state), own.covariance(state), state, told
 

@@ -74,7 +74,7 @@ def move_roundings(env, repetition=0):
     for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
         for owner, names in (
-            (model, ("observe", "charge", "feedback")),
+            (model, ("observe", "counted_cost", "feedback")),
             *((part, PARTS[p]) for part, p in parts),
         ):
             for name in names:

@@ -26,7 +26,7 @@ from filtergym.envs.engine.scenario_choice import make_task
 from filtergym.envs.logs.reading import read_recording
 from filtergym.evaluation.competitors import likelihood as likelihood_module
 from filtergym.evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
-from filtergym.evaluation.statistics.bootstrap import Estimate
+from filtergym.evaluation.statistics.bootstrap import IntervalEstimate
 from filtergym.reports.tables.advice import PRICES, advice_lines, parameter_lines, price_table
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -335,7 +335,7 @@ def test_what_is_fitted_is_taken_only_for_a_gain_beyond_chance(one_family, tmp_p
     )
     assert any(line.startswith(f"Of what was fitted {found.fitted.name} comes closest") for line in lines)
     for high, sure in ((-0.1, True), (0.1, False)):
-        fitted = found.fitted._replace(relative_error=Estimate(-0.2, -0.3, high))
+        fitted = found.fitted._replace(relative_error=IntervalEstimate(-0.2, -0.3, high))
         said = next(iter(advice_lines(found._replace(fitted=fitted), [])))
         assert ("That is beyond chance: a longer log may turn the choice." in said) == sure
 
@@ -381,7 +381,7 @@ def test_of_two_that_are_as_good_the_cheaper_is_advised(one_family, tmp_path):
     assert lines[0].startswith(
         "Take constant-velocity, with the parameters below, as good as true and cheaper: "
     )
-    likelier = found._replace(dearer=("true", Estimate(0.25, -0.125, 0.5)))
+    likelier = found._replace(dearer=("true", IntervalEstimate(0.25, -0.125, 0.5)))
     assert (
         "true is likelier where filters were chosen: it would bring +0.250 [-0.125, +0.500] nats per measurement and "
         "takes 500 operations an update for 400." in list(advice_lines(likelier, []))
@@ -404,7 +404,7 @@ def test_the_best_in_hindsight_is_named_beside(advice):
 
 def test_a_likelihood_that_misleads_is_said(advice):
     """As where errors last longer than a measurement: what predicts best errs more."""
-    worse = advice.fitted._replace(relative_error=Estimate(0.07, 0.02, 0.12))
+    worse = advice.fitted._replace(relative_error=IntervalEstimate(0.07, 0.02, 0.12))
     kept = next(c for c in advice.competitors if c.name == advice.rival)
     line = next(advice_lines(advice._replace(fitted=worse, competitors=[kept, worse]), []))
     assert line.startswith(
@@ -418,7 +418,7 @@ def test_where_the_likelihood_misleads_the_rival_is_advised(one_family, tmp_path
     """Beyond chance; a difference that may be chance changes nothing."""
     recording = read(write_log(tmp_path, count=240, acceleration=0.8, sigma=1.0, seed=5))
     for low, kept in ((0.02, True), (-0.02, False)):
-        errors = Estimate(0.07, low, 0.12)
+        errors = IntervalEstimate(0.07, low, 0.12)
         monkeypatch.setattr(Judgement, "relative_error", lambda self, name, other, errors=errors: errors)
         found = advise(FittedLog(PROBLEM, recording), {"imm": PROBLEM.competitor("imm")})
         assert found.fitted.gain.low > 0.0

@@ -23,7 +23,15 @@ from filtergym.compiler.c_text import (
 )
 from filtergym.compiler.interpretation import interpret
 from filtergym.compiler.library import BINARY
-from filtergym.compiler.program import COMPARISONS, FUNCTIONS, LOGICAL, OPERATIONS, Graph, Result, program
+from filtergym.compiler.program import (
+    COMPARISONS,
+    FUNCTIONS,
+    LOGICAL,
+    OPERATIONS,
+    Graph,
+    ProgramResult,
+    program,
+)
 
 STRICT = ("-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
 ORDERS = np.array([5e-324, 0.5, 1.0, 1.5, 2.5, 3.0, 2.0**52 + 1.0, 1e22, 1e300])
@@ -62,7 +70,7 @@ def single(name, arity, constant=None):
     for place in range(arity):
         if logical or (name == "where" and place == 0):
             nodes[place] = graph.node("not_equal", nodes[place], graph.constant(0.0))
-    return program(graph, [Result(1, 0, graph.node(name, *nodes))])
+    return program(graph, [ProgramResult(1, 0, graph.node(name, *nodes))])
 
 
 ARITY = {
@@ -164,7 +172,7 @@ def random_program(seed, steps):
         else:
             numbers.append(graph.node(name, *(number() for _ in range(ARITY[name]))))
     wanted = [*rng.choice(numbers[7:], 12), *truths[-3:], numbers[0], numbers[5]]
-    return program(graph, [Result(1, row, int(node)) for row, node in enumerate(wanted)])
+    return program(graph, [ProgramResult(1, row, int(node)) for row, node in enumerate(wanted)])
 
 
 SEEDS = range(12)
@@ -223,7 +231,7 @@ def test_what_float_lacks_is_replaced_and_reported():
     ]  # fmt: skip
     graph = Graph()
     node = graph.node("maximum", graph.input(0, 0), graph.constant(1e-300))
-    code = program(graph, [Result(1, 0, node)])
+    code = program(graph, [ProgramResult(1, 0, node)])
     written = [
         write_program(code, "f", [], lambda *_: "x", lambda *_: "y", scalar) for scalar in (DOUBLE, FLOAT)
     ]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from filtergym.compiler import cache, native
-from filtergym.compiler.functions import Function
+from filtergym.compiler.functions import CompiledFunction
 from filtergym.compiler.program import Graph
 
 pytest.importorskip("llvmlite")
@@ -40,7 +40,7 @@ def loaded(monkeypatch):
     def load():
         monkeypatch.setattr(native, "_CODES", {})
         compiled.clear()
-        result = Function(lambda x: x * 2.5 + x, Graph())(NUMBERS)
+        result = CompiledFunction(lambda x: x * 2.5 + x, Graph())(NUMBERS)
         np.testing.assert_array_equal(result, NUMBERS * 2.5 + NUMBERS)
         return len(compiled)
 
@@ -142,7 +142,7 @@ def exchange(place, loaded):
     """Put the code of another program in place of the small program's, with the right checksum."""
     loaded()
     [entry] = place.iterdir()
-    Function(lambda x: x * 7.0, Graph())(NUMBERS)
+    CompiledFunction(lambda x: x * 7.0, Graph())(NUMBERS)
     [other] = set(place.iterdir()) - {entry}
     return other.replace(entry)
 
@@ -232,12 +232,12 @@ def test_names_tell_texts_apart():
 SCRIPT = """
 import numpy
 from filtergym.compiler import cache, namespace
-from filtergym.compiler.functions import Function
+from filtergym.compiler.functions import CompiledFunction
 from filtergym.compiler.program import Graph
 compiled = []
 keep = cache.keep
 cache.keep = lambda *entry: (compiled.append(entry), keep(*entry))
-result = Function(lambda x: namespace.exp(x) * namespace.sin(x) / 3.0 + x, Graph())(numpy.arange(16.0))
+result = CompiledFunction(lambda x: namespace.exp(x) * namespace.sin(x) / 3.0 + x, Graph())(numpy.arange(16.0))
 print(len(compiled), result.tobytes().hex())
 """
 

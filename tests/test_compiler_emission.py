@@ -10,7 +10,7 @@ from contract import assert_properties
 from filtergym.compiler import cache, native
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.library import BINARY, VARIANTS, fastest, portable
-from filtergym.compiler.program import COMPARISONS, FUNCTIONS, OPERATIONS, Graph, Result, program
+from filtergym.compiler.program import COMPARISONS, FUNCTIONS, OPERATIONS, Graph, ProgramResult, program
 
 pytest.importorskip("llvmlite")
 
@@ -49,7 +49,7 @@ def computed(name, arrays, library=None, constant=None):
     count = len(arrays[0])
     padded = [np.concatenate([array.astype(float), np.zeros(-count % 8)]) for array in arrays]
     padded.append(np.empty_like(padded[0]))
-    code = program(graph, [Result(len(arrays), 0, graph.node(name, *nodes))])
+    code = program(graph, [ProgramResult(len(arrays), 0, graph.node(name, *nodes))])
     table = np.array(
         [code.constants.ctypes.data] + [n for a in padded for n in (a.ctypes.data, 0)], dtype=np.int64
     )

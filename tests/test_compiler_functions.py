@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from filtergym.compiler import cache, functions, namespace, native
-from filtergym.compiler.functions import Function, Specialised
+from filtergym.compiler.functions import CompiledFunction, Specialised
 from filtergym.compiler.program import Graph
 from filtergym.compiler.sequence import CallSequence, moving_array
 
@@ -45,7 +45,7 @@ def ordinary(x):
 
 @pytest.fixture
 def compiled():
-    return Function(ordinary, Graph())
+    return CompiledFunction(ordinary, Graph())
 
 
 # --- structures
@@ -64,7 +64,7 @@ def moved(bank, step):
 def test_structures_come_back_as_they_went_in():
     position, flags, count = numbers(2, 8), np.arange(8) % 2 == 0, np.arange(8)
     bank = Bank(Track(position, flags), None, {"count": count, "none": None, "pair": (position, flags)})
-    after, said, nothing = Function(moved, Graph())(bank, np.full(8, 0.25))
+    after, said, nothing = CompiledFunction(moved, Graph())(bank, np.full(8, 0.25))
     assert type(after) is Bank
     assert type(after.track) is Track
     assert after.nothing is None
@@ -87,7 +87,7 @@ def test_a_part_of_an_array_or_another_kind_of_it_is_a_new_one():
     def function(x, i):
         return x[:2], x[::-1], namespace.astype(i, namespace.float64), x * 1.0
 
-    first, turned, as_floats, same = Function(function, Graph())(x, i)
+    first, turned, as_floats, same = CompiledFunction(function, Graph())(x, i)
     np.testing.assert_array_equal(first, x[:2])
     np.testing.assert_array_equal(turned, x[::-1])
     assert as_floats.dtype == np.float64
@@ -97,7 +97,7 @@ def test_a_part_of_an_array_or_another_kind_of_it_is_a_new_one():
 def test_arrays_of_every_shape():
     for shape in ((11,), (0, 11), (1, 11), (2, 0, 3, 11), (2, 1, 3, 2, 11), (3, 0)):
         x = numbers(*shape)
-        result = Function(lambda x: x * 2.0 + 1.0, Graph())(x)
+        result = CompiledFunction(lambda x: x * 2.0 + 1.0, Graph())(x)
         np.testing.assert_array_equal(result, x * 2.0 + 1.0, strict=True)
 
 
@@ -112,7 +112,7 @@ def test_answers_can_have_another_dtype_and_no_operations():
             namespace.zeros(1, dtype=bool),
         )
 
-    whole, positive, ones, no = Function(function, Graph())(x)
+    whole, positive, ones, no = CompiledFunction(function, Graph())(x)
     np.testing.assert_array_equal(whole, x.astype(np.int64), strict=True)
     np.testing.assert_array_equal(positive, x > 0, strict=True)
     np.testing.assert_array_equal(ones, np.ones((2, 8)), strict=True)
@@ -121,7 +121,7 @@ def test_answers_can_have_another_dtype_and_no_operations():
 
 def test_every_structure_is_traced_once():
     calls = []
-    function = Function(lambda x, y: (calls.append(1), x if y is None else x + y)[1], Graph())
+    function = CompiledFunction(lambda x, y: (calls.append(1), x if y is None else x + y)[1], Graph())
     x, y = numbers(2, 8), numbers(8, seed=1)
     for _ in range(2):
         assert function(x, None) is x
@@ -168,19 +168,19 @@ def test_every_row_may_be_the_same_memory(compiled):
     row = np.broadcast_to(numbers(24), (3, 24))
     np.testing.assert_array_equal(compiled(row), compiled(row.copy()))
     cube = np.broadcast_to(numbers(4, 24)[:, None], (2, 4, 3, 24))
-    double = Function(lambda x: x * 2.0, Graph())
+    double = CompiledFunction(lambda x: x * 2.0, Graph())
     np.testing.assert_array_equal(double(cube), cube * 2.0)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f2", "i8", "i2", "u1", "?"])
 def test_numbers_of_every_kind_are_read_as_what_they_are(dtype):
     x = (np.arange(24.0) % 7 - (0 if dtype in ("u1", "?") else 3)).reshape(2, 12).astype(dtype)
-    result = Function(lambda x: namespace.astype(x, namespace.float64) / 4.0, Graph())(x)
+    result = CompiledFunction(lambda x: namespace.astype(x, namespace.float64) / 4.0, Graph())(x)
     np.testing.assert_array_equal(result, x.astype(np.float64) / 4.0)
 
 
 def test_one_lane_stands_for_all_but_other_widths_are_refused():
-    add = Function(lambda x, y: x + y, Graph())
+    add = CompiledFunction(lambda x, y: x + y, Graph())
     x, y = numbers(2, 11), numbers(2, 1)
     np.testing.assert_array_equal(add(x, y), x + y)
     with pytest.raises(ValueError, match=r"arrays have one width, got \[3, 11\]"):
@@ -248,7 +248,7 @@ def test_one_thread_at_a_time_traces_into_a_graph():
 
     def work(rows):
         start.wait()
-        return Function(function, graph)(np.zeros((rows, 8)))
+        return CompiledFunction(function, graph)(np.zeros((rows, 8)))
 
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(work, range(3)))
@@ -263,13 +263,13 @@ def test_one_thread_at_a_time_traces_into_a_graph():
 @pytest.mark.usefixtures("_threads_from_few_lanes")
 def test_a_forked_process_goes_on_and_compiles_what_is_new(compiled):
     x = numbers(3, 64)
-    expected = compiled(x, threads=2), Function(lambda x: ordinary(x) / 7.0, Graph())(x)
+    expected = compiled(x, threads=2), CompiledFunction(lambda x: ordinary(x) / 7.0, Graph())(x)
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         signal.alarm(60)  # what hangs ends, and fails
         try:
-            new = Function(lambda x: ordinary(x) / 7.0, Graph())
+            new = CompiledFunction(lambda x: ordinary(x) / 7.0, Graph())
             native._CODES.clear()
             os.write(write, compiled(x, threads=2).tobytes() + new(x, threads=2).tobytes())
         finally:
@@ -303,14 +303,14 @@ def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
 
     monkeypatch.setattr(native, "_load", loaded)
     monkeypatch.setattr(native, "_CODES", {})  # where it may be of an earlier test
-    thread = threading.Thread(target=Function(function, graph), args=(x,))
+    thread = threading.Thread(target=CompiledFunction(function, graph), args=(x,))
     thread.start()
     begun.wait()
     child = os.fork()
     if child == 0:
         signal.alarm(10)  # what hangs ends, and fails
         try:
-            Function(function, graph)(x)
+            CompiledFunction(function, graph)(x)
             os._exit(0)
         finally:
             os._exit(1)
@@ -341,8 +341,8 @@ def test_a_sequence_runs_its_calls_over_all_steps(threads):
     """x <- x + y[k], reported at every step; what one step writes the next one reads, from the other memory."""
     steps, width = 5, 3 * 512
     x, y = numbers(width), np.stack([numbers(width, seed=k) for k in range(steps)])
-    add = Function(lambda x, y: (x + y,), Graph()).specialise(x, y[0])
-    tell = Function(lambda x: (2.0 * x,), Graph()).specialise(x)
+    add = CompiledFunction(lambda x, y: (x + y,), Graph()).specialise(x, y[0])
+    tell = CompiledFunction(lambda x: (2.0 * x,), Graph()).specialise(x)
     memory, told = [x.copy(), np.empty(width)], np.empty((steps, width))
     turns, moving = [], []
     for now, then in (memory, memory[::-1]):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filtergym.compiler import cache, namespace
-from filtergym.compiler.functions import Function, Specialised
+from filtergym.compiler.functions import CompiledFunction, Specialised
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.compiler.program import Graph
 
@@ -35,7 +35,7 @@ def _nothing_is_kept(monkeypatch):
 
 
 def compiled(function, *arrays):
-    return Function(lambda *traced: function(namespace, *traced), Graph())(*arrays)
+    return CompiledFunction(lambda *traced: function(namespace, *traced), Graph())(*arrays)
 
 
 def check(function, *arrays, rtol=0.0):
@@ -347,7 +347,7 @@ def test_what_no_straight_line_can_do_is_refused(function, sentence):
 def test_what_is_written_with_numpy_is_traced(function):
     with np.errstate(all="ignore"):
         expected = function(X, Y)
-    result = Function(function, Graph())(X, Y)
+    result = CompiledFunction(function, Graph())(X, Y)
     assert result.dtype == expected.dtype
     # A product of matrices, a power and functions of a library may differ in their last bits.
     np.testing.assert_allclose(result, expected, rtol=1e-14, atol=1e-14)
@@ -356,7 +356,7 @@ def test_what_is_written_with_numpy_is_traced(function):
 def test_what_is_given_must_be_numbers():
     for array in (X + 1j, np.array(["one"] * 8), np.array([None] * 8)):
         with pytest.raises(NotTraceable, match="cannot be traced"):
-            Function(lambda x: x, Graph())(array)
+            CompiledFunction(lambda x: x, Graph())(array)
 
 
 # --- the namespace itself

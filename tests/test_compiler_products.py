@@ -5,11 +5,11 @@ import pytest
 
 from filtergym.compiler import namespace
 from filtergym.compiler.c_source import write_lanes
-from filtergym.compiler.functions import Function, Specialised
+from filtergym.compiler.functions import CompiledFunction, Specialised
 from filtergym.compiler.gradients import pullback
 from filtergym.compiler.interpretation import interpret
 from filtergym.compiler.namespace import LARGE, Traced, tracing
-from filtergym.compiler.program import BAND, Graph, Result, program
+from filtergym.compiler.program import BAND, Graph, ProgramResult, program
 
 pytest.importorskip("llvmlite")
 
@@ -41,14 +41,14 @@ def test_a_loop_is_numpys_product(shape):
     special = Specialised(lambda x: A @ x, Graph(loops=True), [x])
     assert operations(special).count("product") == 1
     assert not {"multiply", "add"} & set(operations(special))
-    result = Function(lambda x: A @ x, Graph(loops=True))(x)
+    result = CompiledFunction(lambda x: A @ x, Graph(loops=True))(x)
     assert (np.abs(result - A @ x) <= bound(A, x)).all()
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_a_loop_has_the_bits_of_the_straight_line(shape):
     A, x = matrix(*shape), vector(shape[1])
-    looped, straight = (Function(lambda x: A @ x, Graph(loops=loops))(x) for loops in (True, False))
+    looped, straight = (CompiledFunction(lambda x: A @ x, Graph(loops=loops))(x) for loops in (True, False))
     np.testing.assert_array_equal(looped, straight)
 
 
@@ -70,7 +70,7 @@ def test_every_way_to_write_it_is_a_loop(function):
 
     special = Specialised(rows, Graph(loops=True), [vector(30)])
     assert "product" in operations(special)
-    result = Function(rows, Graph(loops=True))(vector(30))
+    result = CompiledFunction(rows, Graph(loops=True))(vector(30))
     assert (np.abs(result - A @ vector(30)) <= bound(A, vector(30))).all()
 
 
@@ -94,7 +94,7 @@ def test_several_loops_in_a_program_of_many_parts():
     special = Specialised(lambda x: network(namespace, x), Graph(loops=True), [vector(20)])
     assert operations(special).count("product") == 4
     assert len([o for o in operations(special) if o not in ("input", "constant", "entry")]) > 200
-    result = Function(lambda x: network(namespace, x), Graph(loops=True))(vector(20))
+    result = CompiledFunction(lambda x: network(namespace, x), Graph(loops=True))(vector(20))
     for found, expected in zip(result, network(np, vector(20)), strict=True):
         # Functions of the vector library are exact to four units in the last place.
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
@@ -103,7 +103,7 @@ def test_several_loops_in_a_program_of_many_parts():
 def test_what_is_no_number_stays_in_its_lane():
     x = vector(40)
     x[3, 7] = np.nan
-    result = Function(lambda x: matrix(40, 40) @ x, Graph(loops=True))(x)
+    result = CompiledFunction(lambda x: matrix(40, 40) @ x, Graph(loops=True))(x)
     assert (np.isnan(result).all(axis=0) == (np.arange(LANES) == 7)).all()
 
 
@@ -123,7 +123,7 @@ def test_a_gradient_goes_through_a_loop():
         inputs = Traced([[graph.input(0, row)] for row in range(30)], float)
         outputs = namespace.tanh(A @ inputs)
         (found,) = pullback(graph, [outputs], [namespace.ones((20, 1))], [inputs])
-    wanted = [Result(1, row, node) for row, node in enumerate(found.nodes.ravel().tolist())]
+    wanted = [ProgramResult(1, row, node) for row, node in enumerate(found.nodes.ravel().tolist())]
     result = np.stack(interpret(program(graph, wanted), lambda _, row: x[row]))
     expected = A.T @ (1.0 - np.tanh(A @ x) ** 2)
     np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12)

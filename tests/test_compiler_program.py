@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from filtergym.compiler import cache, emission, functions, namespace, native
 from filtergym.compiler.block import block_for, block_of
 from filtergym.compiler.emission import emit
-from filtergym.compiler.functions import Function, Specialised
+from filtergym.compiler.functions import CompiledFunction, Specialised
 from filtergym.compiler.library import VARIANTS, portable
 from filtergym.compiler.native import OPTIMISED, Setting, quick_setting
 from filtergym.compiler.parts import cut_parts
@@ -91,7 +91,7 @@ def computed(recipe, arrays, setting, constants=()):
         patch.setattr(native, "quick_setting", lambda *_: setting)
         patch.setattr(native, "_CODES", {})  # made in another setting
         patch.setattr(functions, "FEWEST", 8)
-        compiled = Function(function, Graph())
+        compiled = CompiledFunction(function, Graph())
         for width in WIDTHS:
             for threads in (1, 2):
                 yield width, *compiled(*(array[..., :width] for array in arrays), threads=threads)
@@ -194,7 +194,7 @@ def test_less_work_for_the_same_finite_numbers(function, expected):
     arrays = np.linspace(-2.0, 3.0, 8), np.arange(8) % 3 == 0
     special = Specialised(function, Graph(), arrays)
     assert [step.operation for step in special.program.steps if step.operation != "input"] == expected
-    result = Function(function, Graph())(*arrays)
+    result = CompiledFunction(function, Graph())(*arrays)
     with np.errstate(divide="ignore"), pytest.MonkeyPatch.context() as patch:
         for name in ("where", "exp", "maximum", "negative"):
             patch.setattr(namespace, name, getattr(np, name))
@@ -251,7 +251,7 @@ def test_a_product_with_zeros_of_a_matrix_vanishes():
         "multiply",
         "multiply",
     ]
-    special = Function(lambda x: namespace.asarray(transition) @ x, Graph())
+    special = CompiledFunction(lambda x: namespace.asarray(transition) @ x, Graph())
     x = np.random.default_rng(0).normal(size=(3, 8))
     np.testing.assert_allclose(special(x), transition @ x, rtol=1e-15)
     x[2, 5] = np.nan  # what no zero lets through
@@ -345,7 +345,7 @@ def settings_used(monkeypatch, function, runs):
     monkeypatch.setattr(
         native, "emit", lambda *given, emit=emit: (used.append((given[3].lanes, *given[4:])), emit(*given))[1]
     )
-    compiled, x = Function(function, Graph()), np.ones((1, 8))
+    compiled, x = CompiledFunction(function, Graph()), np.ones((1, 8))
     expected = compiled(x)
     for _ in range(runs):
         np.testing.assert_array_equal(compiled(x), expected)
@@ -400,7 +400,7 @@ def test_parts_are_cut_by_results_as_well_as_by_steps():
     computed = [i for i, step in enumerate(special.program.steps) if step.operation in ("add", "multiply")]
     assert [s for s in statements if isinstance(s, int)] == computed
     for found, expected in zip(
-        Function(function, Graph())(np.arange(8.0)),
+        CompiledFunction(function, Graph())(np.arange(8.0)),
         (np.arange(8.0) + 1.0, 0.0, np.arange(8.0) * 2.0),
         strict=True,
     ):

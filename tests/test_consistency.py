@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
 from filtergym.evaluation.running.metrics import chi_square_band, chi_square_quantile, score
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, share_interval
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate, share_interval
 from filtergym.reports.tables.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -115,7 +115,7 @@ def test_no_room_unless_the_reference_is_better():
         reference = paper + shift + 0.1 * (noise - noise.mean())
         means = [bootstrap.means(values) for values in (0.9 * paper, paper, reference)]
         found = score(*means, bootstrap)
-        assert isinstance(found, Estimate)
+        assert isinstance(found, IntervalEstimate)
         assert np.isfinite(found.value) == room
 
 

@@ -56,7 +56,7 @@ def test_records_follow_from_the_dataset(dataset):
     assert turn.unit == "m"
     peak = np.sqrt((error[..., 0] ** 2).mean(axis=0)).max()
     assert records["imm", "peak_rmse", "position_x", "all"].value == pytest.approx(peak, rel=1e-12)
-    returned = -dataset["charge"].sel(policy="imm").values.sum(axis=1).mean()
+    returned = -dataset["compressed_cost"].sel(policy="imm").values.sum(axis=1).mean()
     assert records["imm", "return", "", "all"].value == pytest.approx(returned, rel=1e-12)
     assert records["known-input-bound", "rmse", "position", "all"].kind == "bound"
     assert ("known-input-bound", "score", "", "all") not in records

@@ -8,7 +8,7 @@ import pytest
 from models import act, assert_no_action_is_the_estimator, make_model, watch_hypotheses
 
 import filtergym  # noqa: F401  # registers the environments
-from filtergym.envs.contract.filter import Initial, Input
+from filtergym.envs.contract.filter import FilterInput, Initial
 from filtergym.envs.loosely_coupled_navigation.fault_bank import FaultBank
 from filtergym.envs.loosely_coupled_navigation.fault_prior import FEW, TRAINING
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
@@ -107,7 +107,7 @@ def of_bank(bank, seen):
     state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
     total = 0.0
     for said in seen:
-        state = bank.step(state, Input(said))
+        state = bank.step(state, FilterInput(said))
         total += np.nan_to_num(state.likelihood.log_likelihood[0])
     return total, state.mean[0, 0], state.covariance[0, 0, 0]
 
@@ -161,7 +161,7 @@ def test_the_first_fix_gives_the_exact_mixture():
     bank, task = small(levels=(1.0, 6.0), distrust=0.4)
     (first, *_) = measurements(3)
     state = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))))
-    found = bank.step(state, Input(first)).likelihood
+    found = bank.step(state, FilterInput(first)).likelihood
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
     mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before

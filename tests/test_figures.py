@@ -21,7 +21,7 @@ from filtergym.evaluation.figures.curve_figures import (
     evaluation_figures,
     varying_modes,
 )
-from filtergym.evaluation.figures.front_figure import Panel, name_points
+from filtergym.evaluation.figures.front_figure import FrontPanel, name_points
 from filtergym.evaluation.figures.looks import (
     COLOURS,
     MOST_HIGHLIGHTED,
@@ -307,7 +307,7 @@ def test_names_leave_the_line_of_the_papers_cost_free():
         Point(f"of {time:.0f} ns", "estimator", ProcessorTime(time, True), cost)
         for time, cost in costs.items()
     ]
-    name_points(figure, {axis: Panel("", points, "", "", ())})
+    name_points(figure, {axis: FrontPanel("", points, "", "", ())})
     assert len(axis.texts) == 2
     # It would move the axes under the names.
     assert not isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine)

@@ -12,7 +12,7 @@ from contract import BACKENDS, continued
 
 from filtergym.envs.engine.catalogue import task_class
 from filtergym.envs.engine.scenario_choice import find_mixture
-from filtergym.envs.interface.fleet import Course
+from filtergym.envs.interface.fleet import EpisodeDistribution
 
 ID = "filtergym/ManeuveringTarget-v0"
 MIXTURE = {"random": 0.6, "paper": 0.4}
@@ -63,9 +63,9 @@ def test_an_episode_of_a_mixture_is_one_of_its_scenario_from_where_the_choice_le
 
 
 def test_shares_of_a_mixture():
-    course = Course(None, {}, (None, None, None), ("a", "b", "c"), (0.2, 0.5, 0.3))
+    distribution = EpisodeDistribution(None, {}, (None, None, None), ("a", "b", "c"), (0.2, 0.5, 0.3))
     generator = np.random.default_rng(0)
-    counts = np.bincount([course.draw_task(generator) for _ in range(20_000)], minlength=3)
+    counts = np.bincount([distribution.draw_task(generator) for _ in range(20_000)], minlength=3)
     np.testing.assert_allclose(counts / 20_000, [0.2, 0.5, 0.3], atol=0.015)
 
 

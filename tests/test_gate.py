@@ -10,7 +10,7 @@ from models import make_model
 from scipy.stats import norm
 
 from filtergym import evaluate
-from filtergym.agents.gate import Gate, Gated, GatedMaker, PaperAction, excess_cost
+from filtergym.agents.gate import FallbackAction, Gate, Gated, GatedMaker, excess_cost
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
@@ -131,7 +131,7 @@ def opened(name, control, scenario, episodes, keywords):
             return action, state
 
     def make(task):
-        return Listening(task, PaperAction)
+        return Listening(task, FallbackAction)
 
     make.control = control
     # Compiling takes longer than these episodes.

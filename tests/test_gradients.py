@@ -22,7 +22,7 @@ from filtergym.agents.training_run import RunOptions, new_run
 from filtergym.agents.training_session import Session
 from filtergym.agents.unrolled import Unrolled
 from filtergym.compiler import namespace
-from filtergym.compiler.functions import Function
+from filtergym.compiler.functions import CompiledFunction
 from filtergym.compiler.gradients import FLAT, RULES, pullback
 from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph
 
@@ -40,7 +40,7 @@ def compiled_gradients(function, *arrays):
         *inputs, adjoint = parts
         return tuple(pullback(graph, [function(namespace, *inputs)], [adjoint], inputs))
 
-    return Function(back, graph)(*arrays, np.arange(1.0, arrays[0].shape[-1] + 1.0))
+    return CompiledFunction(back, graph)(*arrays, np.arange(1.0, arrays[0].shape[-1] + 1.0))
 
 
 def torch_gradients(function, *arrays):

@@ -148,7 +148,7 @@ def test_the_sampled_filter_agrees_at_first_order():
     np.testing.assert_allclose(order[:, 2:], 2, atol=0.1)
 
 
-def test_a_fixed_gain_is_charged_its_own_covariance():
+def test_a_fixed_gain_has_its_own_covariance():
     optimal = kalman_bucy.sampled_covariance(*AUGMENTED, START, 0.01, 2.0)
     repeated = kalman_bucy.sampled_covariance(*AUGMENTED, START, 0.01, 0.01, gain=optimal.gain[0])
     np.testing.assert_allclose(repeated.updated[0], optimal.updated[0], rtol=1e-12, atol=1e-15)

@@ -247,7 +247,7 @@ def test_covariance_of_the_augmented_filter_under_any_gain_is_josephs():
     root = rng.normal(size=(3, 3))
     P, R, K = root @ root.T, 0.7, rng.normal(size=3)
     packed = loosely_coupled.AugmentedCovariance(P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
-    found = loosely_coupled.update_augmented_by(packed, R, loosely_coupled.AugmentedGain(*K))
+    found = loosely_coupled.update_augmented_by(packed, R, loosely_coupled.AugmentedFilterGain(*K))
     rest = np.eye(3) - np.outer(K, [1.0, 0.0, 0.0])
     joseph = rest @ P @ rest.T + R * np.outer(K, K)
     np.testing.assert_allclose(found, joseph[np.triu_indices(3)], rtol=1e-12)

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.maneuvering_target.adaptive_estimators import SageHusa, VariationalBayes
+from filtergym.baselines.maneuvering_target.adaptive_estimators import SageHusaProcessNoise, VariationalBayes
 from filtergym.baselines.maneuvering_target.estimators import (
     KalmanInteractingMultipleModel,
     KalmanTurnInteractingMultipleModel,
@@ -210,7 +210,7 @@ def test_sage_husa_equals_the_papers_recursion(model):
             level = max((1 - d) * level + d * sample.mean(), least**2)
             z, R, dt = yield x, P
 
-    compare(model, SageHusa(model.task, acceleration, forgetting, least), track)
+    compare(model, SageHusaProcessNoise(model.task, acceleration, forgetting, least), track)
 
 
 def test_variational_bayes_equals_the_papers_recursion(model):

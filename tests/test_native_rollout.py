@@ -177,7 +177,7 @@ def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
     given = model_of("ManeuveringTarget", "imm", "random", horizon=90)
     clock, flown = [0.0], []
 
-    def run(self, report, steering, measurements):
+    def run(self, report, compiled_policy, measurements):
         clock[0] += 3e-3 + 40e-6 * measurements
         flown.append(measurements)
 

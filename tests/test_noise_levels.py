@@ -6,7 +6,7 @@ import numpy
 import pytest
 
 from filtergym.filters import imm, noise_levels, packed_covariance
-from filtergym.filters.noise_levels import Hypotheses, SensorNoise
+from filtergym.filters.noise_levels import LevelHypotheses, SensorNoise
 
 n, H, L, N = 3, 4, 5, 6
 
@@ -23,12 +23,12 @@ def normalised(values: numpy.ndarray) -> numpy.ndarray:
     return values / values.sum(axis=0)
 
 
-def some(seed: int) -> tuple[numpy.random.Generator, Hypotheses, numpy.ndarray]:
+def some(seed: int) -> tuple[numpy.random.Generator, LevelHypotheses, numpy.ndarray]:
     """Hypotheses, and their covariances as matrices."""
     rng = numpy.random.default_rng(seed)
     P = covariances(rng, H, N)
     q = tuple(normalised(rng.random((L, H, N))) for _ in range(2))
-    h = Hypotheses(
+    h = LevelHypotheses(
         rng.standard_normal((n, H, N)), packed_covariance.pack(P), normalised(rng.random((H, N))), q
     )
     return rng, h, P

@@ -22,7 +22,7 @@ from filtergym.evaluation.competitors import program_process
 from filtergym.evaluation.competitors.program_process import ENDED, LATE, WRONG, Limits, ProgramProcess
 from filtergym.evaluation.competitors.programs import (
     LIMITS,
-    Field,
+    ArrayField,
     Program,
     ProgramEstimator,
     limit_programs,
@@ -371,10 +371,10 @@ def test_a_line_has_whole_numbers_and_null_for_what_was_not_received():
     estimator = ProgramEstimator(task_of(), Program("true"))
     estimator._format = "json"
     kinds = [
-        Field("scan", (), "int64", ""),
-        Field("seen", (2,), "bool", ""),
-        Field("none", None, "", ""),
-        Field("z", (), "float64", ""),
+        ArrayField("scan", (), "int64", ""),
+        ArrayField("seen", (2,), "bool", ""),
+        ArrayField("none", None, "", ""),
+        ArrayField("z", (), "float64", ""),
     ]
     rows = np.array([[3.0, 1.0, 0.0, np.nan], [4.0, 0.0, 0.0, 1.5]])
     line = json.loads(estimator._message("measurement", kinds, rows))

@@ -18,7 +18,7 @@ from filtergym.compiler.emission import emit
 from filtergym.compiler.interpretation import interpret
 from filtergym.compiler.library import portable
 from filtergym.compiler.namespace import Traced
-from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, Result, program
+from filtergym.compiler.program import FUNCTIONS, OPERATIONS, Graph, ProgramResult, program
 from filtergym.compiler.rolling import CONSTANTS, SCRATCH, TURN, roll
 from filtergym.exports.traced_filter import ANSWER, MEASUREMENT, STATE
 
@@ -131,7 +131,9 @@ def array_program():
         numbers, truths = arrays_of(given)
         nodes = [*numbers.nodes.tolist(), *truths.nodes.tolist()]
         shuffled = np.random.default_rng(0).permutation(len(nodes)).tolist()
-        return program(graph, [Result(1, row, node) for row, node in zip(shuffled, nodes, strict=True)])
+        return program(
+            graph, [ProgramResult(1, row, node) for row, node in zip(shuffled, nodes, strict=True)]
+        )
 
 
 def inputs(N=40):
@@ -162,8 +164,10 @@ def test_first_results_are_known_before_another_input_is_read():
         shown = namespace.concat([x[:4], 2.0 * x[:4]]) + x
         mixed = namespace.concat([answer[:4], x[4:]]) * namespace.concat([x[:4], answer[4:]]) + shown
         last = namespace.concat([mixed, answer, x[:3]])
-    wanted = [Result(3, row, node) for row, node in enumerate(shown.nodes.tolist())]
-    code = program(graph, [*wanted, *(Result(1, row, node) for row, node in enumerate(last.nodes.tolist()))])
+    wanted = [ProgramResult(3, row, node) for row, node in enumerate(shown.nodes.tolist())]
+    code = program(
+        graph, [*wanted, *(ProgramResult(1, row, node) for row, node in enumerate(last.nodes.tolist()))]
+    )
     given, told = inputs(), []
 
     def read(argument, row):
@@ -203,7 +207,7 @@ def test_a_loop_in_c_says_whose_operations_it_has():
     with namespace.tracing(graph):
         given = Traced(np.array([graph.input(0, row) for row in range(16)]), np.float64)
         nodes = np.concatenate([array.nodes.ravel() for array in arrays_of(given)]).tolist()
-    code = program(graph, [Result(1, row, node) for row, node in enumerate(nodes)])
+    code = program(graph, [ProgramResult(1, row, node) for row, node in enumerate(nodes)])
     arrays = Arrays({0: Rows("a", range(16))}, {1: Rows("b", range(len(nodes)))})
     texts = []
     for each in (code, code._replace(callers={})):
@@ -217,7 +221,7 @@ def test_a_loop_in_c_says_whose_operations_it_has():
 
 def test_a_short_program_stays_a_straight_line():
     graph = Graph()
-    code = program(graph, [Result(1, 0, graph.node("add", graph.input(0, 0), graph.input(0, 1)))])
+    code = program(graph, [ProgramResult(1, 0, graph.node("add", graph.input(0, 0), graph.input(0, 1)))])
     arrays = Arrays({0: Rows("a", range(2))}, {1: Rows("b", range(1))})
     source = write_program(code, "f", [], lambda _, row: f"a[{row}]", lambda _, row: "b[0]", arrays=arrays)
     assert source.body == ["const double v2 = a[0] + a[1];", "b[0] = v2;"]

@@ -25,7 +25,7 @@ def forward(start, F, Q, z, available, R):
         if available[k]:
             mean, covariance = kalman.update(mean, covariance, z[:, k], H, R)[:2]
         kept.append((mean, covariance))
-    return smoothing.Estimate(*(np.stack(parts, axis=-2) for parts in zip(*kept, strict=True)))
+    return smoothing.Gaussian(*(np.stack(parts, axis=-2) for parts in zip(*kept, strict=True)))
 
 
 def motion_of(filtered, F, Q):
@@ -150,7 +150,7 @@ def run_imm(start, motions, transition, probabilities, z, available, R):
         R: variance.
     """
     M = len(motions)
-    bank = smoothing.Bank(
+    bank = smoothing.GaussianMixture(
         np.stack([start[0]] * M, axis=1),
         np.stack([start[1]] * M, axis=2),
         np.repeat(probabilities[:, None], z.shape[1], axis=1),
@@ -169,11 +169,11 @@ def run_imm(start, motions, transition, probabilities, z, available, R):
             results = [kalman.update(*each, z[None, k], H, np.array([[R]])) for each in predicted]
             log_likelihood = np.stack([r.log_likelihood for r in results])
             posterior = imm.mode_posterior(imm.log_probabilities(posterior), log_likelihood)
-        bank = smoothing.Bank(
+        bank = smoothing.GaussianMixture(
             np.stack([r[0] for r in results], axis=1), np.stack([r[1] for r in results], axis=2), posterior
         )
         kept.append(bank)
-    filtered = smoothing.Bank(*(np.stack(parts, axis=-2) for parts in zip(*kept, strict=True)))
+    filtered = smoothing.GaussianMixture(*(np.stack(parts, axis=-2) for parts in zip(*kept, strict=True)))
     F, Q = (np.stack([motion[i] for motion in motions], axis=2) for i in (0, 1))
     motion = smoothing.Motion(F, Q, np.stack(predicted_means, axis=-2))
     precision = available[None, None, :, None] / R

@@ -21,12 +21,12 @@ import filtergym
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import import_problem
 from filtergym.compiler import namespace as traced_namespace
-from filtergym.compiler.functions import Function
+from filtergym.compiler.functions import CompiledFunction
 from filtergym.compiler.program import Graph
 from filtergym.compiler.vector_functions import VectorFunction
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import task_class
-from filtergym.envs.linear.state_space import Measurement
+from filtergym.envs.linear.state_space import StateSpaceMeasurement
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 
@@ -145,7 +145,7 @@ def test_a_function_is_the_same_on_every_kind_of_array(torch):
     tensor = torch.asarray(x)
     np.testing.assert_allclose(function.value(tensor, torch).numpy(), value, rtol=1e-14)
     np.testing.assert_allclose(function.jacobian(tensor, torch).numpy(), jacobian, rtol=1e-14)
-    compiled = Function(
+    compiled = CompiledFunction(
         lambda x: (function.value(x, traced_namespace), function.jacobian(x, traced_namespace)), Graph()
     )
     for answer, expected in zip(compiled(x), (value, jacobian), strict=True):
@@ -174,7 +174,7 @@ def test_the_hypotheses_are_mixed_as_in_the_golden_example(make):
     )
     states = []
     for z in (1.5, 3.5, 6.5):
-        measurement = Measurement(z * one[None], one[None])
+        measurement = StateSpaceMeasurement(z * one[None], one[None])
         state = bank.act(bank.predict(state, measurement), measurement, np.zeros((2, 8)))
         states.append(state)
     first, last = states[0], states[2]
@@ -202,12 +202,12 @@ def test_what_was_not_received_changes_nothing(make):
     cls = make(h=np.eye(2), R=[[1.0, 0.3], [0.3, 2.0]])
     bank = make_model(cls, "noise", backend="numpy").filter
     start, one, zero = bank.start(begin(cls)), np.ones(8), np.zeros(8)
-    nothing = Measurement(np.zeros((2, 8)), np.zeros((2, 8)))
+    nothing = StateSpaceMeasurement(np.zeros((2, 8)), np.zeros((2, 8)))
     kept = bank.act(bank.predict(start, nothing), nothing, np.zeros((2, 8)))
     np.testing.assert_allclose(kept.mean, F @ start.mean)
     np.testing.assert_allclose(kept.covariance[..., 0], F @ F.T + Q)
     assert np.isnan(bank.records(kept, nothing)["log_likelihood"]).all()
-    first = Measurement(np.stack([3.0 * one, zero]), np.stack([one, zero]))
+    first = StateSpaceMeasurement(np.stack([3.0 * one, zero]), np.stack([one, zero]))
     partly = bank.predict(start, first)
     variance = (F @ F.T + Q)[0, 0] + 1.0
     expected = -0.5 * (math.log(2.0 * math.pi * variance) + (3.0 - 1.0) ** 2 / variance)
@@ -551,7 +551,7 @@ def test_what_is_written_with_numpy_has_its_values_and_derivatives(name):
     steps = 1e-6 * np.eye(4)[..., None]
     slopes = np.stack([each(x + step) - each(x - step) for step in steps], axis=1) / 2e-6
     np.testing.assert_allclose(jacobian, slopes, rtol=1e-6, atol=1e-6)
-    compiled = Function(
+    compiled = CompiledFunction(
         lambda x: (function.value(x, traced_namespace), function.jacobian(x, traced_namespace)), Graph()
     )
     for answer, expected in zip(compiled(x), (value, jacobian), strict=True):

@@ -12,7 +12,7 @@ from filtergym import Input, read_recording
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.contract.companions import find_companion
 from filtergym.envs.contract.log_format import LogFormat
-from filtergym.envs.linear.state_space import Measurement
+from filtergym.envs.linear.state_space import StateSpaceMeasurement
 from filtergym.exports.c_source import export_c
 from filtergym.exports.request import request_export
 
@@ -158,7 +158,7 @@ def test_filters_agree(make):
 def test_a_table_is_predicted_with_the_inputs_that_are_measured(make):
     cls = make(**LOADED)
     mean, dt, u = np.array([[0.7], [0.1]]), np.array([0.4]), np.array([[1.1], [0.2]])
-    given = Measurement(np.array([[0.3]]), np.ones((1, 1)), dt, u)
+    given = StateSpaceMeasurement(np.array([[0.3]]), np.ones((1, 1)), dt, u)
     predicted, _ = find_companion(cls, LogFormat).predict(mean, given, None)
     moved = LOADED["f"](mean[:, 0], 0.4, u[:, 0])
     np.testing.assert_allclose(predicted[:, 0], LOADED["h"](moved, u[:, 0]), rtol=1e-14)

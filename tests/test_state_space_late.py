@@ -8,7 +8,7 @@ from own_models import simulate
 import filtergym
 from filtergym import Sensor
 from filtergym.baselines.state_space import Extended, InteractingKalman, Unscented
-from filtergym.envs.contract.filter import Input
+from filtergym.envs.contract.filter import FilterInput
 from filtergym.envs.engine.backend import make_model
 
 Q = np.diag([0.1, 0.2])
@@ -50,7 +50,7 @@ def test_what_comes_late_is_taken_in_as_if_all_had_begun_anew(make, kind):
     state, came = estimator.start(start.measurement), 0
     rows = [[] for _ in range(4)]
     for k, (_, m, *_) in enumerate(kept):
-        state = estimator.update(state, Input(m))
+        state = estimator.update(state, FilterInput(m))
         for lane in range(4):
             rows[lane].append((m.interval[lane], received(m.values, m.available, lane)))
             late = received(m.late, m.late_available, lane)

@@ -15,7 +15,7 @@ from filtergym.baselines.state_space import Extended
 from filtergym.baselines.table import Variant
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.scenario_choice import make_task
-from filtergym.envs.linear.state_space import Measurement
+from filtergym.envs.linear.state_space import StateSpaceMeasurement
 from filtergym.evaluation.statistics.innovations import with_innovations
 from filtergym.reports.tables.advice import parameter_lines
 
@@ -155,10 +155,12 @@ def test_a_closed_gate_takes_nothing_in_and_is_told_all_the_same(make):
     start, _ = simulate(make(), 1, 8)
     bank = model.filter
     state = bank.start(start.measurement)
-    far = Measurement(np.stack([900.0 * one, one, 0.0 * one, 0.0 * one]), np.stack([one, one, *zero]), one)
+    far = StateSpaceMeasurement(
+        np.stack([900.0 * one, one, 0.0 * one, 0.0 * one]), np.stack([one, one, *zero]), one
+    )
     predicted = bank.predict(state, far)
     after = bank.act(predicted, far, zero)
-    nothing = Measurement(np.zeros((4, 8)), np.zeros((4, 8)), one)
+    nothing = StateSpaceMeasurement(np.zeros((4, 8)), np.zeros((4, 8)), one)
     expected = bank.act(bank.predict(state, nothing), nothing, zero)
     np.testing.assert_allclose(after.mean, expected.mean, rtol=1e-15)
     np.testing.assert_allclose(after.covariance, expected.covariance, rtol=1e-15)

@@ -144,9 +144,9 @@ def test_what_a_teacher_says_is_the_expected_reward(monkeypatch):
         drawn = truth._replace(position=true[:2], velocity=true[2:])
         episode = Episode(drawn, None, state)
         np.testing.assert_allclose(world.state(drawn), true)
-        own_pay = reward.OWN_PAY[kind](model, episode)
-        error = own_pay.std() / np.sqrt(draws)
-        expected.append((own_pay.mean(), error))
+        own_reward = reward.OWN_REWARDS[kind](model, episode)
+        error = own_reward.std() / np.sqrt(draws)
+        expected.append((own_reward.mean(), error))
         state = model.filter.start(Initial(x, P[..., None]))
         teacher = m[:, None], S[..., None]
         # Wherever the truth of the episode is, which the teacher's share does not look at.
@@ -162,7 +162,7 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
     pytest.importorskip("llvmlite")
     from filtergym.agents.bptt import NetworkPolicy
     from filtergym.agents.unrolled import Teacher, Unrolled
-    from filtergym.envs.engine.rollout import Reward
+    from filtergym.envs.engine.rollout import TrainingObjective
     from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
     keywords = {"control": NAME, "backend": "compiled", "autoreset_mode": "Disabled", "max_episode_steps": 12}
@@ -172,7 +172,7 @@ def test_the_gradient_of_a_student_with_a_teacher_is_that_of_its_cost():
     teacher = Teacher(env, "kalman-imm")
     found = {}
     for share in (0.0, 0.7, 1.0):
-        reward_of_it = Reward("cost-and-likelihood", share)
+        reward_of_it = TrainingObjective("cost-and-likelihood", share)
         unrolled = Unrolled(env, policy, 12, reward_of_it, teacher if share else None)
 
         def cost(unrolled=unrolled):

@@ -7,7 +7,7 @@ import pytest
 from naive import dense
 
 from filtergym.envs.contract.causes import Causes
-from filtergym.envs.contract.faults import Step
+from filtergym.envs.contract.faults import DisturbanceInput
 from filtergym.envs.contract.model import Model
 from filtergym.envs.tightly_coupled_navigation.disturbances import Reception, Reflections
 from filtergym.envs.tightly_coupled_navigation.parameters import (
@@ -392,7 +392,7 @@ def test_urban_errors_have_the_stated_quantiles():
 
     def noise():
         normals = numpy.concatenate([wide, rng.standard_normal((4, N))])
-        return Step(between, 0.01, normals, rng.random((4, N)))
+        return DisturbanceInput(between, 0.01, normals, rng.random((4, N)))
 
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
         s = reflections.advance(Reception(between, wide + cn0, wide, wide), noise())

@@ -10,7 +10,7 @@ from models import KINDS, make_model, short_episodes
 from rounding import assert_same, flown_side_by_side
 
 from filtergym.envs.engine.catalogue import catalogue
-from filtergym.envs.engine.reward import charge
+from filtergym.envs.engine.reward import compressed_cost
 from filtergym.envs.interface.vector_environment import TaskVectorEnv
 
 torch = pytest.importorskip("torch")
@@ -166,7 +166,7 @@ def test_actions_may_be_arrays_lists_or_whole_numbers(id):
 
 @pytest.mark.parametrize(("id", "control"), CONTINUOUS.items())
 def test_gradient_of_an_episode_equals_finite_differences(id, control):
-    """Loss: mean charge of a short episode on fixed noise, through bank, mixing and update.
+    """Loss: mean compressed cost of a short episode on fixed noise, through bank, mixing and update.
 
     Central differences with step h have an error of h^2 times the third derivative plus rounding over h:
     1e-5 balances them near 1e-10 of the loss, and 1e-5 of the largest gradient leaves room for curvature.
@@ -201,7 +201,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
         total = 0.0
         for k in range(horizon):
             state = model.act(state, actions[k])
-            total = total + charge(model, state)
+            total = total + compressed_cost(model, state)
             state = model.measure(state, rows[k + 1])
         return total.mean()
 

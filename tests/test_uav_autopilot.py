@@ -258,7 +258,7 @@ def test_step_of_the_command(plant: str, overshoot: float, rise: float, settling
 
 
 @BOTH
-def test_charge_is_what_the_error_of_the_estimate_loses(plant: str) -> None:
+def test_counted_cost_is_what_the_error_of_the_estimate_loses(plant: str) -> None:
     """With the command known, the control is off by L times the error; a command moves both alike."""
     model = make(plant)
     assert model.task.design.optimal is not None
@@ -269,7 +269,7 @@ def test_charge_is_what_the_error_of_the_estimate_loses(plant: str) -> None:
         episode = model.act(model.measure(episode, noise.rows[k + 1]) if k else episode, numpy.zeros((1, 8)))
         lost = (L @ model.error(episode))[0]
         expected = regret[0, 0] / model.task.cost_unit * lost**2
-        numpy.testing.assert_allclose(model.charge(episode), expected, rtol=1e-9, atol=1e-12)
+        numpy.testing.assert_allclose(model.counted_cost(episode), expected, rtol=1e-9, atol=1e-12)
 
 
 def values(model: Model) -> tuple[numpy.ndarray, numpy.ndarray]:
@@ -284,29 +284,29 @@ def values(model: Model) -> tuple[numpy.ndarray, numpy.ndarray]:
 
 
 @BOTH
-def test_charge_is_what_bellmans_equation_leaves_of_the_cost(plant: str) -> None:
-    """With value V = x'Sx: cost + V(next) - V(now) = charge + what the noise does, to rounding, at every step."""
+def test_counted_cost_is_what_bellmans_equation_leaves_of_the_cost(plant: str) -> None:
+    """With value V = x'Sx: cost + V(next) - V(now) = counted cost + what the noise does, to rounding, at every step."""
     model = make(plant, "paper-noise")
     F, B, (S, _) = model.task.design.true_model.F, model.task.design.true_model.B, values(model)
     noise, a = Noise(model, 8, 3, 41), actions(model, 3, 40, 8)
     state = begin(model, noise)
     for k in range(40):
         state = model.act(state, a[k])
-        x, paid, charged = state.truth.state, model.cost(state), model.charge(state)
+        x, whole, counted = state.truth.state, model.cost(state), model.counted_cost(state)
         state = model.measure(state, noise.rows[k + 1])
         predicted = F @ x + B * state.measurement.control
         w = state.truth.state - predicted
         before, after = ((y * (S @ y)).sum(axis=0) for y in (x, state.truth.state))
         by_noise = (w * (S @ (w + 2.0 * predicted))).sum(axis=0)
-        bellman = paid + (after - before - by_noise) / model.task.cost_unit
-        numpy.testing.assert_allclose(charged, bellman, rtol=1e-6, atol=1e-9)
+        bellman = whole + (after - before - by_noise) / model.task.cost_unit
+        numpy.testing.assert_allclose(counted, bellman, rtol=1e-6, atol=1e-9)
 
 
-def test_charge_is_the_cost_where_the_weights_leave_the_best_control_open() -> None:
+def test_counted_cost_is_the_cost_where_the_weights_leave_the_best_control_open() -> None:
     model = make("P", state_weights=(0.0, 1.0), feedback=(0.8, 1.5))
     assert model.task.design.optimal is None
     episode = model.act(begin(model, Noise(model, 8, 3, 1)), numpy.zeros((1, 8)))
-    numpy.testing.assert_array_equal(model.charge(episode), model.cost(episode))
+    numpy.testing.assert_array_equal(model.counted_cost(episode), model.cost(episode))
 
 
 # ---------------------------------------------------------------- what an episode of "random" is like

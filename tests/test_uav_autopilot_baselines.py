@@ -11,7 +11,7 @@ from models import Asked, make_model
 
 from filtergym import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
+from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayesMeasurementNoise
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
 from filtergym.baselines.uav_autopilot.metrics import METRICS, detect_raised_noise
@@ -364,7 +364,7 @@ def test_an_imm_over_equal_gusts_is_one_filter(plant):
         return GustInteractingMultipleModel(task, memory=50.0, low=1.0, high=1.0)
 
     def one(task: Any) -> AdaptiveKalman:
-        return AdaptiveKalman(task, VariationalBayes, memory=50.0)
+        return AdaptiveKalman(task, VariationalBayesMeasurementNoise, memory=50.0)
 
     equal.kind = one.kind = "estimator"  # type: ignore[attr-defined]
     error = evaluate(ID, {"imm": equal, "one": one}, "random", 8, plant=plant)["error"]

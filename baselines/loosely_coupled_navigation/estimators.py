@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, Initial, Input, Likelihood
+from ...envs.contract.filter import Filter, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement
@@ -56,7 +56,7 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         rates = self.filter.start(0.0 * initial.mean)
         return Navigator(initial.mean, initial.covariance, rates, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Navigator, given: Input) -> Navigator:
+    def update(self, state: Navigator, given: FilterInput) -> Navigator:
         """Predict by the increment of the INS, update by the fix where there is one."""
         measurement = given.measurement
         displacement, predicted = self.filter.predict(state.rates)

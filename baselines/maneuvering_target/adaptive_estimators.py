@@ -5,7 +5,7 @@ A scan that missed the target says nothing of any noise: what is estimated holds
 
 from typing import NamedTuple
 
-from ...envs.contract.filter import Initial, Input, Likelihood
+from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.banks import SHORTEST
 from ...envs.maneuvering_target.task import ManeuveringTarget
@@ -22,7 +22,7 @@ class ProcessNoiseTrack(NamedTuple):
     level: noise_adaptation.Level
 
 
-class SageHusa(KalmanModel):
+class SageHusaProcessNoise(KalmanModel):
     """A Kalman filter that estimates its acceleration noise from its own corrections (Sage and Husa 1969).
 
     Args:
@@ -44,7 +44,7 @@ class SageHusa(KalmanModel):
         level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
         return ProcessNoiseTrack(*self.first_track(initial), level)
 
-    def update(self, state: ProcessNoiseTrack, given: Input) -> ProcessNoiseTrack:
+    def update(self, state: ProcessNoiseTrack, given: FilterInput) -> ProcessNoiseTrack:
         """Predict with the noise estimated so far, update, and estimate it anew."""
         measurement = given.measurement
         F, unit = self.motion(measurement.interval)
@@ -105,7 +105,7 @@ class VariationalBayes(KalmanModel):
         shape = self.shape + 0.0 * initial.mean[:2]
         return MeasurementNoiseTrack(*self.first_track(initial), noise_adaptation.InverseGamma(shape, shape))
 
-    def update(self, state: MeasurementNoiseTrack, given: Input) -> MeasurementNoiseTrack:
+    def update(self, state: MeasurementNoiseTrack, given: FilterInput) -> MeasurementNoiseTrack:
         """Predict, and update state and noise together."""
         measurement = given.measurement
         xp, variance, available = self.xp, measurement.variance, measurement.available

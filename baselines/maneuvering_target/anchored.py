@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ...envs.contract.filter import Initial, Input, Track
+from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...filters import dead_reckoning
@@ -48,11 +48,11 @@ class DeadReckoning(KalmanModel):
         self.scale, self.heading_offset = scale, DEGREE * heading_offset
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> EstimateState:
         """Start where everyone starts, off by an unknown error."""
         return super().start(Initial(*dead_reckoning.start(*initial[:2], self.deviation)))
 
-    def update(self, state: Track, given: Input) -> Track:
+    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
         """Move by the odometry and update with the measured position."""
         measurement = given.measurement
         odometry = measurement.odometry

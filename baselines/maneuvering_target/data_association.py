@@ -12,7 +12,7 @@ from ...envs.maneuvering_target.world import Measurement
 from ...filters import data_association, kalman
 from ...filters.data_association import Plots
 from ...filters.ordered_sums import ordered_sum
-from ...filters.semi_markov import Hypotheses
+from ...filters.semi_markov import AgedHypotheses
 from .estimators import ConstantVelocity, KalmanInteractingMultipleModel, KalmanModel
 
 
@@ -69,7 +69,7 @@ class InteractingMultipleModelDataAssociation(AllPlots, KalmanInteractingMultipl
 class SemiMarkovDataAssociation(SemiMarkov, AllPlots):
     """The semi-Markov Gaussian sum, each of whose hypotheses weighs all plots of a scan."""
 
-    def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:
+    def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
         """Update every hypothesis with all plots; where a measurement holds one, with that."""
         plots = measurement.plots
         if plots is None:

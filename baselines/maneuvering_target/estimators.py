@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ...envs.contract.filter import Filter, Initial, Input, Likelihood, Track
+from ...envs.contract.filter import EstimateState, Filter, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.task import ManeuveringTarget
@@ -25,9 +25,9 @@ class KalmanModel(ConstantVelocityModel, Filter):
         """Start where everyone starts."""
         return self.first_track(initial)
 
-    def first_track(self, initial: Initial) -> Track:
+    def first_track(self, initial: Initial) -> EstimateState:
         """Estimate before the first scan."""
-        return Track(*initial[:2], Likelihood.unknown(initial.mean[0]))
+        return EstimateState(*initial[:2], Likelihood.unknown(initial.mean[0]))
 
     def mean(self, state: Any) -> Array:
         """Position and velocity, whatever else is estimated."""
@@ -37,9 +37,9 @@ class KalmanModel(ConstantVelocityModel, Filter):
         """Likewise."""
         return state.covariance[:4, :4]
 
-    def track(self, measurement: Measurement, result: kalman.Update) -> Track:
+    def track(self, measurement: Measurement, result: kalman.Update) -> EstimateState:
         """State after an update."""
-        return Track(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
+        return EstimateState(result.mean, result.covariance, self.likelihood(measurement, *result[2:]))
 
 
 class ConstantVelocity(KalmanModel):
@@ -54,14 +54,14 @@ class ConstantVelocity(KalmanModel):
         super().__init__(task)
         self.variance = acceleration**2
 
-    def update(self, state: Track, given: Input) -> Track:
+    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
         """One cycle of the filter."""
         F, Q = self.motion(given.measurement.interval)
         predicted = kalman.predict(state.mean, state.covariance, F, self.variance * Q)
         return self.track(given.measurement, self.update_estimate(predicted, given.measurement))
 
 
-class KalmanBank(NamedTuple):
+class KalmanMixture(NamedTuple):
     """State of the IMM over Kalman filters."""
 
     mean: Array
@@ -113,11 +113,11 @@ class KalmanInteractingMultipleModel(KalmanModel):
             for j, variance in enumerate(self.variances)
         ]
 
-    def start(self, initial: Initial) -> KalmanBank:
+    def start(self, initial: Initial) -> KalmanMixture:
         """Start all filters where everyone starts."""
         xp, M = self.xp, self.probabilities.shape[0]
         mean, covariance = self.augment(initial.mean, initial.covariance)
-        return KalmanBank(
+        return KalmanMixture(
             *self.first_track(initial),
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
@@ -125,7 +125,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
             + 0.0 * mean[:1],
         )
 
-    def update(self, state: KalmanBank, given: Input) -> KalmanBank:
+    def update(self, state: KalmanMixture, given: FilterInput) -> KalmanMixture:
         """One IMM cycle. Its normalised innovation squared is the mean of the filters' by their posterior weights."""
         xp, measurement = self.xp, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, state.probabilities)
@@ -140,7 +140,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         density = imm.log_mixture_density(log_predicted, log_likelihood)
         nis = weighted_sum(probabilities, xp.stack([r.squared_distance for r in results]))
         likelihood = self.likelihood(measurement, density, nis)
-        return KalmanBank(mean[:4], covariance[:4, :4], likelihood, means, covariances, probabilities)
+        return KalmanMixture(mean[:4], covariance[:4, :4], likelihood, means, covariances, probabilities)
 
 
 class TurnModel(ConstantVelocityModel):
@@ -234,11 +234,11 @@ class UnscentedTurn(TurnModel, KalmanModel):
         super().__init__(task, acceleration, turn_rate_change)
         self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> EstimateState:
         """Start where everyone starts, with a turn rate about zero."""
         return super().start(Initial(*coordinated_turn.augment_turn_rate(*initial[:2], self.turn_variance)))
 
-    def update(self, state: Track, given: Input) -> Track:
+    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
         """Carry the sigma points through the turn and update with the measured position."""
         T = given.measurement.interval
         mean, covariance = unscented.transform(

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy
 
-from ...envs.contract.filter import Initial, Input, Track
+from ...envs.contract.filter import EstimateState, FilterInput, Initial
 from ...envs.data.recording import Recording
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
-from .adaptive_estimators import SageHusa, VariationalBayes
+from .adaptive_estimators import SageHusaProcessNoise, VariationalBayes
 from .anchored import DeadReckoning, regress_odometry
 from .estimators import (
     ConstantVelocity,
@@ -41,7 +41,7 @@ class ConstantAcceleration(KalmanModel):
         self.variance, self.start_variance = jerk**2, acceleration**2
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> EstimateState:
         """Start where everyone starts, with an acceleration about zero."""
         xp = self.xp
         zero = 0.0 * initial.mean
@@ -53,7 +53,7 @@ class ConstantAcceleration(KalmanModel):
         augmented = xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0)
         return super().start(Initial(*augmented))
 
-    def update(self, state: Track, given: Input) -> Track:
+    def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
         """One cycle of the filter."""
         xp, T = self.xp, given.measurement.interval
         none, one = 0.0 * T, 1.0 + 0.0 * T
@@ -167,7 +167,7 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
             log10_turn_rate_start=turn,
         ),
         "sage-husa": tunable(
-            SageHusa,
+            SageHusaProcessNoise,
             log10_acceleration=acceleration,
             forgetting=(0.3, 0.9, 0.995),
             log10_least=acceleration,

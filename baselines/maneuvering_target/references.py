@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from ...envs.contract.faults import GaussMarkov
-from ...envs.contract.filter import Initial, Input, Likelihood
+from ...envs.contract.filter import FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.constant_velocity import ConstantVelocityModel
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
@@ -48,7 +48,7 @@ class KnownTurn(KalmanModel):
 
     disturbances = DISTURBANCES
 
-    def initialise(self, given: Input) -> TurnMemory:
+    def initialise(self, given: FilterInput) -> TurnMemory:
         """Start where everyone starts; a coloured error is stationary from the start."""
         (mean, covariance), truth = given.measurement, given.truth
         if "coloured" in truth.disturbances:
@@ -67,7 +67,7 @@ class KnownTurn(KalmanModel):
             ]
         )
 
-    def update(self, state: TurnMemory, given: Input) -> TurnMemory:
+    def update(self, state: TurnMemory, given: FilterInput) -> TurnMemory:
         """Predict with what is known of the flight since the scan before, and update with the measured position."""
         measurement, truth = given.measurement, given.truth
         xp, world, disturbances = self.xp, self.task.world, truth.disturbances

@@ -7,7 +7,7 @@ say; scans that missed the target are prediction only, backward too.
 from collections.abc import Sequence
 from typing import Any
 
-from ...envs.contract.filter import Track
+from ...envs.contract.filter import EstimateState
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
@@ -16,8 +16,8 @@ from ...filters.small_matrices import apply
 from ..table import Variant
 from .estimators import (
     ConstantVelocity,
-    KalmanBank,
     KalmanInteractingMultipleModel,
+    KalmanMixture,
     KalmanTurnInteractingMultipleModel,
 )
 
@@ -41,9 +41,11 @@ class ConstantVelocitySmoother(ConstantVelocity):
         F, unit = self.motion(measurement.interval)
         return smoothing.Motion(F, self.variance * unit, apply(F, mean))
 
-    def smooth(self, measurements: Sequence[Measurement], states: Sequence[Track]) -> tuple[Array, Array]:
+    def smooth(
+        self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
+    ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.Estimate(*smoothing.stack_scans([state[:2] for state in states]))
+        filtered = smoothing.Gaussian(*smoothing.stack_scans([state[:2] for state in states]))
         motion = smoothing.over_time(
             self._motion, smoothing.drop_last(filtered.mean), smoothing.stack_scans(measurements)
         )
@@ -78,7 +80,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         F = F[:, :, None]
         return smoothing.Motion(F, Q, apply(F, mixed))
 
-    def _arrival(self, bank: smoothing.Bank, measurement: Measurement) -> smoothing.Arrival:
+    def _arrival(self, bank: smoothing.GaussianMixture, measurement: Measurement) -> smoothing.Arrival:
         xp = self.xp
         prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
         mixed, _ = imm.mix(bank.mean, bank.covariance, prediction.mixing)
@@ -93,10 +95,10 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         )
 
     def smooth(
-        self, measurements: Sequence[Measurement], states: Sequence[KalmanBank]
+        self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.Bank(*smoothing.stack_scans([state[3:] for state in states]))
+        filtered = smoothing.GaussianMixture(*smoothing.stack_scans([state[3:] for state in states]))
         arrival = smoothing.over_time(
             self._arrival, smoothing.drop_last(filtered), smoothing.stack_scans(measurements)
         )

@@ -18,7 +18,7 @@ from ...envs.maneuvering_target.semi_markov import (
     training_prior,
 )
 from ..table import Tunable, Variant, tunable, without_logarithms
-from .adaptive_estimators import SageHusa, VariationalBayes
+from .adaptive_estimators import SageHusaProcessNoise, VariationalBayes
 from .data_association import (
     InteractingMultipleModelDataAssociation,
     ProbabilisticDataAssociation,
@@ -62,7 +62,7 @@ ESTIMATORS = {
     "semi-markov-pda": SemiMarkovDataAssociation,
     "semi-markov-vague-pda": SEMI_MARKOV_VAGUE_DATA_ASSOCIATION,
     "unscented-turn": UnscentedTurn,
-    "sage-husa": SageHusa,
+    "sage-husa": SageHusaProcessNoise,
     "variational-bayes": VariationalBayes,
 }
 

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, Input, Likelihood
+from ...envs.contract.filter import Filter, FilterInput, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start
@@ -252,7 +252,7 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
             later,
         )
 
-    def update(self, state: ClassState, given: Input) -> ClassState:
+    def update(self, state: ClassState, given: FilterInput) -> ClassState:
         """One cycle: motion and radar, change of class, ESM. Its likelihood is that of the radar."""
         xp, prior, memory, measurement = self.xp, self.prior, state.tracks, given.measurement
         P = packed_covariance.unpack(memory.covariance, self.states)

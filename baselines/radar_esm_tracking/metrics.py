@@ -8,7 +8,7 @@ import numpy
 
 from ...evaluation.running.metrics import Measure, squared_errors
 from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
-from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...evaluation.storage.dataset import slices_of, windows_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 
 def time_quantile(
     bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
-) -> Estimate:
+) -> IntervalEstimate:
     """Time by which a share of the chosen episodes has got there; infinite where too few do, NaN where none is chosen.
 
     Args:

@@ -18,7 +18,7 @@ NOTHING = 1e-12
 """Variance of a coloured error that is not there, in units of the white one: the covariance stays positive definite."""
 
 
-class Track(NamedTuple):
+class KnownClassState(NamedTuple):
     """Estimate, and the class that governs the coming motion."""
 
     mean: Array
@@ -49,7 +49,7 @@ class _KnownDraw:
             [[float(j in (i, i + 3)) for j in range(5 if self.coloured else 3)] for i in range(2)]
         )
 
-    def start(self, initial: Start, truth: Truth) -> Track:
+    def start(self, initial: Start, truth: Truth) -> KnownClassState:
         """Start where the filter of the true class starts; the first measurement's errors are correlated as told."""
         mean, P = initial.mean, self.of(self.start_covariance, truth.target_class)
         white, zero = self.white(truth), 0.0 * truth.radar_correlation
@@ -68,7 +68,7 @@ class _KnownDraw:
                 start[i][i] = start[i][i] + variance
                 start[i + 3][i + 3] = variance
                 start[i][i + 3] = start[i + 3][i] = -variance
-        return Track(mean, self.matrix(start), truth.target_class)
+        return KnownClassState(mean, self.matrix(start), truth.target_class)
 
     def matrix(self, rows: list[list[Array]]) -> Array:
         """Stack the entries of a matrix."""
@@ -113,14 +113,14 @@ class Ideal(_KnownDraw):
     kind = "reference"
 
     def update(
-        self, memory: Track, measurement: Measurement, truth: Truth
-    ) -> tuple[Array, Array, Track, Likelihood]:
+        self, memory: KnownClassState, measurement: Measurement, truth: Truth
+    ) -> tuple[Array, Array, KnownClassState, Likelihood]:
         """Predict under the class that governed the motion, and update."""
         F, Q = self.motion(truth, memory.target_class)
         mean, covariance = kalman.predict(memory.mean, memory.covariance, F, Q)
         result = kalman.update(mean, covariance, measurement.radar, self.H, self.white(truth))
         covariance = mirror_lower(result.covariance)
-        track = Track(result.mean, covariance, truth.target_class)
+        track = KnownClassState(result.mean, covariance, truth.target_class)
         degrees = 2.0 + 0.0 * result.log_likelihood
         return result.mean[:3], covariance[:3, :3], track, Likelihood(*result[2:], degrees)
 
@@ -130,9 +130,11 @@ class KnownDrawBound(_KnownDraw):
 
     kind = "bound"
 
-    def update(self, memory: Track, measurement: Measurement, truth: Truth) -> tuple[Array, Track]:
+    def update(
+        self, memory: KnownClassState, measurement: Measurement, truth: Truth
+    ) -> tuple[Array, KnownClassState]:
         """Bound after this scan: the diagonal of the covariance."""
         F, Q = self.motion(truth, memory.target_class)
         P = bounds.predict_bound(memory.covariance, F, Q)
         P = bounds.posterior_cramer_rao_bound(P, self.H, self.white(truth))
-        return self.xp.stack([P[i, i] for i in range(3)]), Track(memory.mean, P, truth.target_class)
+        return self.xp.stack([P[i, i] for i in range(3)]), KnownClassState(memory.mean, P, truth.target_class)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ...envs.contract.filter import Filter, Initial, Input, Likelihood
+from ...envs.contract.filter import Filter, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
@@ -75,7 +75,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
         """Start every filter where everyone starts."""
         return HuberState(self.bank.start(initial), Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: HuberState, given: Input) -> HuberState:
+    def update(self, state: HuberState, given: FilterInput) -> HuberState:
         """One cycle of the bank."""
         xp, measurement = self.xp, given.measurement
         readings = xp.where(xp.isnan(measurement.readings), 0.0, measurement.readings)
@@ -111,11 +111,11 @@ class HuberStuckCheck(Huber):
     ) -> None:
         super().__init__(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
-    def update(self, state: HuberState, given: Input) -> HuberState:
+    def update(self, state: HuberState, given: FilterInput) -> HuberState:
         """One cycle of the bank without what repeats itself."""
         xp, forces, measurement = self.xp, self.task.sensors[2].readings, given.measurement
         available = measurement.available
         fresh = xp.any(measurement.readings[forces] != state.filters.accelerometers, axis=0)
         kept = available[forces] * xp.astype(fresh, available.dtype)
         available = xp.concat([available[: forces.start], kept, available[forces.stop :]])
-        return super().update(state, Input(measurement._replace(available=available)))
+        return super().update(state, FilterInput(measurement._replace(available=available)))

@@ -9,7 +9,7 @@ import numpy
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.running.metrics import Measure, chi_square_quantile, squared_errors
 from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
-from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...evaluation.storage.dataset import groups_of
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ LASTING = 10
 """Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
 
 
-def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> Estimate:
+def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> IntervalEstimate:
     """Ratio of means over episodes, with its interval."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
@@ -206,7 +206,7 @@ def _errors(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
         for i, name in enumerate(HYPOTHESES):
             if each["share"][:, i].any():
                 value = _ratio(bootstrap, each["squares"][:, k, i], each["share"][:, i])
-                root = Estimate(*(math.sqrt(v) for v in value))
+                root = IntervalEstimate(*(math.sqrt(v) for v in value))
                 yield Measure("rmse_by_hypothesis", f"{component} {name}", "all", root, unit)
     yield Measure("cost_median", "", "all", bootstrap.interval(bootstrap.quantiles(each["cost"])), "1")
     yield Measure(

@@ -20,7 +20,7 @@ TOLD_INCREMENT_SIGMA = 1e-3
 """m/s, likewise of steady increments of the velocity on the fixed courses."""
 
 
-class Track(NamedTuple):
+class KnownModeState(NamedTuple):
     """Memory of both; n = 17 + S states (``filters/range_errors.py``)."""
 
     mean: Array
@@ -50,7 +50,7 @@ class _KnownMode:
         self.axis = task.axis[..., 0]
         self.size = gnss_ins.SIZE + task.satellites
 
-    def start(self, initial: Initial, truth: Truth) -> Track:
+    def start(self, initial: Initial, truth: Truth) -> KnownModeState:
         """Start where everyone starts."""
         mean, covariance = range_errors.start(
             initial.mean,
@@ -58,9 +58,9 @@ class _KnownMode:
             self.task.satellites,
             truth.disturbances["coloured"].deviation ** 2,
         )
-        return Track(mean, pack(covariance), truth.mode)
+        return KnownModeState(mean, pack(covariance), truth.mode)
 
-    def reset_acceleration(self, track: Track, lanes: Array, acceleration: Array) -> Track:
+    def reset_acceleration(self, track: KnownModeState, lanes: Array, acceleration: Array) -> KnownModeState:
         """Track with an acceleration that is told, in some lanes."""
         xp, a = self.task.xp, gnss_ins.ACCELERATION
         new = numpy.zeros(self.size)
@@ -78,7 +78,7 @@ class _KnownMode:
             covariance=xp.where(lanes, track.covariance * keep + told, track.covariance),
         )
 
-    def predict_track(self, truth: Truth, track: Track, noises: Array) -> Track:
+    def predict_track(self, truth: Truth, track: KnownModeState, noises: Array) -> KnownModeState:
         """Prediction to the present measurement.
 
         Args:
@@ -115,7 +115,7 @@ class _KnownMode:
             increment = xp.where(moved_by == LINE, T * along, 0.0)
             x, v = mean[gnss_ins.POSITION] + (0.5 * T) * increment, mean[gnss_ins.VELOCITY] + increment
             mean = xp.concat([x, mean[3:4], v, mean[7:]])
-        track = Track(mean, pack(covariance[:, :, 0]), truth.mode)
+        track = KnownModeState(mean, pack(covariance[:, :, 0]), truth.mode)
         return self.reset_acceleration(track, jumped, push)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
@@ -170,8 +170,8 @@ class KnownMode(_KnownMode):
         self.noises = self.process_noises((rest, line, singer))
 
     def update(
-        self, memory: Track, measurement: Measurement, truth: Truth
-    ) -> tuple[Array, Array, Track, Likelihood]:
+        self, memory: KnownModeState, measurement: Measurement, truth: Truth
+    ) -> tuple[Array, Array, KnownModeState, Likelihood]:
         """Predict under the true hypothesis and update with the sensors that work."""
         xp, task, known = self.task.xp, self.task, gnss_ins.SIZE
         track = self.predict_track(truth, memory, self.noises)
@@ -187,7 +187,7 @@ class KnownMode(_KnownMode):
         likelihood = Likelihood(
             update.log_likelihood, ordered_sum(update.squared_residuals), ordered_sum(available)
         )
-        after = Track(update.mean, pack(update.covariance), truth.mode)
+        after = KnownModeState(update.mean, pack(update.covariance), truth.mode)
         return update.mean[:known], update.covariance[:known, :known], after, likelihood
 
 
@@ -214,7 +214,9 @@ class KnownModeBound(_KnownMode):
         line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, 0.0)
         self.noises = self.process_noises((rest, line, task.models[SINGER]))
 
-    def update(self, memory: Track, measurement: Measurement, truth: Truth) -> tuple[Array, Track]:
+    def update(
+        self, memory: KnownModeState, measurement: Measurement, truth: Truth
+    ) -> tuple[Array, KnownModeState]:
         """Bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
         track = self.predict_track(truth, memory, self.noises)

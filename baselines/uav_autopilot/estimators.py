@@ -7,7 +7,7 @@ and a noisier sensor asks for another change of the filter than stronger gusts d
 
 from typing import Any, ClassVar, NamedTuple
 
-from ...envs.contract.filter import Filter, Initial, Input, Likelihood
+from ...envs.contract.filter import Filter, FilterInput, Initial, Likelihood
 from ...envs.contract.observation import Array
 from ...envs.uav_autopilot.level_bank import likelihood_of
 from ...envs.uav_autopilot.task import UavAutopilot
@@ -15,7 +15,12 @@ from ...envs.uav_autopilot.world import Measurement, Start
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
 from ...filters.ordered_sums import weighted_sum
-from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
+from ..measurement_noise import (
+    MeasurementNoise,
+    Mehra,
+    SageHusaMeasurementNoise,
+    VariationalBayesMeasurementNoise,
+)
 from ..table import Variant
 
 
@@ -32,7 +37,7 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         """Start where everyone starts."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: Input) -> Initial:
+    def update(self, state: Initial, given: FilterInput) -> Initial:
         """Equations (10), (11) with the gain of the algebraic Riccati equation."""
         measurement = given.measurement
         predicted = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
@@ -137,7 +142,7 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         """What is remembered at the start."""
         return self.start_filter(initial)
 
-    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
+    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
         """One measurement, gusts as designed."""
         after, log_likelihood, nis, *_ = self.predict_and_update(state.memory, given.measurement, 1.0)
         likelihood = likelihood_of(given.measurement, log_likelihood, nis, self.xp)
@@ -167,7 +172,7 @@ class AdaptiveGusts(AdaptiveKalman):
         one = 0.0 * initial.mean[0] + 1.0
         return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
-    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
+    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
         """One measurement, and the factor for the next."""
         (before, level), measurement = state.memory, given.measurement
         after, log_likelihood, nis, correction, carried = self.predict_and_update(
@@ -207,7 +212,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         low: float = 0.5,
         high: float = 2.0,
     ) -> None:
-        super().__init__(task, VariationalBayes, memory=memory)
+        super().__init__(task, VariationalBayesMeasurementNoise, memory=memory)
         self.levels = low, 1.0, high
         change = (1.0 - stay) / 2.0
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
@@ -217,7 +222,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.start_filter(initial),) * 3, third)
 
-    def update(self, state: AdaptiveState, given: Input) -> AdaptiveState:
+    def update(self, state: AdaptiveState, given: FilterInput) -> AdaptiveState:
         """One IMM cycle; each model keeps its own opinion of the sensors."""
         xp, memory, measurement = self.xp, state.memory, given.measurement
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
@@ -257,14 +262,14 @@ ESTIMATORS: dict[str, Any] = {
     "sage-husa": Variant(
         AdaptiveGusts,
         "The paper's filter, noise of sensors and gusts by fading means of the innovations (Sage and Husa 1969).",
-        rule=SageHusa,
+        rule=SageHusaMeasurementNoise,
         memory=100.0,
         gust_memory=100.0,
     ),
     "variational-bayes": Variant(
         AdaptiveGusts,
         "The paper's filter, gusts by Sage and Husa, sensors by variational Bayes (Särkkä and Nummenmaa 2009).",
-        rule=VariationalBayes,
+        rule=VariationalBayesMeasurementNoise,
         memory=100.0,
         gust_memory=100.0,
     ),

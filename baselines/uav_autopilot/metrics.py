@@ -10,7 +10,7 @@ from ...envs.engine.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.running.metrics import Measure
 from ...evaluation.running.own_metrics import Arrays, MetricInputs, OwnMetrics
-from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...evaluation.statistics.cause_split import held_causes
 from ...evaluation.storage.dataset import keywords_of, slices_of
 from ..alarm import LARGER, scale_ratio
@@ -133,7 +133,7 @@ def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.D
     found: list[Measure] = []
     for i, (window, times) in enumerate(windows.items()):
 
-        def add(metric: str, estimate: Estimate, unit: str, window: str = window) -> None:
+        def add(metric: str, estimate: IntervalEstimate, unit: str, window: str = window) -> None:
             found.append(Measure(metric, "", window, estimate, unit))
 
         add("output_variance", bootstrap.interval(tracking_variance[:, times].mean(axis=1)), f"({unit})^2")
@@ -173,8 +173,8 @@ def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
     return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 
 
-def _exact(value: float) -> Estimate:
-    return Estimate(value, value, value)
+def _exact(value: float) -> IntervalEstimate:
+    return IntervalEstimate(value, value, value)
 
 
 def _step_response(

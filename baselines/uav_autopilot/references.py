@@ -102,7 +102,7 @@ class _KnownNoise:
 
     def update_covariance(
         self, mean: Array, covariance: Array, measurement: Measurement, truth: Truth
-    ) -> packed_covariance.Update:
+    ) -> packed_covariance.PackedUpdate:
         """Take in the readings without their constant errors, with the noise of this measurement."""
         return packed_covariance.update_coordinates(
             mean,

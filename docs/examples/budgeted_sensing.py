@@ -26,7 +26,7 @@ from filtergym.envs.contract.world import World
 from filtergym.evaluation.competitors.kinds import Policy, RandomPolicy
 from filtergym.filters import imm, kalman, semi_markov
 from filtergym.filters.array_namespace import namespace
-from filtergym.filters.semi_markov import Hypotheses
+from filtergym.filters.semi_markov import AgedHypotheses
 from filtergym.filters.small_matrices import outer
 from scipy.special import erf
 
@@ -126,9 +126,9 @@ class Targets(World[Task, Truth, Measurement]):
 class Track(NamedTuple):
     """Hypotheses of one target, by their age."""
 
-    steady: Hypotheses
+    steady: AgedHypotheses
     """Position and velocity."""
-    thrust: Hypotheses
+    thrust: AgedHypotheses
     """With the acceleration."""
 
 
@@ -176,10 +176,10 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
             mean = xp.stack([initial.mean[j], zero])
             speed = 30.0**2 + zero
             covariance = _matrix(xp, [[initial.covariance[j, j], zero], [zero, speed]])
-            steady = Hypotheses(mean[:, None], covariance[:, :, None], 1.0 + zero[None])
+            steady = AgedHypotheses(mean[:, None], covariance[:, :, None], 1.0 + zero[None])
             mean, covariance = _accelerated(xp, mean, covariance, 0.0 * zero)
             ages = len(HAZARDS)
-            thrust = Hypotheses(
+            thrust = AgedHypotheses(
                 xp.stack([mean] * ages, axis=1),
                 xp.stack([covariance] * ages, axis=2),
                 xp.stack([least + zero] * ages),
@@ -193,7 +193,7 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
         for track in tracks:
             steady, zero = track.steady, 0.0 * track.steady.probability
             mean, covariance = _accelerated(xp, steady.mean, steady.covariance, zero)
-            both = semi_markov.join([Hypotheses(mean, covariance, steady.probability), track.thrust])
+            both = semi_markov.join([AgedHypotheses(mean, covariance, steady.probability), track.thrust])
             total = both.probability / sum(both.probability[h] for h in range(both.probability.shape[0]))
             mean, covariance = imm.combine(both.mean, both.covariance, total)
             means.append(mean)
@@ -238,8 +238,8 @@ class BeamBank(Bank["BudgetedSensing", Measurement, Tracks]):
             weights, place, after = imm.softmax(logarithms), 0, []
             for table, result in zip(track, (steady, thrust), strict=True):
                 end = place + table.probability.shape[0]
-                found = Hypotheses(result.mean, result.covariance, weights[place:end])
-                after.append(Hypotheses(*(xp.where(seen, a, b) for a, b in zip(found, table, strict=True))))
+                found = AgedHypotheses(result.mean, result.covariance, weights[place:end])
+                after.append(AgedHypotheses(*(xp.where(seen, a, b) for a, b in zip(found, table, strict=True))))
                 place = end
             tracks.append(Track(*after))
         return self._together(tuple(tracks), xp.where(looked > 0.0, 0.0 * state.waited, state.waited))
@@ -266,12 +266,12 @@ def _accelerated(xp: Any, mean: Array, covariance: Array, variance: Array) -> tu
     return xp.concat([mean, zero[None]]), _matrix(xp, [*rows, [zero, zero, variance + zero]])
 
 
-def _flown(table: Hypotheses, F: Array) -> Hypotheses:
+def _flown(table: AgedHypotheses, F: Array) -> AgedHypotheses:
     mean, covariance = kalman.predict(table.mean, table.covariance, F[:, :, None], 0.0 * F[:, :, None])
     return table._replace(mean=mean, covariance=covariance)
 
 
-def _update(table: Hypotheses, measurement: Measurement, j: int) -> kalman.Update:
+def _update(table: AgedHypotheses, measurement: Measurement, j: int) -> kalman.Update:
     """Kalman filter of every hypothesis with a measured position."""
     S = table.covariance[0, 0] + measurement.sigma[j] ** 2
     innovation = measurement.position[j] - table.mean[0]

@@ -14,7 +14,7 @@ from filtergym.envs.contract.causes import Causes
 from filtergym.envs.contract.companions import action_meanings
 from filtergym.envs.contract.model import Model
 from filtergym.envs.contract.observation import Block
-from filtergym.envs.contract.parameters import Limits, field_limits
+from filtergym.envs.contract.parameters import ParameterLimits, field_limits
 from filtergym.envs.contract.task import Task, field_texts
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.catalogue import catalogue, nearest
@@ -96,7 +96,7 @@ def _measurement(cls: type[Task]) -> list[str]:
     return markdown_table(("field", "what it is"), rows)
 
 
-def _limits(limits: Limits) -> str:
+def _limits(limits: ParameterLimits) -> str:
     if limits.choices:
         return ", ".join(f'`"{choice}"`' for choice in limits.choices)
     signs = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}

@@ -8,7 +8,7 @@ from records import BenchmarkRecords
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.envs.engine.catalogue import bare_name
 from filtergym.evaluation.competitors.kinds import RANKED
-from filtergym.evaluation.figures.front_figure import Panel, draw_panel, legend_of, name_points
+from filtergym.evaluation.figures.front_figure import FrontPanel, draw_panel, legend_of, name_points
 from filtergym.evaluation.figures.print_layout import figure_with_pairs, in_print
 from filtergym.evaluation.running.metrics import Record
 from filtergym.evaluation.running.times import points_of_records, times_of_records
@@ -19,7 +19,7 @@ BUDGETS = (100, 300, 1000, 5000)
 """Nanoseconds that a measurement may take."""
 
 
-def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
+def panels_of(found: Sequence[BenchmarkRecords]) -> list[FrontPanel]:
     """Return what is drawn of each environment that the records have times of, in its training distribution."""
     panels = []
     for measured in found:
@@ -28,13 +28,13 @@ def panels_of(found: Sequence[BenchmarkRecords]) -> list[Panel]:
         if points := points_of_records(own):
             known, learned = problem.baselines, pretrained_agents(problem.id)
             panels.append(
-                Panel(bare_name(problem.id), points, measured.paper, known.score_reference, learned)
+                FrontPanel(bare_name(problem.id), points, measured.paper, known.score_reference, learned)
             )
     return panels
 
 
 @in_print
-def draw_fronts(panels: Sequence[Panel], *, columns: int = 2) -> Any:
+def draw_fronts(panels: Sequence[FrontPanel], *, columns: int = 2) -> Any:
     """Draw the fronts of several environments in one picture, and its legend in the place that is left.
 
     Args:

@@ -27,7 +27,7 @@ from sentence_numbers import Number
 
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.engine.catalogue import bare_name
-from filtergym.evaluation.statistics.bootstrap import Bootstrap, Estimate, percentile_interval
+from filtergym.evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate, percentile_interval
 from filtergym.papers.grid import markdown_table
 from filtergym.reports.tables.terminal_tables import with_interval
 
@@ -108,7 +108,7 @@ def interquartile_table(scores: Scores) -> str:
     rows = []
     for name, own in scores.items():
         weights = run_weights([len(values) for values in own.values()])
-        mean = Estimate(*percentile_interval(interquartile_mean(_pooled(own), weights)).tolist())
+        mean = IntervalEstimate(*percentile_interval(interquartile_mean(_pooled(own), weights)).tolist())
         runs = ", ".join(str(len(values)) for values in own.values())
         rows.append((mean.value, [f"`{name}`", runs, with_interval(Number(*mean))]))
     environments = ", ".join(next(iter(scores.values())))

@@ -29,7 +29,7 @@ from filtergym.evaluation.running.evaluate import check_sendable
 from filtergym.evaluation.running.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.running.parallel import Workers, check_workers
 from filtergym.evaluation.running.summary import EvaluationRequest, reduce_episodes, stem_of
-from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, Estimate
+from filtergym.evaluation.statistics.bootstrap import CONFIDENCE, Bootstrap, IntervalEstimate
 from filtergym.evaluation.statistics.statistic import ALL, Statistic
 from filtergym.evaluation.storage.code import files_digest
 from filtergym.evaluation.storage.dataset import groups_of, windows_of
@@ -112,7 +112,7 @@ class PolicyMeans(NamedTuple):
 class Spread(NamedTuple):
     """Mean over seeds and episodes, and what it varies with."""
 
-    mean: Estimate
+    mean: IntervalEstimate
     between_seeds: float
     """Standard deviation between training seeds, without what the episodes' noise adds to it."""
     over_episodes: float
@@ -145,7 +145,7 @@ def spread(values: numpy.ndarray) -> Spread:
     quantile = stdtrit(total**2 / uncertainty, 0.5 + 0.5 * CONFIDENCE) if uncertainty > 0.0 else 0.0
     half = quantile * numpy.sqrt(total / (seeds * episodes))
     return Spread(
-        Estimate(float(mean), float(mean - half), float(mean + half)),
+        IntervalEstimate(float(mean), float(mean - half), float(mean + half)),
         float(numpy.sqrt(between / episodes)) if seeds > 1 else float("nan"),
         float(numpy.sqrt(of_episodes / (seeds * episodes))),
     )
@@ -371,7 +371,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         component: str = "",
     ) -> None:
         """Keep an estimate, or the interval of a statistic and its resamples."""
-        estimate = values if isinstance(values, Estimate) else bootstrap.interval(values)
+        estimate = values if isinstance(values, IntervalEstimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
         where = (problem.id, scenario, study.split, study.seed, episodes)
         what = (policy, statistic, against, metric, component)
@@ -420,7 +420,13 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
             ("over episodes", layout.over_episodes),
         ):
             nothing = float("nan")
-            add(algorithm, statistic, paper, "relative_cost_difference", Estimate(value, nothing, nothing))
+            add(
+                algorithm,
+                statistic,
+                paper,
+                "relative_cost_difference",
+                IntervalEstimate(value, nothing, nothing),
+            )
     return found
 
 

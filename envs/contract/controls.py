@@ -11,7 +11,7 @@ import numpy
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
-from .filter import Bank, Filter, Input, Measurement, State, TaskT
+from .filter import Bank, Filter, FilterInput, Measurement, State, TaskT
 from .observation import Array
 
 
@@ -57,7 +57,7 @@ def bank_probabilities(
     return imm.mode_posterior(log_predicted, log_likelihood + evidence_scale * xp.clip(action, -1.0, 1.0))
 
 
-class Steerable(Filter[TaskT, Measurement, State]):
+class SteerableFilter(Filter[TaskT, Measurement, State]):
     """A filter with settings that an action multiplies, at one measurement: :meth:`update` is given the logarithms of
     their factors as action, ``(n, N)``. Without an action it is an estimator.
     """
@@ -77,10 +77,10 @@ class Steerable(Filter[TaskT, Measurement, State]):
             state: after :meth:`predict`.
             measurement: the same.
         """
-        return self.update(state, Input(measurement))
+        return self.update(state, FilterInput(measurement))
 
 
-class SteeredBank(Bank[Any, Any, Any]):
+class SettingsBank(Bank[Any, Any, Any]):
     """A filter, steered by factors of its settings.
 
     The action a in [-1, 1]^n multiplies setting k by ``r_k^a_k``, where r_k is what the filter declares. All zero is
@@ -90,7 +90,7 @@ class SteeredBank(Bank[Any, Any, Any]):
     measurement, ``action``, the last one, ``(n, N)``, and what else is shown.
     """
 
-    strong: ClassVar[type[Steerable[Any, Any, Any]]]
+    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]]
     """Class of the filter."""
     own: Any
     """The filter."""
@@ -112,7 +112,7 @@ class SteeredBank(Bank[Any, Any, Any]):
 
         Args:
             state: with that of the filter after :meth:`predict`.
-            found: what the filter makes of the measurement, see :meth:`Steerable.examine`.
+            found: what the filter makes of the measurement, see :meth:`SteerableFilter.examine`.
             measurement: that arrives.
         """
 
@@ -125,7 +125,7 @@ class SteeredBank(Bank[Any, Any, Any]):
         """Update as the filter does, with its settings multiplied."""
         shown = self.xp.clip(self.xp.astype(action, self.xp.float64), -1.0, 1.0)
         logarithms = self.own.heeds(measurement) * self.log_reach * shown
-        own = self.own.update(state.own, Input(measurement, None, logarithms))
+        own = self.own.update(state.own, FilterInput(measurement, None, logarithms))
         return state._replace(own=own, action=shown)
 
     def mean(self, state: Any) -> Array:

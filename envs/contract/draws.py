@@ -2,7 +2,7 @@
 
 A world asks for what it needs in a fixed order, and how many numbers that takes is counted by asking once
 without any (:meth:`Draws.counting`). What was drawn is kept under its name: an episode's levels, times and
-kinds are its context. What is drawn may hold within a window of time, or step: :func:`within`, :class:`Steps`.
+kinds are its context. What is drawn may hold within a window of time, or step: :func:`within`, :class:`StepSignal`.
 """
 
 import math
@@ -107,7 +107,7 @@ def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Arr
     return index
 
 
-class Steps(NamedTuple):
+class StepSignal(NamedTuple):
     """A signal that is constant between its steps."""
 
     values: Array

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .task import Task
 
 
-class Step(NamedTuple):
+class DisturbanceInput(NamedTuple):
     """A measurement, as a disturbance meets it."""
 
     number: Array
@@ -104,7 +104,7 @@ class Disturbance(ABC):
         """
         return state
 
-    def advance(self, state: Any, step: Step) -> Any:
+    def advance(self, state: Any, step: DisturbanceInput) -> Any:
         """State at a measurement, from that at the one before."""
         return state
 
@@ -120,7 +120,7 @@ class Disturbance(ABC):
         """State and what the sensor reads, ``(n, N)`` in its own coordinates, with what it does to them."""
         return state, reading
 
-    def change_measurement(self, state: Any, measurement: Any, step: Step) -> tuple[Any, Any]:
+    def change_measurement(self, state: Any, measurement: Any, step: DisturbanceInput) -> tuple[Any, Any]:
         """State and measurement with what it does to them.
 
         Args:
@@ -204,16 +204,16 @@ class Disturbances:
 
     def share(
         self, number: Array, interval: Array | float, normals: Array, uniforms: Array, feedback: Any = None
-    ) -> dict[str, Step]:
+    ) -> dict[str, DisturbanceInput]:
         """Hand out a measurement's random numbers, ``(normals, N)`` and ``(row_uniforms, N)``, by name."""
         steps, n, u = {}, 0, 0
         for part in self.parts:
             own = normals[n : n + part.normals], uniforms[u : u + part.row_uniforms]
-            steps[part.name] = Step(number, interval, *own, feedback)
+            steps[part.name] = DisturbanceInput(number, interval, *own, feedback)
             n, u = n + part.normals, u + part.row_uniforms
         return steps
 
-    def advance(self, states: Mapping[str, Any], steps: Mapping[str, Step]) -> dict[str, Any]:
+    def advance(self, states: Mapping[str, Any], steps: Mapping[str, DisturbanceInput]) -> dict[str, Any]:
         """States at a measurement."""
         return {part.name: part.advance(states[part.name], steps[part.name]) for part in self.parts}
 
@@ -237,7 +237,7 @@ class Disturbances:
         return changed, reading
 
     def change_measurement(
-        self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, Step]
+        self, states: Mapping[str, Any], measurement: Any, steps: Mapping[str, DisturbanceInput]
     ) -> tuple[dict[str, Any], Any]:
         """States and measurement with what each does to them."""
         changed = dict(states)
@@ -290,7 +290,7 @@ class Outliers(Disturbance):
         """Start with a usual one."""
         return zero + 1.0
 
-    def advance(self, state: Array, step: Step) -> Array:
+    def advance(self, state: Array, step: DisturbanceInput) -> Array:
         """Draw whether this is one."""
         if not self.probability:
             return state
@@ -348,7 +348,7 @@ class GaussMarkov(NamedTuple):
         return self.decay * error + self.kick * normals
 
 
-class Colour(NamedTuple):
+class ColouredErrorsState(NamedTuple):
     """State of :class:`ColouredErrors`."""
 
     deviation: Array
@@ -383,22 +383,22 @@ class ColouredErrors(Disturbance):
         """Keep what :meth:`complete` takes."""
         return normals, zero
 
-    def complete(self, state: tuple[Array, Array], draws: Draws) -> Colour:
+    def complete(self, state: tuple[Array, Array], draws: Draws) -> ColouredErrorsState:
         """Draw how large they are and how long they last; they are stationary from the start."""
         normals, zero = state
         deviation, lasting = self.draw(draws, zero)
         process = GaussMarkov.sampled(deviation, lasting, self.interval, self.xp)
         level = deviation * normals if self.normals else self.xp.stack([zero] * self.count)
-        return Colour(deviation, process, level)
+        return ColouredErrorsState(deviation, process, level)
 
-    def quiet(self, state: Colour, calm: Array) -> Colour:
+    def quiet(self, state: ColouredErrorsState, calm: Array) -> ColouredErrorsState:
         """None of them."""
         deviation, kick, level = (
             self.xp.where(calm, 0.0, each) for each in (state.deviation, state.process.kick, state.level)
         )
-        return Colour(deviation, state.process._replace(kick=kick), level)
+        return ColouredErrorsState(deviation, state.process._replace(kick=kick), level)
 
-    def advance(self, state: Colour, step: Step) -> Colour:
+    def advance(self, state: ColouredErrorsState, step: DisturbanceInput) -> ColouredErrorsState:
         """Let them wander."""
         return (
             state._replace(level=state.process.advance(state.level, step.normals)) if self.normals else state

@@ -30,7 +30,7 @@ class Initial(NamedTuple):
     """``(C, C, N)``."""
 
 
-class Input(NamedTuple):
+class FilterInput(NamedTuple):
     """All that a filter may be given at a measurement."""
 
     measurement: Any
@@ -80,7 +80,7 @@ class Stated(NamedTuple):
     """Of which it says how large its errors are, ``(C,)``."""
 
 
-class Track(NamedTuple):
+class EstimateState(NamedTuple):
     """State of a filter that remembers its estimate alone."""
 
     mean: Array
@@ -132,7 +132,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     def start(self, initial: Any) -> State:
         """State at the start of the track, of the task's :class:`Initial`."""
 
-    def initialise(self, given: Input) -> State:
+    def initialise(self, given: FilterInput) -> State:
         """State at the start of the track, of all that the filter is given: the initial estimate as measurement."""
         return self.start(given.measurement)
 
@@ -141,7 +141,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return state
 
     @abstractmethod
-    def update(self, state: State, given: Input) -> State:
+    def update(self, state: State, given: FilterInput) -> State:
         """Step 4: take in the measurement that was predicted.
 
         Args:
@@ -149,7 +149,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
             given: the same measurement, and what else this filter is given.
         """
 
-    def step(self, state: State, given: Input) -> State:
+    def step(self, state: State, given: FilterInput) -> State:
         """Predict to a measurement and take it in, where nobody acts between."""
         return self.update(self.predict(state, given.measurement), given)
 
@@ -221,6 +221,6 @@ class Bank(Filter[TaskT, Measurement, State]):
             action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
         """
 
-    def update(self, state: State, given: Input) -> State:
+    def update(self, state: State, given: FilterInput) -> State:
         """Apply the action that is given."""
         return self.act(state, given.measurement, given.action)

@@ -16,7 +16,7 @@ from ...filters.angles import unwrap
 from .causes import Causes, Moment, cause_number
 from .companions import LoopRecords, PictureMaker, find_companion, trained_banks
 from .draws import Draws
-from .filter import Filter, Input
+from .filter import Filter, FilterInput
 from .observation import Array, Blocks, Field, Reader
 from .task import Task, named_arrays
 
@@ -133,7 +133,7 @@ class Model:
 
     def start_filter(self, initial: Any, truth: Any = None) -> Any:
         """State of the filter at the start of the track."""
-        return self.filter.initialise(Input(initial, truth))
+        return self.filter.initialise(FilterInput(initial, truth))
 
     def predict_filter(self, state: Any, measurement: Any) -> Any:
         """State of the filter when a measurement has come, before it is taken in."""
@@ -141,7 +141,7 @@ class Model:
 
     def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
         """State of the filter when the measurement is taken in, by a bank with the action."""
-        return self.filter.update(state, Input(measurement, truth, action))
+        return self.filter.update(state, FilterInput(measurement, truth, action))
 
     def feedback(self, state: Any, measurement: Any) -> Any:
         """What a filter gives back to the world, see :meth:`.Task.feedback`; None in an open loop."""
@@ -211,9 +211,9 @@ class Model:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""
         return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
 
-    def charge(self, episode: Episode) -> Array:
-        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.charge`."""
-        return self.task.world.charge(episode.truth, self.filter.mean(episode.filter))
+    def counted_cost(self, episode: Episode) -> Array:
+        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.counted_cost`."""
+        return self.task.world.counted_cost(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""

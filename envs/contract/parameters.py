@@ -22,7 +22,7 @@ import numpy
 
 
 @dataclasses.dataclass(frozen=True)
-class Limits:
+class ParameterLimits:
     """What must hold for a value beside its type; for each number where the value is a sequence."""
 
     above: float | None = None
@@ -37,8 +37,8 @@ class Limits:
 
 
 def parameter(default: Any, **limits: Any) -> Any:
-    """Declare a field of a parameters' dataclass with its default and its :class:`Limits`."""
-    return dataclasses.field(default=default, metadata={"limits": Limits(**limits)})
+    """Declare a field of a parameters' dataclass with its default and its :class:`ParameterLimits`."""
+    return dataclasses.field(default=default, metadata={"limits": ParameterLimits(**limits)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,10 +75,12 @@ class TaskParameters:
 
 
 @cache
-def field_limits(cls: type) -> dict[str, tuple[Any, Limits]]:
+def field_limits(cls: type) -> dict[str, tuple[Any, ParameterLimits]]:
     """Type and limits of every field of a parameters' dataclass."""
     hints = typing.get_type_hints(cls)
-    return {f.name: (hints[f.name], f.metadata.get("limits", Limits())) for f in dataclasses.fields(cls)}
+    return {
+        f.name: (hints[f.name], f.metadata.get("limits", ParameterLimits())) for f in dataclasses.fields(cls)
+    }
 
 
 def freeze(value: Any) -> Any:
@@ -88,7 +90,7 @@ def freeze(value: Any) -> Any:
     return tuple(freeze(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
+def check(name: str, value: Any, hint: Any, limits: ParameterLimits) -> None:
     """Check a value against the type and the limits that were declared for it.
 
     Raises:
@@ -113,13 +115,13 @@ def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
         raise TypeError(f"{name} is declared as {hint}, which has no check")
 
 
-def _limits_in_words(limits: Limits) -> str:
+def _limits_in_words(limits: ParameterLimits) -> str:
     words = {"above": "above", "at_least": "at least", "below": "below", "at_most": "at most"}
     parts = [f"{words[f]} {getattr(limits, f)}" for f in words if getattr(limits, f) is not None]
     return " and ".join(parts)
 
 
-def _within(value: float, limits: Limits) -> bool:
+def _within(value: float, limits: ParameterLimits) -> bool:
     return (
         (limits.above is None or value > limits.above)
         and (limits.at_least is None or value >= limits.at_least)
@@ -160,7 +162,7 @@ def read_numbers(name: str, value: Any) -> numpy.ndarray:
     raise ValueError(f"{name} must be numbers, got {quote_shortened(value)}")
 
 
-def _number(name: str, value: Any, limits: Limits) -> None:
+def _number(name: str, value: Any, limits: ParameterLimits) -> None:
     # Compared, not converted: a whole number can be too large for a float.
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
@@ -170,7 +172,7 @@ def _number(name: str, value: Any, limits: Limits) -> None:
         raise ValueError(f"{name} must be {stated}{size}, got {quote_shortened(value)}")
 
 
-def _integer(name: str, value: Any, limits: Limits) -> None:
+def _integer(name: str, value: Any, limits: ParameterLimits) -> None:
     is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_whole or not _within(value, limits):
         stated = f" of {_limits_in_words(limits)}" if _limits_in_words(limits) else ""
@@ -184,11 +186,11 @@ def check_integer(name: str, value: Any, at_least: int) -> int:
         ValueError: with the name, the value and what was expected.
     """
     value = freeze(value)
-    _integer(name, value, Limits(at_least=at_least))
+    _integer(name, value, ParameterLimits(at_least=at_least))
     return int(value)
 
 
-def _word(name: str, value: Any, limits: Limits) -> None:
+def _word(name: str, value: Any, limits: ParameterLimits) -> None:
     if limits.choices and value not in limits.choices:
         raise ValueError(
             f"{name} must be one of {', '.join(map(repr, limits.choices))}, got {quote_shortened(value)}"
@@ -200,7 +202,7 @@ def _word(name: str, value: Any, limits: Limits) -> None:
 _KINDS = {float: "numbers", int: "integers", str: "words"}
 
 
-def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: Limits) -> None:
+def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: ParameterLimits) -> None:
     count = None if of[-1] is Ellipsis else len(of)
     if not isinstance(value, Sequence) or isinstance(value, str) or (count and len(value) != count):
         kind = _KINDS.get(of[0], "rows")

@@ -56,7 +56,7 @@ class View(NamedTuple):
     """nu, ``(m, N)``."""
 
 
-class Track(NamedTuple):
+class StudentState(NamedTuple):
     """The estimate at one moment."""
 
     mean: Array
@@ -69,7 +69,7 @@ class Track(NamedTuple):
     """Of the measurement at hand."""
 
 
-class StudentBank(Bank[TaskT, Measurement, Track]):
+class StudentBank(Bank[TaskT, Measurement, StudentState]):
     """An estimate that the action corrects; what an environment declares stands below.
 
     A subclass says how the estimate moves and in which frame it is corrected (:meth:`rotate`, :meth:`look`), and what
@@ -131,20 +131,20 @@ class StudentBank(Bank[TaskT, Measurement, Track]):
             *self.features,
         )
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> StudentState:
         """Start where everyone starts."""
         frame, none = self.rotate(initial.mean), 0.0 * initial.mean
         motion = self.xp.stack([none[0]] * max(len(self.motions), 1))
         innovation = self.xp.stack([none[0]] * self.measured)
         view = View(initial.mean, frame, none + 1.0, innovation)
-        return Track(initial.mean, initial.covariance, motion, view)
+        return StudentState(initial.mean, initial.covariance, motion, view)
 
-    def predict(self, state: Track, measurement: Measurement) -> Track:
+    def predict(self, state: StudentState, measurement: Measurement) -> StudentState:
         """Predict by the motion that was answered, and compare."""
         view = self.look(state.mean, state.motion, measurement)
         return state._replace(mean=view.mean, view=view)
 
-    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+    def act(self, state: StudentState, measurement: Measurement, action: Array) -> StudentState:
         """Correct the estimate and report the covariance as the network answers."""
         xp, C, m = self.xp, self.size, self.measured
         a = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)

@@ -109,10 +109,10 @@ class Reward(NamedTuple):
     kind: str = "cost"
     """Of the reward that agents get unless another one is asked for, see :mod:`.reward`."""
     unit: float = 1.0
-    """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
+    """Mean cost of the paper's algorithm in the default scenario, as far as it counts: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
     log_unit: float | None = None
-    """Unit of the reward ``log-relative``, about what an ordinary episode is charged, where that is far below ``unit``;
+    """Unit of the reward ``log-relative``, about the cost of an ordinary episode, where that is far below ``unit``;
     None where it is the same."""
 
 

@@ -154,7 +154,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """
         return self.error_cost(self.task.subtract(mean, self.state(truth)))
 
-    def charge(self, truth: Truth, mean: Array) -> Array:
+    def counted_cost(self, truth: Truth, mean: Array) -> Array:
         """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
         known not to be its fault.
 

@@ -39,7 +39,7 @@ SECONDS_OF_MEGABYTE = 0.5
 """s that a megabyte of a file may take beside the limit: a bag of a million messages is honest, and slow."""
 
 
-class Limits(NamedTuple):
+class ReadingLimits(NamedTuple):
     """What reading one file may take."""
 
     memory: int
@@ -48,7 +48,7 @@ class Limits(NamedTuple):
     """s of processor time, and for large files some more."""
 
 
-def limits() -> Limits:
+def limits() -> ReadingLimits:
     """Return the limits in force.
 
     Raises:
@@ -63,7 +63,7 @@ def limits() -> Limits:
         if not 0.0 < value < 1e9:
             raise ValueError(f"{name} must be a positive number, got {os.environ[name]!r:.80}")
         found.append(value)
-    return Limits(int(found[0] * 1e6), found[1])
+    return ReadingLimits(int(found[0] * 1e6), found[1])
 
 
 def refuse_memory(what: str) -> ValueError:

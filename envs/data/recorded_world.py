@@ -34,7 +34,7 @@ class Replayed(NamedTuple):
     """Column of the last one."""
 
 
-class Tables(NamedTuple):
+class RecordedArrays(NamedTuple):
     """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
 
     measurements: Mapping[str, numpy.ndarray]
@@ -143,7 +143,7 @@ class RecordedWorld(_ForeignWorld):
         tables = recording.tables
         # Tables of NumPy are read by compiled code as they are.
         kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
-        self.tables = Tables(
+        self.tables = RecordedArrays(
             {name: kept(values) for name, values in tables.measurements.items()},
             {name: kept(values) for name, values in tables.initial.items()},
             None if tables.truth is None else kept(tables.truth),

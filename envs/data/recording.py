@@ -27,7 +27,7 @@ from ..contract.log_format import LogFormat
 from ..contract.parameters import check, field_limits, freeze
 from ..contract.task import Scenario, Task, named_arrays
 from ..contract.world import World
-from .recorded_world import RecordedWorld, Tables, measure_once
+from .recorded_world import RecordedArrays, RecordedWorld, measure_once
 from .scenario_data import ScenarioData
 
 
@@ -309,7 +309,7 @@ class Recording(ScenarioData):
         return RecordedWorld(task, self)
 
     @functools.cached_property
-    def tables(self) -> Tables:
+    def tables(self) -> RecordedArrays:
         """All episodes one after another, as floats."""
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         ends = numpy.cumsum(self.rows)
@@ -320,7 +320,7 @@ class Recording(ScenarioData):
         def starts(values: numpy.ndarray) -> numpy.ndarray:
             return numpy.ascontiguousarray(numpy.moveaxis(values.astype(float), 0, -1))
 
-        return Tables(
+        return RecordedArrays(
             {name: columns(values) for name, values in self.measurements.items()},
             {name: starts(values) for name, values in self.initial.items()},
             None if self.truth is None else columns(self.truth),

@@ -8,7 +8,7 @@ import numpy
 from ...compiler.namespace import NotTraceable
 from ..contract.companions import trained_banks
 from ..contract.model import Model
-from ..contract.parameters import Limits, check
+from ..contract.parameters import ParameterLimits, check
 from ..contract.task import Task
 from .catalogue import nearest
 from .compiled import AVAILABLE, compiled_model, warn_of
@@ -44,7 +44,7 @@ def make_model(
             than one thread, or a task that cannot be compiled and was asked to be.
         ImportError: if the backend needs a library that is not installed.
     """
-    check("threads", threads, int, Limits(at_least=1))
+    check("threads", threads, int, ParameterLimits(at_least=1))
     xp, device = array_backend(backend, device)
     control = cls.controls[0] if control is None else control
     if not isinstance(control, str) or control not in (*cls.controls, *trained_banks(cls)):

@@ -50,7 +50,7 @@ class CompiledModel(Model):
     observe = _compile(Model.observe)
     mean = _compile(Model.mean)
     cost = _compile(Model.cost)
-    charge = _compile(Model.charge)
+    counted_cost = _compile(Model.counted_cost)
     error = _compile(Model.error)
     covariance = _compile(Model.covariance)
     track = _compile(Model.track)

@@ -25,7 +25,7 @@ from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
-from .reward import OWN_PAY, RewardBaseline
+from .reward import OWN_REWARDS, RewardBaseline
 from .stepper import Stepper
 
 
@@ -259,14 +259,14 @@ class Lanes:
             self._some[width] = EpisodeNoise(self.task, width)
         return self._some[width]
 
-    def pay(self, action: Array, kind: str) -> Array:
+    def step_reward(self, action: Array, kind: str) -> Array:
         """Apply one decision and return its reward, the mean over its measurements, ``(count,)``.
 
         Args:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        answers = self.decide(action, OWN_PAY[kind])
+        answers = self.decide(action, OWN_REWARDS[kind])
         return mean_of([own if other is None else own - other for own, other in answers])[: self.count]
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
@@ -297,23 +297,23 @@ class Lanes:
         return answers
 
     def run(
-        self, report: Report, steering: Specialised | None = None, measurements: int | None = None
+        self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
         """Run the episodes that have just begun to their end in native code, and report on every measurement.
 
         Args:
             report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
-            steering: as of :meth:`.stepper.Stepper.run`; None: the action is zero.
+            compiled_policy: as of :meth:`.stepper.Stepper.run`; None: the action is zero.
             measurements: after which they are left, a multiple of the decision interval; default: all.
 
         Returns:
-            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of what steers.
+            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of the policy.
         """
         (stepper,) = self._reporting(report)
         stepper.take(numpy.zeros((self.width, *(self.model.action_space.shape or ()))))
         interval = self.task.decision_interval
         steps = self.decisions_per_episode * interval if measurements is None else measurements
-        answer: tuple[Any, Any] = stepper.run(self.noise, steps, steering)
+        answer: tuple[Any, Any] = stepper.run(self.noise, steps, compiled_policy)
         self.decisions += steps // interval
         return answer
 

@@ -12,11 +12,11 @@ import gymnasium
 import numpy
 
 from ...compiler import namespace
-from ...compiler.functions import Function, Specialised, leaves
+from ...compiler.functions import CompiledFunction, Specialised, leaves
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ..contract.draws import Draws
-from ..contract.filter import Filter, Input
+from ..contract.filter import Filter, FilterInput
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 
@@ -29,7 +29,7 @@ Report = Callable[[Model, Episode], Any]
 
 def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
     """Filter after the measurement, and what it gives back to the world."""
-    after = model.filter.update(state, Input(measurement, truth, action))
+    after = model.filter.update(state, FilterInput(measurement, truth, action))
     return after, model.feedback(after, measurement)
 
 
@@ -56,7 +56,7 @@ def begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any
 
 def start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
-    state = model.filter.initialise(Input(initial, truth))
+    state = model.filter.initialise(FilterInput(initial, truth))
     return state, model.feedback(state, initial)
 
 
@@ -70,7 +70,7 @@ class Parts(NamedTuple):
     """After the measurement, its arrays of the right shapes."""
 
 
-class _Once:
+class _ComputedOnce:
     """A property that is computed once, as of functools from Python 3.12 on: before, it holds a lock that a fork would
     leave to a child for ever.
     """
@@ -97,7 +97,7 @@ class Programs:
         self.graph = graph
         self.refused: set[Any] = set()
         """Functions that could not be traced."""
-        self._functions: dict[Any, Function] = {}
+        self._functions: dict[Any, CompiledFunction] = {}
         self._of_world = of_world or self
         self._with_filter: dict[Any, Programs] = {}
         self._kept: dict[Any, Any] = {}
@@ -127,33 +127,33 @@ class Programs:
             self._kept[key] = made
         return self._kept[key]
 
-    def function(self, function: Callable[..., Any], **options: Any) -> Function:
+    def function(self, function: Callable[..., Any], **options: Any) -> CompiledFunction:
         """Compiled form of ``function(task, ...)``."""
         if function not in self._functions:
             options = {"unchanged": 0, **options}
-            self._functions[function] = Function(
+            self._functions[function] = CompiledFunction(
                 functools.partial(function, self.traced), self.graph, **options
             )
         return self._functions[function]
 
-    @_Once
-    def filter_update(self) -> Function:
+    @_ComputedOnce
+    def filter_update(self) -> CompiledFunction:
         """The filter with the measurement; a part of it that stays is not written again."""
         return self.function(_update, unchanged=None)
 
-    @_Once
-    def world_advance(self) -> Function:
+    @_ComputedOnce
+    def world_advance(self) -> CompiledFunction:
         """The world; a part of the truth that stays is not written again."""
         if self._of_world is not self:
             return self._of_world.world_advance
         return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
-    @_Once
-    def filter_prediction(self) -> Function:
+    @_ComputedOnce
+    def filter_prediction(self) -> CompiledFunction:
         """The filter at the next measurement."""
         return self.function(_predict, turned=True)
 
-    @_Once
+    @_ComputedOnce
     def world_start(self) -> Specialised:
         """World at the start of the track."""
         if self._of_world is not self:
@@ -162,7 +162,7 @@ class Programs:
         uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
         return self.function(begin_world).specialise(uniforms, normals)
 
-    @_Once
+    @_ComputedOnce
     def start(self) -> tuple[Specialised, Specialised]:
         """World and filter at the start of the track."""
         truth, initial = self.world_start.example()
@@ -170,13 +170,13 @@ class Programs:
             initial, self.traced.truth_for_filter(truth)
         )
 
-    @_Once
+    @_ComputedOnce
     def first(self) -> Parts:
         """Parts of the way from the start of the track over the first measurement."""
         world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
-    @_Once
+    @_ComputedOnce
     def later(self) -> Parts:
         """Parts of the way from an action to the next.
 
@@ -193,7 +193,7 @@ class Programs:
             raise NotTraceable("the arrays of an episode change their shapes from step to step")
         return later
 
-    @_Once
+    @_ComputedOnce
     def unseen_predictions(self) -> tuple[Specialised, Specialised]:
         """The filter at the first measurement and at later ones, where nobody looks at what it shows."""
         states = self.start[1].example()[0], self.first.update.example()[0]

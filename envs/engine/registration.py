@@ -189,7 +189,13 @@ def _check_episodes(model: Model) -> None:
         action = numpy.zeros(WIDTH, int)
     episode = ask("act", model.act, episode, action)
     about = f" of the components {', '.join(names)}"
-    shapes = {"mean": (count,), "covariance": (count, count), "error": (count,), "cost": (), "charge": ()}
+    shapes = {
+        "mean": (count,),
+        "covariance": (count, count),
+        "error": (count,),
+        "cost": (),
+        "counted_cost": (),
+    }
     for name, shape in shapes.items():
         values = ask(name, getattr(model, name), episode)
         check(name + (about if shape else ""), values, shape)

@@ -1,7 +1,7 @@
 """The reward of an agent for one measurement.
 
-* ``cost``: minus the charge of the estimate, in units of its average for the paper's algorithm, and compressed: of a
-  charge ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and
+* ``cost``: minus the counted cost of the estimate, in units of its mean for the paper's algorithm, and compressed: of a
+  cost ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and
   falls by 30 log(2) with every doubling once the track is lost. So it is always better to find the track again, and
   one lost track does not drown all that can be learned elsewhere.
 * ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It rewards an honest covariance,
@@ -10,15 +10,16 @@
   be both accurate and consistent.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
-* ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
-  action of the same control is charged on the same noise, both in units of the paper's average, or where few lost
+* ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is the counted cost of the agent and ``x0`` that of the
+  zero action of the same control on the same noise, both in units of the paper's average, or where few lost
   tracks rule that, of an ordinary episode (``Reward.log_unit``). It is zero where the agent does nothing, the
-  difference of small charges, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
-  of the charge, do not hide what an action changes in all others.
+  difference of small costs, and the logarithm of the ratio of large ones. So a few wild episodes, which rule the mean
+  of the cost, do not hide what an action changes in all others.
 
 :attr:`.Reward.kind` of the task says which is the default.
 
-What an evaluation compares is the cost, neither compressed nor in another unit.
+The counted cost is the cost, or the part of it that :meth:`.World.counted_cost` leaves. What an evaluation compares is
+the whole cost, neither compressed nor in another unit.
 """
 
 from collections.abc import Callable
@@ -31,30 +32,30 @@ from ..contract.model import Model
 from ..contract.observation import Array
 
 COMPRESSED_BEYOND = 30.0
-"""Charge, in units of the paper's average one, from which on the reward falls slowly."""
+"""Counted cost, in units of the paper's average one, from which on the reward falls slowly."""
 
 
-def compress(model: Model, charged: Array) -> Array:
-    """Charge in units of the paper's average one, compressed, ``(N,)``."""
+def compress(model: Model, counted: Array) -> Array:
+    """Counted cost in units of the paper's average one, compressed, ``(N,)``."""
     return COMPRESSED_BEYOND * model.task.xp.log1p(
-        charged * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
+        counted * (1.0 / (COMPRESSED_BEYOND * model.task.reward.unit))
     )
 
 
-def charge(model: Model, state: Any) -> Array:
-    """What the estimate is charged in the reward, in units of the paper's average charge, compressed, ``(N,)``."""
-    return compress(model, model.charge(state))
+def compressed_cost(model: Model, state: Any) -> Array:
+    """Counted cost of the estimate in units of the paper's average one, compressed, ``(N,)``."""
+    return compress(model, model.counted_cost(state))
 
 
 def cost_reward(model: Model, state: Any) -> Array:
-    """Minus the compressed charge of the estimate, ``(N,)``."""
-    return -charge(model, state)
+    """Minus the compressed cost of the estimate, ``(N,)``."""
+    return -compressed_cost(model, state)
 
 
 def log_cost_reward(model: Model, state: Any) -> Array:
-    """Minus ``log(1 + x)`` of the charge x in units of an ordinary one, ``(N,)``."""
+    """Minus ``log(1 + x)`` of the counted cost x in units of an ordinary one, ``(N,)``."""
     unit = model.task.reward.log_unit or model.task.reward.unit
-    return -model.task.xp.log1p(model.charge(state) * (1.0 / unit))
+    return -model.task.xp.log1p(model.counted_cost(state) * (1.0 / unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
@@ -63,7 +64,7 @@ def log_likelihood_reward(model: Model, state: Any) -> Array:
 
 
 def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
-    """Both: minus the compressed charge, plus the log-density of a component, ``(N,)``."""
+    """Both: minus the compressed cost, plus the log-density of a component, ``(N,)``."""
     return cost_reward(model, state) + log_likelihood_reward(model, state) * (
         1.0 / len(model.task.components)
     )
@@ -77,8 +78,8 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
     """Expected reward, up to a constant, if the truth is distributed as a teacher says, ``(N,)``.
 
     With d = x - m, the student's estimate less the teacher's, and their covariances P and S, the log-density is
-    expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A charge is a square of errors, and adds what the teacher's own
-    errors are charged, which the student cannot change: it is charged for d.
+    expected to be ``log N(d; 0, P) - tr(P^-1 S) / 2``. A cost is a square of errors, and adds that of the teacher's own
+    errors, which the student cannot change: what counts is the cost of d.
 
     Args:
         kind: of reward, one of ``LIKELIHOOD_WEIGHTS``.
@@ -88,7 +89,7 @@ def teacher_reward(kind: str, model: Model, state: Any, mean: Array, covariance:
         covariance: S, ``(C, C, N)``.
     """
     world, difference = model.task.world, model.task.subtract(model.mean(state), mean)
-    reward = -compress(model, world.charge(state.truth, world.state(state.truth) + difference))
+    reward = -compress(model, world.counted_cost(state.truth, world.state(state.truth) + difference))
     weight = LIKELIHOOD_WEIGHTS[kind] / len(model.task.components)
     if not weight:
         return reward
@@ -103,7 +104,7 @@ def no_reward(model: Model, state: Any) -> Array:
     return 0.0 * model.mean(state)[0]
 
 
-OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
+OWN_REWARDS: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
@@ -113,7 +114,7 @@ OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
 }
 """Functions of a model and its episodes. Where there is a :func:`reference`, the same of it is subtracted later. "none"
 is that of recordings without truth."""
-REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
+REWARDS = tuple(kind for kind in OWN_REWARDS if kind != "none")
 """Those that can be asked for."""
 
 

@@ -15,10 +15,10 @@ from ...compiler.functions import Specialised, address_of, empty_lanes, leaves, 
 from ...compiler.gradients import pullback
 from ..contract.model import Episode
 from .programs import Programs
-from .reward import OWN_PAY, teacher_reward
+from .reward import OWN_REWARDS, teacher_reward
 
 
-class Reward(NamedTuple):
+class TrainingObjective(NamedTuple):
     """What the gradient is of."""
 
     kind: str
@@ -46,18 +46,22 @@ def _pack(episode: Episode) -> Any:
     return traced.concat([traced.reshape(array, (-1, 1)) for array in arrays])
 
 
-def _forward(programs: Programs, reward: Reward, state: Any, action: Any, noise: Any, *teacher: Any) -> Any:
+def _forward(
+    programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *teacher: Any
+) -> Any:
     """Episodes at the next measurement, reward, and observation."""
     model = programs.traced
     after = model.act(_unpack(programs.later.episode, state), action)
-    episode, own = model.measure(after, noise), OWN_PAY[reward.kind](model, after)
+    episode, own = model.measure(after, noise), OWN_REWARDS[reward.kind](model, after)
     if teacher:
         taught = teacher_reward(reward.kind, model, after, *teacher)
         own = (1.0 - reward.teacher_share) * own + reward.teacher_share * taught
     return _pack(episode), own, model.observe(episode)
 
 
-def _backward(programs: Programs, reward: Reward, state: Any, action: Any, noise: Any, *others: Any) -> Any:
+def _backward(
+    programs: Programs, reward: TrainingObjective, state: Any, action: Any, noise: Any, *others: Any
+) -> Any:
     """Gradients with respect to episodes and action, from those with respect to what :func:`_forward` returns.
 
     The last three arguments are the latter; what stands before them is the teacher's.
@@ -67,7 +71,7 @@ def _backward(programs: Programs, reward: Reward, state: Any, action: Any, noise
 
 
 @functools.lru_cache(16)
-def _compile(programs: Programs, reward: Reward) -> tuple[Specialised, Specialised]:
+def _compile(programs: Programs, reward: TrainingObjective) -> tuple[Specialised, Specialised]:
     rows = sum(int(numpy.prod(leaf.shape[:-1])) for leaf in leaves(programs.later.episode))
     state = numpy.zeros((rows, 8))
     action = numpy.zeros((*(programs.traced.action_space.shape or ()), 8))
@@ -103,7 +107,7 @@ class Rollout:
         action_adjoint: gradient with respect to the action, ``(A, width)``.
     """
 
-    def __init__(self, model: Any, reward: Reward, width: int, measurements: int) -> None:
+    def __init__(self, model: Any, reward: TrainingObjective, width: int, measurements: int) -> None:
         forward, backward = _compile(model.programs, reward)
         rows, actions, noise, *teacher = (leaf.rows for leaf in forward.inputs)
         self._states = [empty_lanes((rows,), width) for _ in range(measurements + 1)]

@@ -248,24 +248,24 @@ class Stepper:
             found = self._lists[calls] = CallList(calls)
         run_over(found, self.width, self._threads)
 
-    def run(self, noise: EpisodeNoise, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
+    def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.
 
         Args:
             noise: of the measurements.
             steps: how many.
-            steering: function of what is shown, read lane by lane, and of a memory that begins with zeros, to an action
-                and the memory. None: the action stays as it is.
+            compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros, to
+                an action and the memory. None: the action stays as it is.
 
         Returns:
             The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
-            nothing steers.
+            there is no policy.
         """
         if self._given:
             self._show_in(self._shown.copy())
         reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
-        actions, memories = None, [self._blank_memory(steering), self._blank_memory(steering)]
-        if steering is not None:
+        actions, memories = None, [self._blank_memory(compiled_policy), self._blank_memory(compiled_policy)]
+        if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
         draw = noise.call_of_each()
         turns: list[list[Call]] = []
@@ -275,8 +275,8 @@ class Stepper:
             advance.table[self._row_entry] = noise.address
             moving += [moving_array(tell, self._report_place + i, each) for i, each in enumerate(reported)]
             turns.append([update, tell, draw, advance, predict])
-            if steering is not None and actions is not None:
-                steer = steering.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
+            if compiled_policy is not None and actions is not None:
+                steer = compiled_policy.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
                 turns[-1].insert(0, steer)
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
@@ -289,9 +289,13 @@ class Stepper:
         ]
         return map_arrays(lambda i: answers[i], self._report_template), actions
 
-    def _blank_memory(self, steering: Specialised | None) -> list[numpy.ndarray]:
-        """Memory of what steers before its first action."""
-        blank = [empty_lanes(leaf.shape, self.width) for leaf in steering.outputs[1:]] if steering else []
+    def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
+        """Memory of a policy before its first action."""
+        blank = (
+            [empty_lanes(leaf.shape, self.width) for leaf in compiled_policy.outputs[1:]]
+            if compiled_policy
+            else []
+        )
         for array in blank:
             array[...] = 0.0
         return blank

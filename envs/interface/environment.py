@@ -77,7 +77,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self._late: LatePicture | None = None
         if render_mode is not None:
-            self._picture_of(self._first_course.names[0])
+            self._picture_of(self._first_distribution.names[0])
         self.observation_space = self._observation_space()
         self.action_space = self.model.action_space
 

@@ -16,7 +16,7 @@ from ..engine.catalogue import check_names, nearest, task_class
 from ..engine.lanes import Lanes, mean_of
 from ..engine.reward import REWARDS
 from ..engine.scenario_choice import find_mixture, find_scenario
-from .fleet import Course, Fleet, check_alike
+from .fleet import EpisodeDistribution, Fleet, check_alike
 from .privileged import context_shapes, in_sigmas
 from .requests import EnvOptions
 from .specification import with_episode_length
@@ -25,10 +25,10 @@ from .step_report import step_report
 FRAMES_PER_SECOND = 10
 
 
-def _no_truth(course: Course) -> str:
-    known = any(model.task.has_truth for model in course.models)
+def _no_truth(distribution: EpisodeDistribution) -> str:
+    known = any(model.task.has_truth for model in distribution.models)
     lacks = "lacks some of the truth, so the reward" if known else "has no truth, so the cost"
-    return f"recording {course.names[0]!r} {lacks} of an estimate is not known"
+    return f"recording {distribution.names[0]!r} {lacks} of an estimate is not known"
 
 
 class EnvBase:
@@ -85,18 +85,18 @@ class EnvBase:
             longest: decisions after which an episode ends at the latest.
         """
         self._make, self._keywords = make, dict(keywords)
-        course = self._course(scenario, {})
-        if not all(model.task.has_whole_truth for model in course.models):
-            self._disable_reward(course)
-        self.model, self._first_course = course.models[0], course
-        self.fleet = Fleet(count, course, self.reward_kind, longest)
+        distribution = self._distribution(scenario, {})
+        if not all(model.task.has_whole_truth for model in distribution.models):
+            self._disable_reward(distribution)
+        self.model, self._first_distribution = distribution.models[0], distribution
+        self.fleet = Fleet(count, distribution, self.reward_kind, longest)
         self.last_decision = self.fleet.decisions_per_episode
         self._scaled_errors: Array = None
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
         if self.privileged:
             self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
-    def _disable_reward(self, course: Course) -> None:
+    def _disable_reward(self, distribution: EpisodeDistribution) -> None:
         """Set every reward to zero, where the truth is not known.
 
         Raises:
@@ -105,12 +105,12 @@ class EnvBase:
         wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
         wanted = "observation='asymmetric'" if self.privileged else wanted
         if wanted:
-            raise ValueError(f"{_no_truth(course)}: leave out {wanted}; rewards are zero")
+            raise ValueError(f"{_no_truth(distribution)}: leave out {wanted}; rewards are zero")
         self.reward_kind = "none"
 
     # --- scenarios
 
-    def _course(self, scenario: Any, parameters: Mapping[str, Any]) -> Course:
+    def _distribution(self, scenario: Any, parameters: Mapping[str, Any]) -> EpisodeDistribution:
         """Make the tasks of a scenario or a mixture, with parameters beside those of the environment.
 
         Raises:
@@ -122,7 +122,7 @@ class EnvBase:
         found = [find_scenario(self._class, choice, keywords) for choice in choices]
         models = tuple(self._make(one, **keywords) for one in found)
         names = tuple(one.name for one in found)
-        course = Course(
+        distribution = EpisodeDistribution(
             scenario,
             dict(parameters),
             models,
@@ -135,7 +135,7 @@ class EnvBase:
             and not all(t.task.has_whole_truth for t in models)
         ):
             raise ValueError(
-                f"{_no_truth(course)}, and this environment gives rewards: make another one of it"
+                f"{_no_truth(distribution)}, and this environment gives rewards: make another one of it"
             )
         first = getattr(self, "model", models[0])
         for model, name in zip(models, names, strict=True):
@@ -145,7 +145,7 @@ class EnvBase:
                     f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
                     "it out, or make the environment without observation='asymmetric'"
                 )
-        return course
+        return distribution
 
     def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
         """Apply the scenario and the parameters of a reset to the coming episodes of these lanes."""
@@ -156,23 +156,23 @@ class EnvBase:
             isinstance(parameters, Mapping) and all(isinstance(name, str) for name in parameters)
         ):
             raise ValueError(f"options['parameters'] maps names of parameters to values, got {parameters!r}")
-        known = [self._first_course, *self.fleet.courses()]
-        courses = []
+        known = [self._first_distribution, *self.fleet.distributions()]
+        distributions = []
         for lane in chosen:
             now = self.fleet.course_of(lane)
             asked = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
-                asked = (self._first_course.scenario if scenario is None else scenario), asked[1]
+                asked = (self._first_distribution.scenario if scenario is None else scenario), asked[1]
             if "parameters" in wanted:
                 asked = asked[0], dict(parameters or {})
-            found = next((course for course in known if course.is_of(*asked)), None)
+            found = next((distribution for distribution in known if distribution.is_of(*asked)), None)
             if found is None:
-                found = self._course(*asked)
+                found = self._distribution(*asked)
                 known.append(found)
-            courses.append(found)
-        for lane, course in zip(chosen, courses, strict=True):
-            self.fleet.send(lane, course)
+            distributions.append(found)
+        for lane, distribution in zip(chosen, distributions, strict=True):
+            self.fleet.send(lane, distribution)
         self.last_decision = self.fleet.decisions_per_episode
 
     # --- what is shown
@@ -271,7 +271,7 @@ class EnvBase:
         ``watch`` is called with the state after the action, once for each measurement.
         """
         if self._rewards_only and watch is None:
-            return self.fleet.pay(action, self.reward_kind)
+            return self.fleet.step_reward(action, self.reward_kind)
         infos: list[dict[str, Array]] = []
         answers = []
         for part, own in self.fleet.parts(action):

@@ -22,14 +22,14 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..data.recording import Recording
 from ..engine.lanes import Lanes
-from ..engine.reward import OWN_PAY, reference
+from ..engine.reward import OWN_REWARDS, reference
 from .specification import plain
 
 ROOM = 8
 """Places by which lanes grow: a multiple of the width that arrays are padded to."""
 
 
-class Course(NamedTuple):
+class EpisodeDistribution(NamedTuple):
     """What the coming episodes of a lane are drawn from."""
 
     scenario: Any
@@ -81,32 +81,34 @@ def check_alike(model: Model, other: Model, name: str) -> None:
 
 
 class Fleet:
-    """``count`` lanes, each with a :class:`Course` of its own.
+    """``count`` lanes, each with a :class:`EpisodeDistribution` of its own.
 
     Args:
         count: number of lanes.
-        course: of all of them, until :meth:`send` names others.
+        distribution: of the episodes of all of them, until :meth:`send` names others.
         kind: of reward, which may need a reference that runs beside every episode.
         longest: decisions after which an episode ends at the latest; default: its task's horizon.
     """
 
-    def __init__(self, count: int, course: Course, kind: str, longest: int | None = None) -> None:
+    def __init__(
+        self, count: int, distribution: EpisodeDistribution, kind: str, longest: int | None = None
+    ) -> None:
         self.count = count
         self.generators: list[numpy.random.Generator] = []
-        self._courses = [course] * count
+        self._distributions = [distribution] * count
         self._kind, self._longest = kind, longest
         self._part = numpy.full(count, -1)
         """Which of ``_parts`` each lane flies in; -1 before its first episode."""
         self._place = numpy.arange(count)
         """Where in it."""
-        self._names = [course.names[0]] * count
+        self._names = [distribution.names[0]] * count
         self._parts: list[Lanes] = []
         self._whole: Lanes | None = None
         """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
         self._sent = False
         """Whether lanes have courses that their episodes were not drawn from."""
-        if len(course.models) == 1:
-            self._parts, self._part[:] = [self._make_lanes(course.models[0], count)], 0
+        if len(distribution.models) == 1:
+            self._parts, self._part[:] = [self._make_lanes(distribution.models[0], count)], 0
         self._arrange()
 
     # --- who flies where
@@ -127,20 +129,20 @@ class Fleet:
     @property
     def mixes_scenarios(self) -> bool:
         """Whether the coming episodes may be of several tasks."""
-        return len({id(model) for course in self._courses for model in course.models}) > 1
+        return len({id(model) for distribution in self._distributions for model in distribution.models}) > 1
 
-    def courses(self) -> list[Course]:
+    def distributions(self) -> list[EpisodeDistribution]:
         """Return the different courses that lanes have."""
-        return list({id(course): course for course in self._courses}.values())
+        return list({id(distribution): distribution for distribution in self._distributions}.values())
 
-    def course_of(self, lane: int) -> Course:
+    def course_of(self, lane: int) -> EpisodeDistribution:
         """Return what the coming episodes of a lane are drawn from."""
-        return self._courses[lane]
+        return self._distributions[lane]
 
-    def send(self, lane: int, course: Course) -> None:
-        """Draw the coming episodes of a lane from a course, from its next restart on."""
-        self._sent = self._sent or course is not self._courses[lane]
-        self._courses[lane] = course
+    def send(self, lane: int, distribution: EpisodeDistribution) -> None:
+        """Draw the coming episodes of a lane from a distribution, from its next restart on."""
+        self._sent = self._sent or distribution is not self._distributions[lane]
+        self._distributions[lane] = distribution
 
     def model_of(self, lane: int) -> Model:
         """Return the task of a lane's episode."""
@@ -158,12 +160,14 @@ class Fleet:
     @property
     def decisions_per_episode(self) -> int:
         """Decisions of the longest episode that there may be."""
-        models = {id(model): model for course in self.courses() for model in course.models}.values()
+        models = {
+            id(model): model for distribution in self.distributions() for model in distribution.models
+        }.values()
         most = max(model.task.horizon // model.task.decision_interval for model in models)
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        beside, report = reference(self._kind, model), OWN_PAY[self._kind]
+        beside, report = reference(self._kind, model), OWN_REWARDS[self._kind]
         return Lanes(model, count, beside, longest=self._longest, report=report)
 
     def _part_of(self, model: Model) -> Lanes:
@@ -180,7 +184,9 @@ class Fleet:
 
     def _arrange(self) -> None:
         """Forget lanes that nobody needs, and note where everybody is."""
-        needed = [model.task.parameters for course in self._courses for model in course.models]
+        needed = [
+            model.task.parameters for distribution in self._distributions for model in distribution.models
+        ]
         kept = [
             i
             for i, part in enumerate(self._parts)
@@ -224,12 +230,12 @@ class Fleet:
         self._part[chosen] = -1
         fresh: dict[int, list[int]] = {}
         for lane in chosen:
-            course = self._courses[lane]
-            which = course.draw_task(self.generators[lane])
-            part = self._part_of(course.models[which])
+            distribution = self._distributions[lane]
+            which = distribution.draw_task(self.generators[lane])
+            part = self._part_of(distribution.models[which])
             number = next(i for i, other in enumerate(self._parts) if other is part)
             fresh.setdefault(number, []).append(lane)
-            self._names[lane] = course.names[which]
+            self._names[lane] = distribution.names[which]
         for number, arrived in fresh.items():
             part = self._parts[number]
             taken = set(self._place[self._part == number].tolist())
@@ -270,11 +276,11 @@ class Fleet:
             return self._whole.model.task.xp.asarray(values[0], copy=True)
         return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
-    def pay(self, action: Array, kind: str) -> Array:
-        """Apply one decision and return its reward, see :meth:`.lanes.Lanes.pay`."""
+    def step_reward(self, action: Array, kind: str) -> Array:
+        """Apply one decision and return its reward, see :meth:`.lanes.Lanes.step_reward`."""
         if self._whole is not None:
-            return self._whole.pay(action, kind)
-        return self.gather([part.pay(own, kind) for part, own in self.parts(action)])
+            return self._whole.step_reward(action, kind)
+        return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
         """Observation of every lane, batch first."""
@@ -336,5 +342,5 @@ class Fleet:
         self._arrange()
 
 
-_STATE_ATTRIBUTES = ("generators", "_courses", "_part", "_place", "_names", "_sent")
+_STATE_ATTRIBUTES = ("generators", "_distributions", "_part", "_place", "_names", "_sent")
 """Attributes of a fleet that change."""

@@ -10,7 +10,7 @@ import numpy
 
 from ...filters.array_namespace import host_array, is_tensor
 from ..contract.observation import Array
-from ..contract.parameters import Limits, check
+from ..contract.parameters import ParameterLimits, check
 from ..engine.catalogue import nearest
 
 DTYPES = ("float64", "float32")
@@ -101,8 +101,8 @@ class EnvOptions:
             raise nearest("dtype", self.dtype, DTYPES)
         if self.observation not in OBSERVATIONS:
             raise nearest("observation", self.observation, OBSERVATIONS)
-        check("detailed_info", self.detailed_info, bool, Limits())
-        check("context", self.context, bool, Limits())
+        check("detailed_info", self.detailed_info, bool, ParameterLimits())
+        check("context", self.context, bool, ParameterLimits())
 
     @property
     def privileged(self) -> bool:

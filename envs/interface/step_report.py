@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
 from ..engine.programs import Report
-from ..engine.reward import OWN_PAY
+from ..engine.reward import OWN_REWARDS
 
 
 class StepReport(NamedTuple):
@@ -29,15 +29,15 @@ def step_report(kind: str, errors: bool = False, details: bool = False, episode:
     """Return the function that makes a :class:`StepReport`, always the same one.
 
     Args:
-        kind: of reward, one of :data:`.reward.OWN_PAY`.
+        kind: of reward, one of :data:`.reward.OWN_REWARDS`.
         errors: whether error and covariance are asked about.
         details: likewise.
         episode: likewise.
     """
-    pay = OWN_PAY[kind]
+    reward = OWN_REWARDS[kind]
 
     def report(model: Model, state: Episode) -> StepReport:
-        found = StepReport(pay(model, state))
+        found = StepReport(reward(model, state))
         if errors:
             found = found._replace(error=model.error(state), covariance=model.covariance(state))
         if details:

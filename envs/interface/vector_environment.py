@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from ...filters.array_namespace import host_array, is_tensor, tensor_on
 from ..contract.observation import Array
-from ..contract.parameters import Limits, check, freeze
+from ..contract.parameters import ParameterLimits, check, freeze
 from ..engine.backend import make_model
 from ..engine.catalogue import nearest
 from ..engine.scenario_choice import ScenarioChoice
@@ -112,9 +112,9 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
         num_envs, max_episode_steps = freeze(num_envs), freeze(max_episode_steps)
-        check("num_envs", num_envs, int, Limits(at_least=1))
+        check("num_envs", num_envs, int, ParameterLimits(at_least=1))
         if max_episode_steps not in (None, -1):
-            check("max_episode_steps", max_episode_steps, int, Limits(at_least=1))
+            check("max_episode_steps", max_episode_steps, int, ParameterLimits(at_least=1))
         modes = {mode.value: mode for mode in AutoresetMode}
         if not isinstance(autoreset_mode, AutoresetMode):
             if not isinstance(autoreset_mode, str) or autoreset_mode not in modes:
@@ -142,7 +142,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 raise ValueError(
                     "a vector of environments that mix scenarios cannot be drawn: use gymnasium.make, or one scenario"
                 )
-            name = self._first_course.names[0]
+            name = self._first_distribution.names[0]
             self.pictures = EpisodePictures(self.model, name, num_envs, FRAMES_PER_SECOND)
         self.single_observation_space = self._observation_space()
         self.single_action_space = self.model.action_space

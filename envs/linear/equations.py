@@ -226,7 +226,7 @@ def find_invalid_noise(
     return None
 
 
-class Measurement(NamedTuple):
+class StateSpaceMeasurement(NamedTuple):
     """What the sensors say."""
 
     values: Array
@@ -253,7 +253,7 @@ class Passage(NamedTuple):
 
 QUARTER = 0.25
 """Of a turn, by which sigma points may move an angle: half of what has a nearest turn."""
-Passed = Measurement | Passage
+Passed = StateSpaceMeasurement | Passage
 """What says how a state moved since the measurement before."""
 
 
@@ -478,7 +478,7 @@ class Equations:
         turns = self.xp.stack([(J[row] - slopes[row]) / periods[row] for row in bent])
         return continuous, narrow(turns, covariance, QUARTER)
 
-    def receive(self, measurement: Measurement, mean: Array, R: Array) -> Received:
+    def receive(self, measurement: StateSpaceMeasurement, mean: Array, R: Array) -> Received:
         """What was received of a measurement, as it was predicted.
 
         Args:
@@ -554,7 +554,9 @@ class Equations:
             "their range, such as by numpy.maximum"
         )
 
-    def explain_loss(self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: Measurement) -> str:
+    def explain_loss(
+        self, mean: numpy.ndarray, covariance: numpy.ndarray, measurement: StateSpaceMeasurement
+    ) -> str:
         """Name the function that is not finite near an estimate, where the next measurement is taken in.
 
         Args:

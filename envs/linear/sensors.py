@@ -15,14 +15,14 @@ from ...filters.angles import PERIODS
 from ..contract.causes import Cause, Moment
 from ..contract.draws import Draws
 from ..contract.observation import Array
-from ..contract.parameters import Limits, check, freeze
+from ..contract.parameters import ParameterLimits, check, freeze
 from .parameters import StateSpaceParameters
 
-LIMITS: dict[str, tuple[Any, Limits]] = {
-    "interval": (float | None, Limits(above=0.0)),
-    "availability": (float, Limits(above=0.0, at_most=1.0)),
-    "gate": (float | None, Limits(above=0.0)),
-    "wraps": (str | None, Limits(choices=tuple(PERIODS))),
+LIMITS: dict[str, tuple[Any, ParameterLimits]] = {
+    "interval": (float | None, ParameterLimits(above=0.0)),
+    "availability": (float, ParameterLimits(above=0.0, at_most=1.0)),
+    "gate": (float | None, ParameterLimits(above=0.0)),
+    "wraps": (str | None, ParameterLimits(choices=tuple(PERIODS))),
 }
 """What must hold for a sensor's fields."""
 EARLY = 1e-6

@@ -30,9 +30,9 @@ from ..contract.task import Component, PaperPolicy, Reward, Scenario
 from ..contract.world import World
 from .equations import (
     Equations,
-    Measurement,
     Passage,
     StateSpaceDefinition,
+    StateSpaceMeasurement,
     StateSpaceProblem,
     usual_sensor_noise,
 )
@@ -40,10 +40,10 @@ from .inputs import InputCourses
 from .live import StateSpaceInput
 from .parameters import StateSpaceParameters
 from .sensors import Receptions, SensorStates, silence_causes
-from .state_space_banks import KalmanNetBank, bank_tables
+from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
-class Truth(NamedTuple):
+class StateSpaceTruth(NamedTuple):
     """What is."""
 
     state: Array
@@ -63,7 +63,7 @@ class Truth(NamedTuple):
     comes late."""
 
 
-class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
+class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
     """A state that moves by one model, or switches between several."""
 
     parameters: StateSpaceParameters
@@ -106,7 +106,7 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
             return None
         return self.task.constant(semidefinite_root(covariance[..., None])[..., 0])
 
-    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
+    def begin(self, draws: Draws, normals: Array) -> tuple[StateSpaceTruth, Initial]:
         """Draw the start and the noise of the episode; everyone starts with the same mean and covariance."""
         p, zero, own = self.parameters, 0.0 * normals[0], self.task.definition
         process, measurement = (
@@ -126,10 +126,12 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
         if self.delays:
             nothing = self.xp.stack([self.xp.stack([zero] * (self.noises - self.states))] * 2)
             waiting = self.xp.stack([nothing] * self.parameters.lateness)
-        truth = Truth(state, first, process, measurement, inputs, sensors, waiting)
+        truth = StateSpaceTruth(state, first, process, measurement, inputs, sensors, waiting)
         return truth, Initial(mean, covariance)
 
-    def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
+    def advance(
+        self, truth: StateSpaceTruth, noise: Array, feedback: Any
+    ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
         """Switch, move, measure."""
         xp, n = self.xp, self.states
         uniforms = noise[self.normals :]
@@ -157,10 +159,12 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
             truth.sensors, self._seconds(truth, interval), uniforms[self.drawn :]
         )
         truth = truth._replace(state=state, hypothesis=hypothesis, inputs=inputs, sensors=sensors)
-        received = Measurement(*self._receive(truth, values, (here, due)), interval, told)
+        received = StateSpaceMeasurement(*self._receive(truth, values, (here, due)), interval, told)
         return self._delay(truth, received, uniforms[self.delayed :]) if self.delays else (truth, received)
 
-    def _delay(self, truth: Truth, received: Measurement, uniforms: Array) -> tuple[Truth, Measurement]:
+    def _delay(
+        self, truth: StateSpaceTruth, received: StateSpaceMeasurement, uniforms: Array
+    ) -> tuple[StateSpaceTruth, StateSpaceMeasurement]:
         """Hold back what comes late, and hand over what was held back.
 
         Args:
@@ -176,9 +180,11 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
         kept = xp.stack([held * received.values, held * received.available])
         truth = truth._replace(waiting=xp.concat([waiting[1:], kept[None]]))
         in_time = (1.0 - held) * received.values, (1.0 - held) * received.available
-        return truth, Measurement(*in_time, received.interval, received.inputs, *waiting[0])
+        return truth, StateSpaceMeasurement(*in_time, received.interval, received.inputs, *waiting[0])
 
-    def _receive(self, truth: Truth, values: Array, here: Sequence[Array | None]) -> tuple[Array, Array]:
+    def _receive(
+        self, truth: StateSpaceTruth, values: Array, here: Sequence[Array | None]
+    ) -> tuple[Array, Array]:
         """What is received of the values of all sensors, zero elsewhere, and where it is, ``(m, N)`` both.
 
         Args:
@@ -197,13 +203,13 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
                 values = self.xp.where(part > 0.0, values, 0.0)
         return values, available
 
-    def _seconds(self, truth: Truth, interval: Array | None) -> Array:
+    def _seconds(self, truth: StateSpaceTruth, interval: Array | None) -> Array:
         """Time that passes until the next measurement, s, ``(N,)``, also of a model that is not timed."""
         usual: Array = self.parameters.sampling_interval + 0.0 * truth.process_noise
         return usual if interval is None else interval
 
     def _inputs(
-        self, truth: Truth, interval: Array | None, normals: Array
+        self, truth: StateSpaceTruth, interval: Array | None, normals: Array
     ) -> tuple[Array | None, Array | None]:
         """Inputs that act until the next measurement, and what is told of them, ``(p, N)``; None without inputs."""
         if truth.inputs is None:
@@ -211,7 +217,7 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
         inputs = self.courses.advance(truth.inputs, self._seconds(truth, interval), normals)
         return inputs, self.courses.report(inputs, normals)
 
-    def _interval(self, truth: Truth, uniform: Array | None) -> Array | None:
+    def _interval(self, truth: StateSpaceTruth, uniform: Array | None) -> Array | None:
         """Time that passes until the next measurement, s, ``(N,)``; None where the model is not timed."""
         if not self.timed:
             return None
@@ -243,7 +249,7 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
         terms = [weight * error[i] ** 2 for i, weight in enumerate(weights) if weight]
         return sum(terms[1:], terms[0])
 
-    def reading_deviations(self, measurement: Measurement) -> Array:
+    def reading_deviations(self, measurement: StateSpaceMeasurement) -> Array:
         """Those of the R that the filters believe, at the initial mean where it depends on the state."""
         values = measurement.values
         mean = self.task.constant(self.task.definition.mean)
@@ -251,11 +257,11 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
         R = self.task.believed[0].sensor_noise(x, measurement)
         return self.xp.stack([self.xp.sqrt(R[j, j]) + 0.0 * values[j] for j in range(values.shape[0])])
 
-    def component_readings(self, measurement: Measurement) -> Array | None:
+    def component_readings(self, measurement: StateSpaceMeasurement) -> Array | None:
         """Readings of components that are measured as they are; None where none is."""
         return self._of_components(measurement.values, measurement.available)
 
-    def component_deviations(self, measurement: Measurement) -> Array | None:
+    def component_deviations(self, measurement: StateSpaceMeasurement) -> Array | None:
         """Deviations that the model states for them."""
         return self._of_components(self.reading_deviations(measurement), measurement.available)
 
@@ -268,7 +274,7 @@ class StateSpaceWorld(World[StateSpaceProblem, Truth, Measurement]):
             [none if j is None else xp.where(available[j] > 0.0, values[j], none) for j in self.places]
         )
 
-    def context(self, truth: Truth) -> dict[str, Array]:
+    def context(self, truth: StateSpaceTruth) -> dict[str, Array]:
         """The model in force and the factors on Q and R."""
         return {
             "hypothesis": truth.hypothesis,
@@ -305,7 +311,7 @@ class StateSpace(StateSpaceProblem):
 
     ## Rewards
 
-    `log(1 + x0) - log(1 + x)`, x the weighted squared error in units of what the filter as written is charged, x0 that
+    `log(1 + x0) - log(1 + x)`, x the weighted squared error in units of the cost of the filter as written, x0 that
     of the action zero on the same noise.
 
     ## Starting State
@@ -330,7 +336,9 @@ REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("ev
 """Parameters that say how far an action reaches, by control."""
 
 
-def _explain_loss(task: StateSpaceProblem, mean: Array, covariance: Array, measurement: Measurement) -> str:
+def _explain_loss(
+    task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
+) -> str:
     """Name the function of the filters' first model that is not finite near an estimate."""
     return task.believed[0].explain_loss(mean, covariance, measurement)
 
@@ -366,7 +374,7 @@ def state_space_attributes(
         "banks": banks,
         "companions": (
             Actions(actions, REACH),
-            TrainedBanks({"kalman-net": KalmanNetBank}),
+            TrainedBanks({"kalman-net": StateSpaceKalmanNetBank}),
             *(make(definition, defaults) for make in load_present(MODEL_COMPANIONS)),
             LiveReader(StateSpaceInput),
             Causes((*(silence_causes(definition.channels) if several else (MISSED,)), OUTLIER)),

@@ -36,7 +36,7 @@ from ..contract.observation import (
     nis_block,
     relative_likelihood_block,
 )
-from .equations import Equations, Measurement, StateSpaceProblem
+from .equations import Equations, StateSpaceMeasurement, StateSpaceProblem
 from .parameters import StateSpaceParameters
 
 AVERAGED = 0.1
@@ -49,7 +49,7 @@ OFFSET = 5.0
 """Largest correction that it adds to the predicted state, in deviations of the process noise."""
 
 
-class Track(NamedTuple):
+class ExtendedKalmanState(NamedTuple):
     """An extended Kalman filter at one moment."""
 
     mean: Array
@@ -70,7 +70,7 @@ class Track(NamedTuple):
     """Of the state by the last update, in deviations of the process noise, ``(n, N)``; None where none sees it."""
 
 
-class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
+class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
     """What the banks with one filter share."""
 
     parameters: StateSpaceParameters
@@ -108,10 +108,10 @@ class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
             last_action_block(self.answers),
         )
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> ExtendedKalmanState:
         """Start where everyone starts."""
         zero = 0.0 * initial.mean[0]
-        return Track(
+        return ExtendedKalmanState(
             initial.mean,
             initial.covariance,
             self.xp.stack([zero] * self.sensors),
@@ -121,20 +121,20 @@ class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
             self.xp.stack([zero] * len(self.answers)),
         )
 
-    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """Covariance of the process noise at a predicted mean under an action, ``(n, n, N)`` or ``(n, n, 1)``."""
         return self.equations.process_noise(mean, measurement)
 
-    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """Covariance of the measurement noise at a predicted mean under an action, ``(m, m, N)`` or ``(m, m, 1)``."""
         return self.equations.sensor_noise(mean, measurement)
 
-    def predict(self, state: Track, measurement: Measurement) -> Track:
+    def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """Predict, and compare under the noises of the last action."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
-    def compare(self, state: Track, measurement: Measurement) -> Track:
+    def compare(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """What is known of the measurement as it was predicted."""
         xp = self.xp
         received = self.received(state, measurement, state.action)
@@ -152,12 +152,14 @@ class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
             average=state.average + weight * (xp.log1p(share) - state.average),
         )
 
-    def received(self, state: Track, measurement: Measurement, action: Array) -> Received:
+    def received(
+        self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
+    ) -> Received:
         """What was received, under the noises of an action."""
         R = self.sensor_noise(state.mean, measurement, action)
         return self.equations.receive(measurement, state.mean, R)
 
-    def records(self, state: Track, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> dict[str, Array]:
         """How likely the measurement was; NaN where nothing was received."""
         degrees = ordered_sum(measurement.available)
         there = degrees > 0.0
@@ -168,7 +170,7 @@ class KalmanBank(Bank[StateSpaceProblem, Measurement, Track]):
         }
 
 
-class NoiseBank(KalmanBank):
+class StateSpaceNoiseBank(StateSpaceBank):
     """Control ``noise``: the action scales Q and R."""
 
     answers: Sequence[str] = ("process", "measurement")
@@ -176,15 +178,17 @@ class NoiseBank(KalmanBank):
     def _scale(self, action: Array, entry: int) -> Array:
         return self.xp.exp((self.parameters.noise_decades * math.log(10.0)) * action[entry])
 
-    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """Scaled Q."""
         return self._scale(action, 0) * self.equations.process_noise(mean, measurement)
 
-    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """Scaled R."""
         return self.equations.sensor_noise(mean, measurement, self._scale(action, 1))
 
-    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+    def act(
+        self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
+    ) -> ExtendedKalmanState:
         """Update with the noises that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
@@ -193,7 +197,7 @@ class NoiseBank(KalmanBank):
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
-class GainBank(KalmanBank):
+class StateSpaceGainBank(StateSpaceBank):
     """Control ``gain``: the action multiplies the gain of each component."""
 
     @property
@@ -201,7 +205,9 @@ class GainBank(KalmanBank):
         """The components."""
         return tuple(component.name for component in self.task.components)
 
-    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+    def act(
+        self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
+    ) -> ExtendedKalmanState:
         """Update with the gain that the action asks for."""
         action = self.xp.clip(action, -1.0, 1.0)
         received = self.received(state, measurement, action)
@@ -211,7 +217,7 @@ class GainBank(KalmanBank):
         return state._replace(mean=result.mean, covariance=result.covariance, action=action)
 
 
-class KalmanNetBank(KalmanBank):
+class StateSpaceKalmanNetBank(StateSpaceBank):
     r"""The filter inside the learned estimator ``kalman-net``: a network sets noises, gain and motion.
 
     With D = diag(20^a) of n entries of the action, W = diag(20^a) of m, A = diag(5^a) of n, C = diag(5^a) of m, and
@@ -248,7 +254,7 @@ class KalmanNetBank(KalmanBank):
         names = names if len(names) > 1 else ()
         xp = self.xp
 
-        def spread(f: Track, _: Measurement) -> Array:
+        def spread(f: ExtendedKalmanState, _: StateSpaceMeasurement) -> Array:
             variances = xp.stack([f.covariance[i, i] for i in range(self.states)])
             return 0.5 * xp.log(1e-12 + variances * self.scales**2)
 
@@ -267,7 +273,7 @@ class KalmanNetBank(KalmanBank):
             Block("spread", spread, "deviation of the state, likewise", names, KEPT_AS_LOG),
         )
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> ExtendedKalmanState:
         """Start where everyone starts."""
         return super().start(initial)._replace(correction=0.0 * initial.mean)
 
@@ -277,12 +283,12 @@ class KalmanNetBank(KalmanBank):
         ends = numpy.cumsum([0, n, m, n, m, n]).tolist()
         return action[ends[place] : ends[place + 1]]
 
-    def process_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def process_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """Q under the action."""
         Q = self.equations.process_noise(mean, measurement)
         return self._scaled(Q, NOISE_RANGE, self._part(action, 0))
 
-    def sensor_noise(self, mean: Array, measurement: Measurement, action: Array) -> Array:
+    def sensor_noise(self, mean: Array, measurement: StateSpaceMeasurement, action: Array) -> Array:
         """R under the action."""
         R = self.equations.sensor_noise(mean, measurement)
         return self._scaled(R, NOISE_RANGE, self._part(action, 1))
@@ -291,13 +297,15 @@ class KalmanNetBank(KalmanBank):
         scale = self.xp.exp(math.log(factor) * exponents)
         return outer(scale, scale) * matrix
 
-    def predict(self, state: Track, measurement: Measurement) -> Track:
+    def predict(self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement) -> ExtendedKalmanState:
         """Predict with the offset that was answered, and compare."""
         mean, carried = self.equations.carry(state.mean, state.covariance, measurement)
         mean = mean + (OFFSET * self.deviations) * self._part(state.action, 4)
         return self.compare(state._replace(mean=mean, covariance=carried), measurement)
 
-    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+    def act(
+        self, state: ExtendedKalmanState, measurement: StateSpaceMeasurement, action: Array
+    ) -> ExtendedKalmanState:
         """Update as the network answers."""
         action = self.xp.clip(action, -1.0, 1.0)
         Q = self.process_noise(state.mean, measurement, action)
@@ -337,7 +345,7 @@ class Mixture(NamedTuple):
     """``(M, N)``."""
 
 
-class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
+class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture]):
     """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
 
     Args:
@@ -411,7 +419,7 @@ class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
             one,
         )
 
-    def predict(self, state: Mixture, measurement: Measurement) -> Mixture:
+    def predict(self, state: Mixture, measurement: StateSpaceMeasurement) -> Mixture:
         """Mix, and let every hypothesis predict and take the measurement in, as none of that depends on the action."""
         xp = self.xp
         chain = imm.predict_mode_probabilities(self.task.transition, state.probabilities)
@@ -435,7 +443,7 @@ class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
         """Means of the hypotheses, ``(n, M, N)``, with angles on the turn of the first."""
         return unwrap(means, means[:, :1], self.task.periods)
 
-    def act(self, state: Mixture, measurement: Measurement, action: Array) -> Mixture:
+    def act(self, state: Mixture, measurement: StateSpaceMeasurement, action: Array) -> Mixture:
         """Weigh the hypotheses."""
         probabilities = bank_probabilities(
             self.control,
@@ -449,7 +457,7 @@ class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
         action = self.xp.clip(action, -1.0, 1.0)
         return state._replace(mean=mean, covariance=covariance, probabilities=probabilities, action=action)
 
-    def records(self, state: Mixture, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: Mixture, measurement: StateSpaceMeasurement) -> dict[str, Array]:
         """How likely the measurement was, and the probabilities."""
         there = ordered_sum(measurement.available) > 0.0
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
@@ -461,14 +469,14 @@ class HypothesisBank(Bank[StateSpaceProblem, Measurement, Mixture]):
 
 def bank_tables(count: int) -> tuple[Mapping[str, Any], Mapping[str, str]]:
     """Banks of a task with so many hypotheses by their controls, the default first, and what their actions mean."""
-    banks: dict[str, Any] = {"noise": NoiseBank, "gain": GainBank}
+    banks: dict[str, Any] = {"noise": StateSpaceNoiseBank, "gain": StateSpaceGainBank}
     actions = {
         "noise": "times `noise_decades` decades: factors on Q and R; **0 is the filter as written**",
         "gain": "`gain_factor` to its power: factors on the Kalman gain of each component; "
         "**0 is the filter as written**",
     }
     if count > 1:
-        banks = {"evidence": HypothesisBank, **banks}
+        banks = {"evidence": MultipleModelBank, **banks}
         actions["evidence"] = (
             "times `evidence_scale` nats, added to the log-posterior of each hypothesis; **0 is the IMM**"
         )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from ..contract.parameters import Limits, check, freeze
+from ..contract.parameters import ParameterLimits, check, freeze
 from ..data.trajectory import Trajectory
 from .plausibility import check_speed, check_velocity, find_outliers, speeds_of
 
@@ -24,10 +24,12 @@ class Cleaning(NamedTuple):
 
     def check(self) -> None:
         """Raise ValueError if a limit cannot be."""
-        check("longest_gap", self.longest_gap, float, Limits(above=0.0))
-        check("speeds", freeze(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
-        check("reach", self.reach, float, Limits(above=0.0))
-        check("smoothing", self.smoothing, float, Limits(at_least=0.0))
+        check("longest_gap", self.longest_gap, float, ParameterLimits(above=0.0))
+        check(
+            "speeds", freeze(self.speeds), tuple[float, float], ParameterLimits(at_least=0.0, ascending=True)
+        )
+        check("reach", self.reach, float, ParameterLimits(above=0.0))
+        check("smoothing", self.smoothing, float, ParameterLimits(at_least=0.0))
 
 
 CLEANING_COUNTS: dict[str, Any] = {

@@ -84,7 +84,7 @@ UNITS: Mapping[str, tuple[str, ...]] = {
 """Units that a NetCDF variable may say it has."""
 
 
-class Table(NamedTuple):
+class FlightTable(NamedTuple):
     """What was read of a file."""
 
     columns: "pandas.DataFrame"
@@ -115,7 +115,7 @@ class ColumnNames(frozenset[str]):
         return {"names": sorted(self), "prefix": self.prefix}
 
 
-def _csv(file: Path, known: ColumnNames) -> Table:
+def _csv(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
     with open_foreign(file) as content, io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as text:
@@ -136,7 +136,7 @@ def _csv(file: Path, known: ColumnNames) -> Table:
     if delimiter != ",":
         rows = [[*row] for row in zip(*map(_replace_decimal_commas, zip(*rows, strict=True)), strict=True)]
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
-    return Table(columns.mask(columns.eq("")), names)
+    return FlightTable(columns.mask(columns.eq("")), names)
 
 
 def _bounded_lines(text: TextIO) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _plain_attributes(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _netcdf(file: Path, known: ColumnNames) -> Table:
+def _netcdf(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
     with open_netcdf(file, known, decode_timedelta=False) as data:
@@ -257,17 +257,17 @@ def _netcdf(file: Path, known: ColumnNames) -> Table:
                     f"{name} must be one row of numbers, as many as of time, got shape {values.shape}"
                 )
             columns[lower] = values.astype(values.dtype.newbyteorder("="))
-    return Table(pandas.DataFrame(columns), names)
+    return FlightTable(pandas.DataFrame(columns), names)
 
 
-def _parquet(file: Path, known: ColumnNames) -> Table:
+def _parquet(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
     found = parse_apart(
         "parquet", file, EXTRA, wanted=known.request, rows_limit=MOST_ROWS, bytes_limit=limits().memory
     )
     columns = {name.lower(): _parquet_column(column) for name, column in found["columns"]}
-    return Table(pandas.DataFrame(columns), found["names"])
+    return FlightTable(pandas.DataFrame(columns), found["names"])
 
 
 def _parquet_column(column: Mapping[str, Any]) -> Any:
@@ -283,7 +283,7 @@ def _parquet_column(column: Mapping[str, Any]) -> Any:
     return dates.dt.tz_localize("UTC").dt.tz_convert(column["zone"]) if column["zone"] else dates
 
 
-def _json(file: Path, known: ColumnNames) -> Table:
+def _json(file: Path, known: ColumnNames) -> FlightTable:
     import pandas
 
     most = limits().memory // 3  # a text, and what it is made of
@@ -309,12 +309,12 @@ def _json(file: Path, known: ColumnNames) -> Table:
         found = pandas.DataFrame({n: [row.get(n, math.nan) for row in rows] for n in chosen})
     else:
         found = pandas.DataFrame({n: rows[n] for n in chosen}).reset_index(drop=True)
-    return Table(found.rename(columns=chosen), names)
+    return FlightTable(found.rename(columns=chosen), names)
 
 
-def _receiver(file: Path, known: ColumnNames) -> Table:
+def _receiver(file: Path, known: ColumnNames) -> FlightTable:
     columns, notes = receiver_columns(file, suffix_of(file), MOST_ROWS)
-    return Table(columns[[name for name in columns if name in known]], list(columns), notes)
+    return FlightTable(columns[[name for name in columns if name in known]], list(columns), notes)
 
 
 _READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
@@ -327,7 +327,7 @@ def suffix_of(file: Path) -> str:
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
-def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> Table:
+def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTable:
     """Read the known columns of a file.
 
     Args:
@@ -357,7 +357,7 @@ def list_names(names: Sequence[str], most: int = 20) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most:,} more" if len(names) > most else "")
 
 
-def flight_columns(table: Table) -> tuple["pandas.DataFrame", bool]:
+def flight_columns(table: FlightTable) -> tuple["pandas.DataFrame", bool]:
     """Return the columns of a flight by what they are, and whether altitudes are feet.
 
     Raises:

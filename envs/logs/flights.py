@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ...filters.geodesy import east_north
-from ..contract.parameters import Limits, check, quote_shortened
+from ..contract.parameters import ParameterLimits, check, quote_shortened
 from ..data.scenario_data import FlightData
 from ..data.trajectory import Trajectory, trajectory_of
 from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-class Source(NamedTuple):
+class FlightSource(NamedTuple):
     """One file, or one trajectory of a sequence, and what has become of it."""
 
     name: str
@@ -67,10 +67,10 @@ class Flights(FlightData):
     trajectories: tuple[Trajectory, ...]
     name: str = "flights"
     fewest_scans: int = 10
-    sources: tuple[Source, ...] = ()
+    sources: tuple[FlightSource, ...] = ()
 
     def __post_init__(self) -> None:
-        check("fewest_scans", self.fewest_scans, int, Limits(at_least=2))
+        check("fewest_scans", self.fewest_scans, int, ParameterLimits(at_least=2))
         if not all(isinstance(flight, Trajectory) for flight in self.trajectories):
             raise ValueError(
                 "trajectories of Flights are a sequence of Trajectory; filtergym.read_flights reads files"
@@ -82,7 +82,7 @@ class Flights(FlightData):
             by_name: dict[str, list[Trajectory]] = {}
             for trajectory in self.trajectories:
                 by_name.setdefault(flight_of(trajectory), []).append(trajectory)
-            found = tuple(Source(name, tuple(pieces)) for name, pieces in by_name.items())
+            found = tuple(FlightSource(name, tuple(pieces)) for name, pieces in by_name.items())
             object.__setattr__(self, "sources", found)
 
     def fields(self) -> dict[str, Any]:
@@ -313,7 +313,7 @@ def read_flights(
         raise ValueError(
             f"flights are a file, a folder, a pattern such as 'flights/*.csv', or a sequence of them, got {source!r}"
         )
-    sources: list[Source] = []
+    sources: list[FlightSource] = []
     files: list[Path] = []
     own: list[Trajectory] = []
     for item in given:
@@ -325,7 +325,7 @@ def read_flights(
             files += files_of(item)
         else:
             raise ValueError(f"a set of flights holds files and trajectories, got {item!r}")
-    sources += [Source(trajectory.name, (trajectory,)) for trajectory in _number_namesakes(own)]
+    sources += [FlightSource(trajectory.name, (trajectory,)) for trajectory in _number_namesakes(own)]
     stems = [file.name.removesuffix(suffix_of(file)) for file in files]
     for file, stem in zip(files, stems, strict=True):
         label = stem if stems.count(stem) == 1 else str(file)
@@ -335,7 +335,7 @@ def read_flights(
             if len(files) + len(sources) == 1:
                 raise
             reason = str(error).partition(f"trajectory {file}: ")[2]
-            sources.append(Source(_short(file, files), (), wrong=reason))
+            sources.append(FlightSource(_short(file, files), (), wrong=reason))
     trajectories = tuple(t for s in sources for t in s.trajectories)
     if not trajectories:
         raise ValueError(_nothing(name, [f"{s.name}: {s.wrong}" for s in sources]))
@@ -349,7 +349,7 @@ def _short(file: Path, files: Sequence[Path]) -> str:
 def _check_site(site: Any) -> tuple[float, float] | None:
     if site is None:
         return None
-    check("site", site, tuple[float, float], Limits())
+    check("site", site, tuple[float, float], ParameterLimits())
     latitude, longitude = map(float, site)
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
         raise ValueError(f"site is a latitude and a longitude in degrees, got {site!r}")
@@ -359,7 +359,7 @@ def _check_site(site: Any) -> tuple[float, float] | None:
 # --- one file
 
 
-def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[Source]:
+def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[FlightSource]:
     """Read one file: a source for it, and one more for every flight in it that cannot be used.
 
     Raises:
@@ -378,7 +378,7 @@ def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[Sou
 
 def _flights_of(
     file: Path, label: str, columns: "pandas.DataFrame", feet: bool, limits: Cleaning, at_median: bool
-) -> list[Source]:
+) -> list[FlightSource]:
     plane = "x" in columns and "y" in columns and not (limits.site and "latitude" in columns)
     names = ["x", "y"] if plane else ["latitude", "longitude"]
     if plane and {"vx", "vy"} <= {*columns}:
@@ -404,7 +404,7 @@ def _flights_of(
     rows["ground"] = is_true(columns["ground"]) if "ground" in columns else False
     good: list[Trajectory] = []
     counts = dict.fromkeys(CLEANING_COUNTS, 0)
-    bad: list[Source] = []
+    bad: list[FlightSource] = []
     groups = _by_flight(rows, columns.get("flight"))
     for flight, own in groups.items():
         name = f"{label}:{flight}" if flight else label
@@ -415,7 +415,7 @@ def _flights_of(
         except ValueError as error:
             if len(groups) == 1:
                 raise
-            bad.append(Source(f"{file.name}:{flight}", (), wrong=str(error)))
+            bad.append(FlightSource(f"{file.name}:{flight}", (), wrong=str(error)))
             continue
         good += pieces
         for what, count in found.items():
@@ -431,7 +431,7 @@ def _flights_of(
         notes = [f"{len(groups) - len(bad)} flights", *notes]
     if placed:
         notes = [placed, *notes]
-    return [Source(file.name, tuple(good), tuple(notes)), *bad]
+    return [FlightSource(file.name, tuple(good), tuple(notes)), *bad]
 
 
 def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:

@@ -59,7 +59,7 @@ class Innovations(NamedTuple):
     """Standard deviation that is predicted for the innovation at hand, m."""
 
 
-class Steered(NamedTuple):
+class GainState(NamedTuple):
     """The plain scheme with the gain of the action."""
 
     position: Array
@@ -374,13 +374,13 @@ class GainBank(KalmanBucyBank):
         """Block of the action applied before."""
         return last_action_block(self.axes)
 
-    def start(self, initial: Initial) -> Steered:
+    def start(self, initial: Initial) -> GainState:
         """Start where INS and reference agree."""
         zero = 0.0 * initial.mean
         variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
-        return Steered(initial.mean, variance, self.no_innovations(zero), zero, zero)
+        return GainState(initial.mean, variance, self.no_innovations(zero), zero, zero)
 
-    def predict(self, state: Steered, measurement: Measurement) -> Steered:
+    def predict(self, state: GainState, measurement: Measurement) -> GainState:
         """Predict by the increment of the INS."""
         position = state.position + measurement.increment
         variance = ins_gnss.predict_plain(state.variance, *self.error_model)
@@ -403,7 +403,7 @@ class GainBank(KalmanBucyBank):
         action = beyond / numpy.where(beyond > 0.0, -middle, middle - math.log(smallest))
         return numpy.where(gain <= smallest, -1.0, action)
 
-    def act(self, state: Steered, measurement: Measurement, action: Array) -> Steered:
+    def act(self, state: GainState, measurement: Measurement, action: Array) -> GainState:
         """Update by the gain of the action; without a measurement the gain is zero."""
         action = self.xp.clip(action, -1.0, 1.0)
         gain = measurement.available * self.gain(action)
@@ -415,18 +415,18 @@ class GainBank(KalmanBucyBank):
             gain=gain,
         )
 
-    def mean(self, state: Steered) -> Array:
+    def mean(self, state: GainState) -> Array:
         """Position, ``(A, N)``, m."""
         return state.position
 
-    def covariance(self, state: Steered) -> Array:
+    def covariance(self, state: GainState) -> Array:
         """Covariance that belongs to the gains used, ``(A, A, N)``, m^2.
 
         It holds for the modelled noises, and for gains that do not depend on the innovations.
         """
         return self.eye * state.variance.modelled
 
-    def records(self, state: Steered, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: GainState, measurement: Measurement) -> dict[str, Array]:
         """NIS and log-density (NaN without a measurement), gain and K."""
         found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):

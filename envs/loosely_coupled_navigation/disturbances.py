@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
-from ..contract.draws import Draws, Steps, draw_between, within
-from ..contract.faults import Colour, ColouredErrors, Disturbance, Outliers, Step
+from ..contract.draws import Draws, StepSignal, draw_between, within
+from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, Outliers
 from ..contract.observation import Array
 from ..contract.task import Task
 from .parameters import LooselyCoupledNavigationParameters
@@ -90,12 +90,13 @@ class NoiseChanges(Disturbance):
         """The receiver reports its true noise; the law of its reports stays."""
         return state._replace(true=self.xp.where(calm, state.reported, state.true))
 
-    def advance(self, state: Levels, step: Step) -> Levels:
+    def advance(self, state: Levels, step: DisturbanceInput) -> Levels:
         """Take the levels of this measurement."""
         if not self.parameters.noise_changes[1]:
             return state
         level, report = (
-            Steps(levels, state.change).at(step.number, self.xp) for levels in (state.true, state.reported)
+            StepSignal(levels, state.change).at(step.number, self.xp)
+            for levels in (state.true, state.reported)
         )
         return state._replace(level=level, report=report)
 
@@ -103,7 +104,9 @@ class NoiseChanges(Disturbance):
         """Bring them to the level, m."""
         return state.level * deviations
 
-    def change_measurement(self, state: Levels, measurement: Any, step: Step) -> tuple[Levels, Any]:
+    def change_measurement(
+        self, state: Levels, measurement: Any, step: DisturbanceInput
+    ) -> tuple[Levels, Any]:
         """Report it."""
         return state, measurement._replace(reported_deviation=state.report)
 
@@ -138,11 +141,11 @@ class ReceiverColour(ColouredErrors):
         lasting = draw_between(draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time)
         return zero + deviation, zero + lasting
 
-    def change_reading(self, state: Colour, reading: Array) -> tuple[Colour, Array]:
+    def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
         """Add them."""
         return state, reading + state.level if self.normals else reading
 
-    def context(self, state: Colour) -> dict[str, Array]:
+    def context(self, state: ColouredErrorsState) -> dict[str, Array]:
         """What is left of them from one measurement to the next, and the standard deviation of what they gain, m."""
         return {"receiver_decay": state.process.decay, "receiver_kick": state.process.kick}
 
@@ -176,7 +179,7 @@ class _Once(Disturbance):
         window = xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
         return Spell(window, zero, zero)
 
-    def advance(self, state: Spell, step: Step) -> Spell:
+    def advance(self, state: Spell, step: DisturbanceInput) -> Spell:
         """Count."""
         return state._replace(number=step.number)
 
@@ -194,7 +197,7 @@ class Outage(_Once):
         Cause("after outage", f"in the {AFTERMATH:g} measurements after an outage", _follows_outage),
     )
 
-    def change_measurement(self, state: Spell, measurement: Any, step: Step) -> tuple[Spell, Any]:
+    def change_measurement(self, state: Spell, measurement: Any, step: DisturbanceInput) -> tuple[Spell, Any]:
         """Take the fix away."""
         if not self.probability:
             return state, measurement

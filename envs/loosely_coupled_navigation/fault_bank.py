@@ -40,8 +40,8 @@ from ...filters import receiver_faults as faults
 from ...filters.array_namespace import namespace
 from ...filters.loosely_coupled import AugmentedCovariance, Sampling
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.controls import Steerable
-from ..contract.filter import Initial, Input, Likelihood
+from ..contract.controls import SteerableFilter
+from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from ..contract.task import Task
 from .fault_prior import TRAINING, FaultPrior, Noises, draw_noises
@@ -109,7 +109,7 @@ class FaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class FaultBank(Steerable[Task, Measurement, FaultState]):
+class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
     """Kalman filters over the noises of INS and receiver and since when the receiver is pulled off.
 
     Args:
@@ -258,7 +258,7 @@ class FaultBank(Steerable[Task, Measurement, FaultState]):
         """How a fix weighs the predicted hypotheses."""
         return self.weigh(state.memory, measurement)
 
-    def steer(
+    def apply_factors(
         self, predicted: Memory, measurement: Measurement, logarithms: Array
     ) -> tuple[Memory, Weighing]:
         """Hypotheses with the noises of a step multiplied by factors of these logarithms, ``(6, N)``, and how a fix
@@ -277,13 +277,13 @@ class FaultBank(Steerable[Task, Measurement, FaultState]):
         )
         return predicted, self.weigh(predicted, measurement, evidence, receiver, levels)
 
-    def update(self, state: FaultState, given: Input) -> FaultState:
+    def update(self, state: FaultState, given: FilterInput) -> FaultState:
         """Weigh the predicted hypotheses by a fix, update them, and report the moments of all."""
         predicted, measurement = state.memory, given.measurement
         if given.action is None:
             weighing = self.weigh(predicted, measurement)
         else:
-            predicted, weighing = self.steer(predicted, measurement, given.action)
+            predicted, weighing = self.apply_factors(predicted, measurement, given.action)
         return self.take(predicted, measurement, weighing)
 
     def likelihood(self, weighing: Weighing, measurement: Measurement) -> Likelihood:

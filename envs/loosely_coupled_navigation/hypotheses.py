@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
-from ..contract.controls import SteeredBank
+from ..contract.controls import SettingsBank
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     Array,
@@ -25,7 +25,7 @@ from .fault_bank import FaultBank, FaultState, Weighing
 from .world import Measurement
 
 
-class SteeredFaults(NamedTuple):
+class HypothesesState(NamedTuple):
     """The bank over faults at one moment."""
 
     own: FaultState
@@ -47,7 +47,7 @@ class SteeredFaults(NamedTuple):
     """Last action, ``(6, N)``."""
 
 
-class HypothesesBank(SteeredBank, KalmanBucyBank):
+class HypothesesBank(SettingsBank, KalmanBucyBank):
     """The bank over faults, steered by factors of its weights, of its levels and of its noises."""
 
     strong = FaultBank
@@ -97,13 +97,13 @@ class HypothesesBank(SteeredBank, KalmanBucyBank):
         """Block of the action applied before."""
         return last_action_block(tuple(self.own.settings))
 
-    def start(self, initial: Initial) -> SteeredFaults:
+    def start(self, initial: Initial) -> HypothesesState:
         """Start where the estimator starts."""
         own, zero = self.own.start(initial), 0.0 * initial.mean
         memory, none = own.memory, zero[0]
         weights = self.own.join([memory.free.weights, memory.pulled.weights], 0)
         groups = self.group(weights, self.own.age(none))
-        return SteeredFaults(
+        return HypothesesState(
             own=own,
             likelihood=own.likelihood,
             seen=self.no_innovations(zero),
@@ -125,7 +125,7 @@ class HypothesesBank(SteeredBank, KalmanBucyBank):
         young = xp.where(age <= self.own.prior.shortest, by_onset, 0.0)
         return xp.stack([free[0], *noises, ordered_sum(young), ordered_sum(by_onset - young)])
 
-    def look(self, state: SteeredFaults, found: Weighing, measurement: Measurement) -> SteeredFaults:
+    def look(self, state: HypothesesState, found: Weighing, measurement: Measurement) -> HypothesesState:
         """Show the innovations, and probabilities before and after the fix."""
         bank, predicted, p = self.own, state.own.memory, found.weights
         age = bank.age(measurement.number)

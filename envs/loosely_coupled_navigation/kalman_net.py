@@ -86,7 +86,7 @@ class KalmanNetBank(NoiseBank):
         caution, *rates = a[len(NOISES) :]
         share = measurement.available / (P.position + xp.exp(math.log(CAUTION) * caution) * R)
         by_drift, by_coloured = (share * xp.exp(math.log(RATE_RANGE) * rate) for rate in rates)
-        gain = ins_gnss.AugmentedGain(
+        gain = ins_gnss.AugmentedFilterGain(
             share * P.position, by_drift * P.position_drift, by_coloured * P.position_coloured
         )
         return state._replace(

@@ -481,7 +481,7 @@ class FilterBank(RadarBank):
         }
 
 
-class SteeredFilterBank(FilterBank):
+class GainsBank(FilterBank):
     """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
 
     def __init__(self, task: TargetProblem, control: str) -> None:

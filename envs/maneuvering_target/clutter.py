@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 from ...filters import data_association, polar
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, Step
+from ..contract.faults import Disturbance, DisturbanceInput
 from ..contract.observation import Array
 from .parameters import PLOT_SLOTS, ManeuveringTargetParameters
 
 
-class Track(NamedTuple):
+class ReportedTrack(NamedTuple):
     """What a filter tells the radar, to be answered with plots about it."""
 
     mean: Array
@@ -84,7 +84,7 @@ class Clutter(Disturbance):
         return count
 
     def change_measurement(
-        self, state: ClutterState, measurement: Any, step: Step
+        self, state: ClutterState, measurement: Any, step: DisturbanceInput
     ) -> tuple[ClutterState, Any]:
         """Put false plots beside that of the target, and associate one with the track of the filter."""
         xp, p, uniforms = self.xp, self.parameters, step.uniforms
@@ -127,7 +127,7 @@ class Clutter(Disturbance):
             plots=data_association.Plots(positions, variances, there),
         )
 
-    def predict(self, track: Track, interval: Array, elapsed: Array) -> tuple[Array, Array]:
+    def predict(self, track: ReportedTrack, interval: Array, elapsed: Array) -> tuple[Array, Array]:
         """Position that is expected, ``(2, N)``, and its covariance, ``(2, 2, N)``: at constant velocity, but for an
         acceleration of ``gate_acceleration`` since the last plot.
         """

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from ...filters import coordinated_turn
 from ...filters.array_namespace import namespace
 from ...filters.ordered_sums import ordered_sum
-from ..contract.draws import Draws, Steps
+from ..contract.draws import Draws, StepSignal
 from ..contract.observation import Array
 from ..contract.task import Task
 from .parameters import ManeuveringTargetParameters
@@ -353,7 +353,7 @@ class LegCourse(Course):
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
         """Motion at a scan, or between two: any number. The legs say where it is then, whatever was before."""
         now = self.parameters.sampling_interval * scan
-        leg = Steps(flight.begins, flight.time[1:]).at(now, self.xp)
+        leg = StepSignal(flight.begins, flight.time[1:]).at(now, self.xp)
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
     def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
@@ -370,7 +370,7 @@ class LegCourse(Course):
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
         """Where legs begin (s), their turn rates (rad/s), and whether the target turns now."""
         now = self.parameters.sampling_interval * time
-        turn = Steps(flight.turn, flight.time[1:]).at(now, self.xp)
+        turn = StepSignal(flight.turn, flight.time[1:]).at(now, self.xp)
         return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
 
 

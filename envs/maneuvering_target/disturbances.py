@@ -7,14 +7,14 @@ deviations. Nobody says any of it.
 from typing import NamedTuple
 
 from ..contract.draws import Draws
-from ..contract.faults import Disturbance, GaussMarkov, Glint, Step, undisturbed
+from ..contract.faults import Disturbance, DisturbanceInput, GaussMarkov, Glint, undisturbed
 from ..contract.observation import Array
 from .clutter import Clutter
 from .parameters import ManeuveringTargetParameters
 
 
-class Colour(NamedTuple):
-    """State of :class:`ColouredErrors`."""
+class ColouredScanErrorsState(NamedTuple):
+    """State of :class:`ColouredScanErrors`."""
 
     deviation: Array
     """``(N,)``."""
@@ -24,7 +24,7 @@ class Colour(NamedTuple):
     """In this scan, ``(2, N)``."""
 
 
-class ColouredErrors(Disturbance):
+class ColouredScanErrors(Disturbance):
     """Errors that last from scan to scan, beside the white ones."""
 
     name = "coloured"
@@ -36,25 +36,27 @@ class ColouredErrors(Disturbance):
         """Whether there may be any."""
         return parameters.coloured
 
-    def begin(self, draws: Draws, normals: Array, zero: Array) -> Colour:
+    def begin(self, draws: Draws, normals: Array, zero: Array) -> ColouredScanErrorsState:
         """Draw how large they are and how long they last; they are stationary from the start."""
         p = self.parameters
         deviation = draws.uniform("coloured_sigma", p.coloured_sigma)
         calm = undisturbed(draws, p)
         if calm is not None:
             deviation = self.xp.where(calm, 0.0, deviation)
-        return Colour(deviation, draws.uniform("coloured_time", p.coloured_time), deviation * normals)
+        return ColouredScanErrorsState(
+            deviation, draws.uniform("coloured_time", p.coloured_time), deviation * normals
+        )
 
-    def advance(self, state: Colour, step: Step) -> Colour:
+    def advance(self, state: ColouredScanErrorsState, step: DisturbanceInput) -> ColouredScanErrorsState:
         """Let them wander."""
         process = GaussMarkov.sampled(state.deviation, state.correlation_time, step.interval, self.xp)
         return state._replace(level=process.advance(state.level, step.normals))
 
-    def change_errors(self, state: Colour, errors: Array) -> Array:
+    def change_errors(self, state: ColouredScanErrorsState, errors: Array) -> Array:
         """Add them."""
         return errors + state.level
 
-    def context(self, state: Colour) -> dict[str, Array]:
+    def context(self, state: ColouredScanErrorsState) -> dict[str, Array]:
         """Their standard deviation."""
         return {"coloured_sigma": state.deviation}
 
@@ -82,5 +84,5 @@ class Bias(Disturbance):
         return {"bias": state}
 
 
-DISTURBANCES: tuple[type[Disturbance], ...] = (Glint, ColouredErrors, Bias, Clutter)
+DISTURBANCES: tuple[type[Disturbance], ...] = (Glint, ColouredScanErrors, Bias, Clutter)
 """In the order in which they take random numbers and act; a further one comes last, so that episodes stay."""

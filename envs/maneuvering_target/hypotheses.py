@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import apply, product, transpose
-from ..contract.controls import SteeredBank
+from ..contract.controls import SettingsBank
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
@@ -32,7 +32,7 @@ GROUPS = ("straight", "ended", "begun", "thrust", "left", "right", "old_thrust",
 manoeuvres of the first age, kinds of manoeuvres of the ages between, and of the last age."""
 
 
-class Steered(NamedTuple):
+class HypothesesState(NamedTuple):
     """The filter at one moment."""
 
     own: SemiMarkovState
@@ -52,7 +52,7 @@ class Steered(NamedTuple):
     """Of the hypotheses then, over the largest possible, ``(N,)``."""
 
 
-class HypothesesBank(SteeredBank, RadarBank):
+class HypothesesBank(SettingsBank, RadarBank):
     """The semi-Markov Gaussian sum, steered by factors of its weights, covariances and measurement noise."""
 
     strong = SemiMarkov
@@ -97,12 +97,12 @@ class HypothesesBank(SteeredBank, RadarBank):
             *self.surroundings(),
         )
 
-    def start(self, initial: Initial) -> Steered:
+    def start(self, initial: Initial) -> HypothesesState:
         """Start where the estimator starts."""
         own, none = self.own.start(initial), 0.0 * initial.mean[:2]
         groups = self.group(self.xp.concat([table.probability for table in own.track]))
         action = self.xp.stack([none[0]] * len(self.own.settings))
-        return Steered(own, own.likelihood, action, none, none, groups, groups, none[0])
+        return HypothesesState(own, own.likelihood, action, none, none, groups, groups, none[0])
 
     def group(self, probabilities: Array) -> Array:
         """Probabilities of groups, ``(G, N)``, of those of hypotheses, ``(H, N)``."""
@@ -110,7 +110,9 @@ class HypothesesBank(SteeredBank, RadarBank):
             [ordered_sum(probabilities[h] for h in members) for members in self.groups.values()]
         )
 
-    def look(self, state: Steered, found: SemiMarkovState, measurement: Measurement) -> Steered:
+    def look(
+        self, state: HypothesesState, found: SemiMarkovState, measurement: Measurement
+    ) -> HypothesesState:
         """Show the innovation of all hypotheses together, and probabilities before and after it."""
         xp, tables = self.xp, [table.unpack() for table in state.own.track]
         weights = xp.concat([table.probability for table in tables])

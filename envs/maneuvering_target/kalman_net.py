@@ -56,7 +56,7 @@ ANSWERS = 9
 FRAME = ("along", "across")
 
 
-class Track(NamedTuple):
+class KalmanNetState(NamedTuple):
     """The filter at one moment."""
 
     mean: Array
@@ -171,7 +171,7 @@ def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
     return xp.concat([position, (1.0 + faster) * turned[2:4]]), turning
 
 
-class KalmanNetBank(Bank[TargetProblem, Measurement, Track]):
+class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
     """An extended Kalman filter whose noises, gain and motion the action sets."""
 
     parameters: ManeuveringTargetParameters
@@ -214,14 +214,16 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, Track]):
             *clock_blocks(self),
         )
 
-    def start(self, initial: Initial) -> Track:
+    def start(self, initial: Initial) -> KalmanNetState:
         """Start where everyone starts."""
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none
-        return Track(initial.mean, initial.covariance, none, deviation, none, none, sensor, sensor, none[0])
+        return KalmanNetState(
+            initial.mean, initial.covariance, none, deviation, none, none, sensor, sensor, none[0]
+        )
 
-    def predict(self, state: Track, measurement: Measurement) -> Track:
+    def predict(self, state: KalmanNetState, measurement: Measurement) -> KalmanNetState:
         """Predict to the scan by the acceleration that was answered, and compare."""
         xp, T = self.xp, measurement.interval
         mean, turning = advance(state.mean, state.acceleration, T)
@@ -258,7 +260,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, Track]):
         corner, middle, velocity = (0.25 * square * square) * E, (0.5 * square * T) * E, square * E
         return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
-    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+    def act(self, state: KalmanNetState, measurement: Measurement, action: Array) -> KalmanNetState:
         """Update by the gain that was answered, and keep the acceleration for the next prediction."""
         xp, available = self.xp, measurement.available
         a = xp.clip(action, -1.0, 1.0)

@@ -25,7 +25,7 @@ from ..drawing.rendering import (
     grown,
 )
 from .banks import AlphaBeta, Filters
-from .hypotheses import GROUPS, Steered
+from .hypotheses import GROUPS, HypothesesState
 from .kalman_net import FRAME
 from .problem import TargetProblem
 
@@ -102,7 +102,7 @@ class ManeuveringTargetPicture(Picture):
             innovation = estimator.innovation[:, 0]
             variance = estimator.innovation_variance[:, 0]
             values["alpha"] = estimator.alpha[0]
-        elif isinstance(estimator, Steered):
+        elif isinstance(estimator, HypothesesState):
             innovation, variance = estimator.innovation[:, 0], numpy.ones(2)
             groups = dict(zip(GROUPS, estimator.probabilities[:, 0], strict=True))
             values |= {f"kind.{kind}": sum(groups[group] for group in those) for kind, those in KINDS.items()}

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 
 from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ...filters.semi_markov import Hypotheses
+from ...filters.semi_markov import AgedHypotheses
 from ...filters.small_matrices import mirror_lower
-from ..contract.controls import Steerable
-from ..contract.filter import Initial, Input, Likelihood
+from ..contract.controls import SteerableFilter
+from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .constant_velocity import ConstantVelocityModel
 from .problem import TargetProblem
@@ -110,7 +110,7 @@ def training_prior(hypotheses: int) -> SemiMarkovPrior:
     )
 
 
-Tables = tuple[Hypotheses, ...]
+Tables = tuple[AgedHypotheses, ...]
 """Hypotheses of straight flight by the time since the last manoeuvre, with position and velocity; of thrust by age,
 with the acceleration along x and y, too; and of turns, where the prior has any, by age, one kind of turn after another,
 with the turn rate."""
@@ -139,7 +139,7 @@ class SemiMarkovState(NamedTuple):
     """With packed covariances."""
 
 
-class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, SemiMarkovState]):
+class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measurement, SemiMarkovState]):
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
@@ -182,8 +182,8 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
         xp, least = self.xp, semi_markov.LEAST_PROBABILITY
         none = 0.0 * initial.mean[0]
 
-        def repeat(state: tuple[Array, Array], probabilities: list[float]) -> Hypotheses:
-            return Hypotheses(
+        def repeat(state: tuple[Array, Array], probabilities: list[float]) -> AgedHypotheses:
+            return AgedHypotheses(
                 xp.stack([state[0]] * len(probabilities), axis=1),
                 xp.stack([state[1]] * len(probabilities), axis=2),
                 xp.stack([probability + none for probability in probabilities]),
@@ -232,7 +232,7 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
             ]
         )
 
-    def switch(self, straight: Hypotheses, thrust: Hypotheses, *turns: Hypotheses) -> Tables:
+    def switch(self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses) -> Tables:
         """Let manoeuvres end and begin."""
         ages, turning = self.ages, self.prior.turning if self.turns else 0.0
         modes = [semi_markov.Mode(thrust, self.hazard, (1.0 - turning) * self.prior.begin, self.begin_thrust)]
@@ -249,7 +249,9 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
         straight, (thrust, *kinds) = semi_markov.switch(straight, modes)
         return straight, thrust, *([semi_markov.join(kinds)] if kinds else [])
 
-    def fly(self, straight: Hypotheses, thrust: Hypotheses, *turns: Hypotheses, T: Array) -> Tables:
+    def fly(
+        self, straight: AgedHypotheses, thrust: AgedHypotheses, *turns: AgedHypotheses, T: Array
+    ) -> Tables:
         """Fly on for an interval (s) in the mode of each hypothesis."""
         F, unit = (matrix[:, :, None] for matrix in self.motion(T))
         Q = self.prior.noise**2 * unit
@@ -280,27 +282,27 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
         """Where the scan saw the target."""
         return measurement.available
 
-    def steer(self, tables: Iterable[Hypotheses], logarithms: Array) -> list[Hypotheses]:
+    def apply_factors(self, tables: Iterable[AgedHypotheses], logarithms: Array) -> list[AgedHypotheses]:
         """Multiply weights and covariances by factors of these logarithms, ``(5, N)``."""
         factors = self.xp.exp(ordered_sum(self.raised * logarithms[:3, None]))
         straight, manoeuvre = self.xp.exp(logarithms[3:])
-        steered, first = [], 0
+        scaled, first = [], 0
         for i, table in enumerate(tables):
             growth = manoeuvre if i else straight
             last = first + table.probability.shape[0]
             weights = factors[first:last] * table.probability
-            steered.append(table._replace(probability=weights, covariance=growth * table.covariance))
+            scaled.append(table._replace(probability=weights, covariance=growth * table.covariance))
             first = last
-        return steered
+        return scaled
 
-    def update(self, state: SemiMarkovState, given: Input) -> SemiMarkovState:
+    def update(self, state: SemiMarkovState, given: FilterInput) -> SemiMarkovState:
         """Take in a measurement. Its normalised innovation squared is the mean of the filters' by their posterior
         weights.
         """
         xp, measurement = self.xp, given.measurement
         tables = [table.unpack() for table in state.track]
         if given.action is not None:
-            tables = self.steer(tables, given.action[:5])
+            tables = self.apply_factors(tables, given.action[:5])
             measurement = measurement._replace(variance=xp.exp(given.action[5]) * measurement.variance)
         results = [self.update_table(table, measurement) for table in tables]
         logarithms = xp.concat(
@@ -315,11 +317,13 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
         nis = weighted_sum(probabilities, xp.concat([r.squared_distance for r in results]))
         ends = itertools.accumulate((table.probability.shape[0] for table in tables), initial=0)
         parts = [probabilities[i:j] for i, j in itertools.pairwise(ends)]
-        track = tuple(Hypotheses(r.mean, r.covariance, p).pack() for r, p in zip(results, parts, strict=True))
+        track = tuple(
+            AgedHypotheses(r.mean, r.covariance, p).pack() for r, p in zip(results, parts, strict=True)
+        )
         likelihood = self.likelihood(measurement, imm.log_sum(logarithms), nis)
         return SemiMarkovState(mean, covariance, likelihood, track)
 
-    def update_table(self, table: Hypotheses, measurement: Measurement) -> kalman.Update:
+    def update_table(self, table: AgedHypotheses, measurement: Measurement) -> kalman.Update:
         """Update every hypothesis with the measured position, or leave it as predicted."""
         result = contaminated_normal.update_position(
             table.mean,
@@ -332,6 +336,6 @@ class SemiMarkov(ConstantVelocityModel, Steerable[TargetProblem, Measurement, Se
         return self.where_detected(measurement, result, kalman.Update(table.mean, table.covariance, 0.0, 0.0))
 
 
-def _moved(table: Hypotheses, mean: Array, covariance: Array) -> Hypotheses:
+def _moved(table: AgedHypotheses, mean: Array, covariance: Array) -> AgedHypotheses:
     """Hypotheses after the time update."""
     return table._replace(mean=mean, covariance=mirror_lower(covariance))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from ...filters.small_matrices import apply, product, transpose
 from ..contract.observation import Array, Block
-from ..contract.student import StudentBank, Track, View
+from ..contract.student import StudentBank, StudentState, View
 from .kalman_net import (
     FRAME,
     advance,
@@ -57,14 +57,14 @@ class RadarStudentBank(StudentBank[object, Measurement]):
     def features(self) -> Sequence[Block]:
         """The sensor's covariance in the frame, the speed, and the clock."""
 
-        def covariance(track: Track, measurement: Measurement) -> Array:
+        def covariance(track: StudentState, measurement: Measurement) -> Array:
             return self.turned_covariance(track.view.frame[:2, :2], measurement)
 
-        def variances(track: Track, measurement: Measurement) -> Array:
+        def variances(track: StudentState, measurement: Measurement) -> Array:
             R = covariance(track, measurement)
             return self.xp.stack([R[0, 0], R[1, 1]])
 
-        def coupling(track: Track, measurement: Measurement) -> Array:
+        def coupling(track: StudentState, measurement: Measurement) -> Array:
             R = covariance(track, measurement)
             return R[0, 1] / self.xp.sqrt(R[0, 0] * R[1, 1])
 

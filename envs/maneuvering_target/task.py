@@ -14,9 +14,9 @@ from ..contract.model import Model
 from ..contract.observation import Array
 from ..contract.task import Component, PaperPolicy, Reward
 from . import ID
-from .banks import FilterBank, GainBank, SteeredFilterBank
+from .banks import FilterBank, GainBank, GainsBank
 from .causes import CAUSES
-from .clutter import Track
+from .clutter import ReportedTrack
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .parameters import ManeuveringTargetParameters
@@ -63,7 +63,7 @@ class ManeuveringTarget(TargetProblem):
     ## Rewards
 
     By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the squared position error over `range_sigma` squared in
-    units of 8.0, what the paper's IMM is charged on average where half of the flights have regular scans, and x0 that of
+    units of 8.0, the mean cost of the paper's IMM where half of the flights have regular scans, and x0 that of
     the action zero on the same flight and noise.
     "relative" compares with the IMM under every control, and compresses nothing but lost tracks.
 
@@ -101,7 +101,7 @@ class ManeuveringTarget(TargetProblem):
     World = RadarWorld
     banks = {
         "evidence": FilterBank,
-        "gains": SteeredFilterBank,
+        "gains": GainsBank,
         "gain": GainBank,
         "hypotheses": HypothesesBank,
         "mode": FilterBank,
@@ -114,7 +114,7 @@ class ManeuveringTarget(TargetProblem):
         Component("velocity_x", "m/s", group="velocity"),
         Component("velocity_y", "m/s", group="velocity"),
     )
-    # What a turn costs rules the noise of the reward, and who does nothing pays for it too; a logarithm, because a few
+    # What a turn costs rules the noise of the reward, and who does nothing bears it too; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.
     reward = Reward(
         "squared position error over the squared range sigma",
@@ -166,9 +166,9 @@ class ManeuveringTarget(TargetProblem):
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
         self.closes_loop = self.parameters.cluttered
 
-    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Track:
+    def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
         """Track about which the radar looks for plots."""
-        return Track(mean, covariance)
+        return ReportedTrack(mean, covariance)
 
 
 TASK = ManeuveringTarget

@@ -11,7 +11,7 @@ from ..contract.filter import Initial
 from ..contract.observation import Array
 from ..contract.task import Task
 from ..contract.world import World
-from .clutter import Track
+from .clutter import ReportedTrack
 from .courses import course_of
 from .disturbances import DISTURBANCES
 from .parameters import ManeuveringTargetParameters
@@ -116,7 +116,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
         truth = Truth(0.0 * ones, position, velocity, flight, scans, states)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 
-    def advance(self, truth: Truth, noise: Array, feedback: Track | None) -> tuple[Truth, Measurement]:
+    def advance(
+        self, truth: Truth, noise: Array, feedback: ReportedTrack | None
+    ) -> tuple[Truth, Measurement]:
         """Fly one scan and measure; in clutter, about the track of the filter."""
         p, number, flight = self.parameters, truth.scan + 1.0, truth.flight
         uniforms, before = noise[self.normals :], (truth.position, truth.velocity)

@@ -3,7 +3,14 @@
 from dataclasses import dataclass
 
 from ...filters import singer
-from ..contract.parameters import Limits, TaskParameters, check, check_length, parameter, square_matrix
+from ..contract.parameters import (
+    ParameterLimits,
+    TaskParameters,
+    check,
+    check_length,
+    parameter,
+    square_matrix,
+)
 
 STANDARD_GRAVITY = 9.81
 """m/s^2."""
@@ -139,9 +146,9 @@ class RadarEsmTrackingParameters(TaskParameters):
             check_length(f"composition[{s}]", row, types)
         check_length("prior", self.prior, classes)
         square_matrix("class_transition", self.class_transition, classes)
-        check("true_class", self.true_class, str, Limits(choices=("random", *self.class_names)))
+        check("true_class", self.true_class, str, ParameterLimits(choices=("random", *self.class_names)))
         # The class at scan 0 must have governed one motion before it can change.
-        after_a_scan = Limits(above=self.sampling_interval)
+        after_a_scan = ParameterLimits(above=self.sampling_interval)
         check("class_change", self.class_change, tuple[float, float] | None, after_a_scan)
         if self.silence_start[0] + self.silence_end[0] == 0.0:
             raise ValueError(

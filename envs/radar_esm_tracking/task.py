@@ -97,8 +97,8 @@ class RadarEsmTracking(RadarEsmProblem):
     By default ("log-relative") `log(1 + x0) - log(1 + x)`, x the mean of three squared errors (range over
     `range_scale`, range rate over `range_rate_scale`, acceleration over `acceleration_scale`) in units of 0.05, and
     x0 that of the action zero on the same noise. Most scans cost more than 0.05, so the reward is about the logarithm
-    of a ratio: a few mistaken classes do not rule it. "cost" is `-30 log(1 + x / 30)` in units of 0.3, what the paper's
-    algorithm is charged on average.
+    of a ratio: a few mistaken classes do not rule it. "cost" is `-30 log(1 + x / 30)` in units of 0.3, the mean cost of
+    the paper's algorithm.
 
     ## Starting State
 

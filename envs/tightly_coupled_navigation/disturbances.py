@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 from ...filters import gnss_ins
 from ..contract.causes import Cause, Moment, context_flag
 from ..contract.draws import Draws, draw_between
-from ..contract.faults import Colour, ColouredErrors, Disturbance, Step, undisturbed
+from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, undisturbed
 from ..contract.observation import Array
 from .problem import NavigationProblem
 
@@ -98,7 +98,7 @@ class _Once(_OfSatellites):
         """Draw which satellites it concerns: here none."""
         return None
 
-    def advance(self, state: Fault, step: Step) -> Fault:
+    def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
         """Look whether it happens."""
         happens = (step.number >= state.window[0]) & (step.number <= state.window[1])
         return state._replace(now=self.xp.astype(happens, state.now.dtype))
@@ -140,7 +140,7 @@ class StuckAccelerometers(_Hidden):
         forces = self.xp.where(state.now > 0.0, state.own, reading[rows])
         return state._replace(own=forces), self.change_rows(reading, rows.start, forces)
 
-    def advance(self, state: Fault, step: Step) -> Fault:
+    def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
         """Look whether it happens; the first measurement is never one."""
         state = super().advance(state, step)
         return state._replace(now=self.xp.where(step.number > 1.0, state.now, 0.0))
@@ -189,7 +189,7 @@ class HiddenSatellites(_Once):
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return self.xp.stack([first, second])
 
-    def change_measurement(self, state: Fault, measurement: Any, step: Step) -> tuple[Fault, Any]:
+    def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
         """Take their pseudoranges and rates away."""
         seen = self.xp.where(self.is_at(state), 0.0, self.xp.ones_like(state.now))
         return state, self.change_available(measurement, 0, self.xp.concat([seen, seen]))
@@ -205,7 +205,7 @@ class LostRates(_Once):
     name, title = "no_rates", "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
-    def change_measurement(self, state: Fault, measurement: Any, step: Step) -> tuple[Fault, Any]:
+    def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
         """Take them away."""
         kept = self.xp.stack([1.0 - state.now] * self.satellites)
         return state, self.change_available(measurement, self.satellites, kept)
@@ -230,11 +230,11 @@ class RangeColour(ColouredErrors):
             zero + draw_between(draws.log_uniform, "pseudorange_correlation_time", lasting),
         )
 
-    def change_errors(self, state: Colour, errors: Array) -> Array:
+    def change_errors(self, state: ColouredErrorsState, errors: Array) -> Array:
         """Add them."""
         return errors + state.level
 
-    def context(self, state: Colour) -> dict[str, Array]:
+    def context(self, state: ColouredErrorsState) -> dict[str, Array]:
         """Their deviation, m, and what is left of them from one measurement to the next."""
         return {"coloured_deviation": state.deviation, "coloured_decay": state.process.decay}
 
@@ -278,7 +278,7 @@ class Reflections(_OfSatellites):
             urban=urban, cn0=self.xp.where(urban < 0.5, self.parameters.clear_cn0, state.cn0)
         )
 
-    def advance(self, state: Reception, step: Step) -> Reception:
+    def advance(self, state: Reception, step: DisturbanceInput) -> Reception:
         """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now."""
         xp, p, S = self.xp, self.parameters, self.satellites
         if not p.urban:
@@ -307,7 +307,9 @@ class Reflections(_OfSatellites):
         """Add them."""
         return errors + state.multipath
 
-    def change_measurement(self, state: Reception, measurement: Any, step: Step) -> tuple[Reception, Any]:
+    def change_measurement(
+        self, state: Reception, measurement: Any, step: DisturbanceInput
+    ) -> tuple[Reception, Any]:
         """Tell C/N0."""
         return state, measurement._replace(cn0=state.cn0)
 
@@ -348,7 +350,7 @@ class Ramp(_Hidden):
         jump = zero + draw_between(draws.uniform, "ramp_jump", p.ramp_jump)
         return Fault(window, satellite[None], xp.stack([jump, zero]), zero)
 
-    def advance(self, state: Fault, step: Step) -> Fault:
+    def advance(self, state: Fault, step: DisturbanceInput) -> Fault:
         """Drift on."""
         p, jump = self.parameters, state.own[0]
         run = jump + (p.ramp_rate * p.sampling_interval) * (step.number - state.window[0] + 1.0)
@@ -379,7 +381,7 @@ class Aperture(_OfSatellites):
         """Draw whether they do."""
         return _draw_share(draws, "aperture", self.parameters, state)
 
-    def change_measurement(self, state: Array, measurement: Any, step: Step) -> tuple[Array, Any]:
+    def change_measurement(self, state: Array, measurement: Any, step: DisturbanceInput) -> tuple[Array, Any]:
         """Take away what is too far from the state ``(17, N)`` that they expect."""
         feedback = step.feedback
         if feedback is None:

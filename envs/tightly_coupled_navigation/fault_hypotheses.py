@@ -40,8 +40,8 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm, range_errors
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ...filters.packed_covariance import pack, unpack
-from ..contract.controls import Steerable
-from ..contract.filter import Initial, Input, Likelihood
+from ..contract.controls import SteerableFilter
+from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
 from .problem import NavigationProblem
@@ -173,7 +173,7 @@ class FaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class FaultHypotheses(Steerable[NavigationProblem, Measurement, FaultState]):
+class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState]):
     """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
 
     Args:
@@ -236,7 +236,7 @@ class FaultHypotheses(Steerable[NavigationProblem, Measurement, FaultState]):
         )
         return FaultState(initial.mean, initial.covariance, hypotheses, Likelihood.unknown(none))
 
-    def update(self, state: FaultState, given: Input) -> FaultState:
+    def update(self, state: FaultState, given: FilterInput) -> FaultState:
         """Predict, weigh hypotheses, levels and renewals by the readings, and report the moments of all."""
         if given.action is None:
             return self.examine(state, given.measurement).after

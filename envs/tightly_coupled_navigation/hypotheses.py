@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ...filters import gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.controls import SteeredBank
+from ..contract.controls import SettingsBank
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
@@ -23,7 +23,7 @@ from .parameters import HYPOTHESES
 from .world import Measurement
 
 
-class SteeredHypotheses(NamedTuple):
+class HypothesesState(NamedTuple):
     """The bank over motion and faults at one moment; four hypotheses: those on the motion, and one that has begun."""
 
     own: FaultState
@@ -59,7 +59,7 @@ class SteeredHypotheses(NamedTuple):
         return self.own.hypotheses.probabilities
 
 
-class FaultHypothesesBank(SteeredBank, SatelliteBank):
+class FaultHypothesesBank(SettingsBank, SatelliteBank):
     """The bank over motion and faults, steered by factors of its probabilities and of its noises."""
 
     strong = FaultHypotheses
@@ -102,13 +102,13 @@ class FaultHypothesesBank(SteeredBank, SatelliteBank):
             ),
         )  # fmt: skip
 
-    def start(self, initial: Initial) -> SteeredHypotheses:
+    def start(self, initial: Initial) -> HypothesesState:
         """Start where the estimator starts."""
         xp, S, M = self.xp, self.task.satellites, len(self.hypotheses)
         own, none = self.own.start(initial), 0.0 * initial.mean[0]
         probabilities = xp.concat([own.hypotheses.probabilities, none[None]])
         nis = xp.stack([xp.stack([none] * M)] * len(self.task.sensors))
-        return SteeredHypotheses(
+        return HypothesesState(
             own=own,
             likelihood=Likelihood(none, none, none),
             action=xp.stack([none] * len(self.actions)),
@@ -124,7 +124,7 @@ class FaultHypothesesBank(SteeredBank, SatelliteBank):
             between=none,
         )
 
-    def look(self, state: SteeredHypotheses, found: Posterior, measurement: Measurement) -> SteeredHypotheses:
+    def look(self, state: HypothesesState, found: Posterior, measurement: Measurement) -> HypothesesState:
         """Show what the filters say of the measurement, and what is believed after it."""
         xp, task = self.xp, self.task
         log_predicted = imm.log_probabilities(found.predicted)
@@ -145,7 +145,7 @@ class FaultHypothesesBank(SteeredBank, SatelliteBank):
             between=xp.astype(found.between, xp.float64),
         )
 
-    def records(self, state: SteeredHypotheses, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
         """As the paper's bank, likelihood and NIS as the estimator finds them."""
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture

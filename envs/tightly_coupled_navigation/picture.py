@@ -104,8 +104,8 @@ class TightlyCoupledNavigationPicture(Picture):
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
         if self.model.control in ACTIONS:
-            steering: Any = self.model.filter
-            names = [name.removeprefix("accelerometers_").replace("_", " ") for name in steering.actions]
+            own_bank: Any = self.model.filter
+            names = [name.removeprefix("accelerometers_").replace("_", " ") for name in own_bank.actions]
             groups = len(self.task.sensors)
             parts = range(groups), range(groups, len(names))
             for title, part in zip(ACTIONS[self.model.control], parts, strict=False):

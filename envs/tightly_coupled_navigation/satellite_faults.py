@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from ...filters import imm, range_errors
 from ...filters.ordered_sums import weighted_sum
-from ..contract.filter import Filter, Initial, Input, Likelihood
+from ..contract.filter import Filter, FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .fault_hypotheses import TRAINING, FaultHypotheses, FaultPrior, FaultState
 from .problem import NavigationProblem
@@ -97,7 +97,7 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         members = tuple(member.start(initial) for member in self.members)
         return SatelliteFaultState(members, weights, Likelihood.unknown(none))
 
-    def update(self, state: SatelliteFaultState, given: Input) -> SatelliteFaultState:
+    def update(self, state: SatelliteFaultState, given: FilterInput) -> SatelliteFaultState:
         """Update every member, and weigh them."""
         xp, S, measurement = self.xp, self.task.satellites, given.measurement
         between = xp.any(measurement.cn0 != self.task.parameters.clear_cn0, axis=0)

@@ -131,7 +131,7 @@ class TightlyCoupledNavigation(NavigationProblem):
         *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
     modes = HYPOTHESES
-    # A few lost tracks rule the mean, and who does nothing pays for them, too.
+    # A few lost tracks rule the mean, and who does nothing bears them, too.
     reward = Reward(
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix",

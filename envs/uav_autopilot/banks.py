@@ -36,7 +36,7 @@ FLOORED_LOG = Compression(
 """The logarithm of squares, which may be zero; less than a hundredth of their expectation says no more."""
 
 
-class Filter(NamedTuple):
+class KalmanState(NamedTuple):
     """N Kalman filters."""
 
     mean: Array
@@ -226,18 +226,18 @@ class _KalmanBank(AutopilotBank):
         """Process noise under a scale ``(N,)``, at some packed entries, ``(entries, N)``."""
         return scale * self.process_noise[entries]
 
-    def log_trace(self, state: Filter) -> Array:
+    def log_trace(self, state: KalmanState) -> Array:
         """Log of the predicted covariance's trace, with the process noise of the last action."""
         variances = state.covariance[self.diagonal] + self.scaled_noise(state.scale, self.diagonal)
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
-    def start(self, initial: Start) -> Filter:
+    def start(self, initial: Start) -> KalmanState:
         """Start at the initial estimate, with averages as a consistent filter has them."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0
         covariance = packed_covariance.pack(initial.covariance)
-        return Filter(
+        return KalmanState(
             mean=initial.mean,
             covariance=covariance,
             estimate=initial.mean,
@@ -252,14 +252,14 @@ class _KalmanBank(AutopilotBank):
             mean_nis=one,
         )
 
-    def predict(self, state: Filter, measurement: Measurement) -> Filter:
+    def predict(self, state: KalmanState, measurement: Measurement) -> KalmanState:
         """Equation (10), and the innovations, with the process noise of the last action."""
         m = len(self.task.sensors)
         mean = self.xp.matmul(self.F, state.mean) + self.B * measurement.control
         covariance = self.xp.matmul(self.propagator, state.covariance)
         predicted = covariance[self.sensor_entries] + self.scaled_noise(state.scale, self.sensor_entries)
         S = self.xp.reshape(predicted, (m, m, -1)) + self.R
-        compared: Filter = self.compare(state, measurement, self.task.readings_of(mean), S)
+        compared: KalmanState = self.compare(state, measurement, self.task.readings_of(mean), S)
         return compared._replace(mean=mean, covariance=covariance)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
@@ -271,12 +271,12 @@ class _KalmanBank(AutopilotBank):
         return self.task.sensor_variances
 
     def autopilot_estimate(
-        self, update: packed_covariance.Update, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
         """Return what the autopilot uses, and its packed covariance."""
         return update.mean, update.covariance
 
-    def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
+    def act(self, state: KalmanState, measurement: Measurement, action: Array) -> KalmanState:
         """Equations (12), (11) with the noises that the action asks for."""
         shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
@@ -297,11 +297,11 @@ class _KalmanBank(AutopilotBank):
             action=shown,
         )
 
-    def mean(self, state: Filter) -> Array:
+    def mean(self, state: KalmanState) -> Array:
         """What the autopilot uses, ``(n, N)``."""
         return state.estimate
 
-    def covariance(self, state: Filter) -> Array:
+    def covariance(self, state: KalmanState) -> Array:
         """Covariance reported for it, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
 
@@ -319,7 +319,7 @@ class GainBank(_KalmanBank):
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
-    def covariance(self, state: Filter) -> Array:
+    def covariance(self, state: KalmanState) -> Array:
         """Covariance of the filter, when it is steered times the short average of the NIS where that is above one.
 
         Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
@@ -384,7 +384,7 @@ class ModeBank(_KalmanBank):
         return shown, 1.0 + (wide + smooth)
 
     def autopilot_estimate(
-        self, update: packed_covariance.Update, measurement: Measurement, shown: Array
+        self, update: packed_covariance.PackedUpdate, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
         """Readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""
         xp, reading, measured = self.xp, measurement.reading, self.task.measured

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
-from ..contract.draws import Draws, Steps, within
-from ..contract.faults import Colour, ColouredErrors, Disturbance, Step
+from ..contract.draws import Draws, StepSignal, within
+from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput
 from ..contract.observation import Array
 from .problem import AutopilotProblem
 
@@ -27,11 +27,11 @@ def draw_steps(
     times: Sequence[tuple[int, int]],
     zero: Array,
     count: int | None = None,
-) -> Steps:
+) -> StepSignal:
     """Draw the level in each part of the episode, and when the parts begin."""
     values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
     begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
-    return Steps(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
+    return StepSignal(draws.xp.stack(values), draws.xp.stack([zero, *begins])[1:])
 
 
 class _OfSensors(Disturbance):
@@ -50,7 +50,7 @@ class _OfSensors(Disturbance):
 class SensorLevels(NamedTuple):
     """State of :class:`NoisySensors`."""
 
-    levels: Steps
+    levels: StepSignal
     """Factors on the sensors' noise, values ``(J + 1, m, N)``."""
     level: Array
     """At this measurement, ``(m, N)``."""
@@ -80,7 +80,7 @@ class NoisySensors(_OfSensors):
         values = self.xp.where(calm, 1.0, state.levels.values)
         return SensorLevels(state.levels._replace(values=values), values[0])
 
-    def advance(self, state: SensorLevels, step: Step) -> SensorLevels:
+    def advance(self, state: SensorLevels, step: DisturbanceInput) -> SensorLevels:
         """Take the levels of this measurement."""
         return state._replace(level=state.levels.at(step.number, self.xp))
 
@@ -122,7 +122,7 @@ class Dropouts(_OfSensors):
             stops.append(starts[-1] + length)
         return Holds(xp.stack(starts)[1:], xp.stack(stops)[1:], none)
 
-    def change_measurement(self, state: Holds, measurement: Any, step: Step) -> tuple[Holds, Any]:
+    def change_measurement(self, state: Holds, measurement: Any, step: DisturbanceInput) -> tuple[Holds, Any]:
         """Hold the last reading of each sensor that is out."""
         xp, available = self.xp, measurement.available
         for i in range(state.starts.shape[0]):
@@ -180,11 +180,11 @@ class SensorColour(ColouredErrors):
         deviation = self.sigmas * draws.uniform("coloured", p.sensor_coloured, self.count)
         return deviation, draws.log_uniform("correlation_time", p.sensor_correlation_time, self.count)
 
-    def change_reading(self, state: Colour, reading: Array) -> tuple[Colour, Array]:
+    def change_reading(self, state: ColouredErrorsState, reading: Array) -> tuple[ColouredErrorsState, Array]:
         """Add them."""
         return state, reading + state.level if self.normals else reading
 
-    def context(self, state: Colour) -> dict[str, Array]:
+    def context(self, state: ColouredErrorsState) -> dict[str, Array]:
         """Those of this measurement."""
         return {"sensor_coloured": state.level}
 

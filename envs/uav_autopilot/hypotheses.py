@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ...filters import imm, noise_levels, packed_covariance
-from ...filters.noise_levels import Hypotheses
+from ...filters.noise_levels import LevelHypotheses
 from ...filters.ordered_sums import ordered_sum
-from ..contract.controls import SteeredBank
+from ..contract.controls import SettingsBank
 from ..contract.filter import Likelihood
 from ..contract.observation import (
     Array,
@@ -26,7 +26,7 @@ from .problem import AutopilotProblem
 from .world import Measurement, Start
 
 
-class SteeredLevels(NamedTuple):
+class HypothesesState(NamedTuple):
     """The bank over levels at one moment."""
 
     own: Levels
@@ -59,7 +59,7 @@ class SteeredLevels(NamedTuple):
     """Expected logarithm of the factor on each sensor's deviation then, ``(m, N)``."""
 
 
-class HypothesesBank(SteeredBank, AutopilotBank):
+class HypothesesBank(SettingsBank, AutopilotBank):
     """The bank over levels, steered by factors of its weights and of its noises."""
 
     strong = LevelBank
@@ -106,18 +106,18 @@ class HypothesesBank(SteeredBank, AutopilotBank):
             entropy_block(xp),
         )
 
-    def log_trace(self, state: SteeredLevels) -> Array:
+    def log_trace(self, state: HypothesesState) -> Array:
         """Log of the predicted covariance's trace, the spread of the hypotheses included."""
         return state.log_trace
 
-    def start(self, initial: Start) -> SteeredLevels:
+    def start(self, initial: Start) -> HypothesesState:
         """Start where the estimator starts, with averages as a consistent filter has them."""
         own = self.own.start(initial)
         zeros = 0.0 * self.task.readings_of(initial.mean)
         none = zeros[0]
         groups = self.group(own.hypotheses.probability)
         variances = self.xp.stack([initial.covariance[i, i] for i in range(initial.mean.shape[0])])
-        return SteeredLevels(
+        return HypothesesState(
             own=own,
             likelihood=own.likelihood,
             action=self.xp.stack([none] * len(self.own.settings)),
@@ -139,7 +139,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
         each = len(self.names)
         return ordered_sum(probability[each * i : each * (i + 1)] for i in range(self.own.groups))
 
-    def expect_levels(self, h: Hypotheses) -> Array:
+    def expect_levels(self, h: LevelHypotheses) -> Array:
         """Expected logarithm of the factor on the deviation of each sensor, ``(m, N)``."""
         of_each = [ordered_sum(q * level) for q, level in zip(h.sensors, self.log_levels, strict=True)]
         return self.xp.stack([ordered_sum(h.probability * levels) for levels in of_each])
@@ -148,7 +148,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
         """Whether any sensor has answered, ``(N,)``."""
         return ordered_sum(measurement.available) > 0.0
 
-    def look(self, state: SteeredLevels, found: Levels, measurement: Measurement) -> SteeredLevels:
+    def look(self, state: HypothesesState, found: Levels, measurement: Measurement) -> HypothesesState:
         """Compare the readings with what all hypotheses together predict, and show what is believed after them."""
         xp, bank, rows, h = self.xp, self.own, self.own.rows, state.own.hypotheses
         whole = noise_levels.merge(h.mean, h.covariance, h.probability)
@@ -171,7 +171,7 @@ class HypothesesBank(SteeredBank, AutopilotBank):
         )
         p = found.hypotheses.probability
         n = len(self.task.components)
-        compared: SteeredLevels = self.compare(state, measurement, readings, S)
+        compared: HypothesesState = self.compare(state, measurement, readings, S)
         return compared._replace(
             likelihood=found.likelihood,
             log_trace=xp.log(ordered_sum(self.trace_weights[i] * P[i, i] for i in range(n))),
@@ -181,6 +181,6 @@ class HypothesesBank(SteeredBank, AutopilotBank):
             sensor_levels=self.expect_levels(found.hypotheses),
         )
 
-    def records(self, state: SteeredLevels, measurement: Measurement) -> dict[str, Array]:
+    def records(self, state: HypothesesState, measurement: Measurement) -> dict[str, Array]:
         """Report as the other filters do, likelihood and NIS as the estimator finds them."""
         return {**super().records(state, measurement), **state.likelihood._asdict()}

@@ -35,7 +35,7 @@ CAUTION = 5.0
 
 
 class NetFilter(NamedTuple):
-    """As :class:`~.banks.Filter`, with the covariance of the gain."""
+    """As :class:`~.banks.KalmanState`, with the covariance of the gain."""
 
     mean: Array
     covariance: Array

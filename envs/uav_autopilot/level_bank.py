@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...filters import imm, noise_levels, packed_covariance
-from ...filters.noise_levels import Hypotheses
+from ...filters.noise_levels import LevelHypotheses
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.controls import Steerable
-from ..contract.filter import Initial, Input, Likelihood
+from ..contract.controls import SteerableFilter
+from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
-from .plant import Model, pitch_channel
+from .plant import Plant, pitch_channel
 from .problem import AutopilotProblem
 from .world import Measurement, Start
 
@@ -110,7 +110,7 @@ class Levels(NamedTuple):
     covariance: Array
     """``(n, n, N)``."""
     likelihood: Likelihood
-    hypotheses: Hypotheses
+    hypotheses: LevelHypotheses
 
 
 def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
@@ -120,7 +120,7 @@ def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, x
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
-class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
+class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
     """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
@@ -186,7 +186,7 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
         """Start all where everyone starts."""
         xp, none = self.xp, 0.0 * initial.mean[0]
         mean = xp.stack([*initial.mean, *[none] * (self.size - self.n)])
-        hypotheses = Hypotheses(
+        hypotheses = LevelHypotheses(
             xp.stack([mean] * self.probability.shape[0], axis=1),
             self.start_covariance + none,
             self.probability + none,
@@ -204,7 +204,7 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
         """Where a sensor answers."""
         return self.xp.where(ordered_sum(measurement.available) > 0.0, 1.0, 0.0)
 
-    def steer(self, h: Hypotheses, logarithms: Array) -> Hypotheses:
+    def apply_factors(self, h: LevelHypotheses, logarithms: Array) -> LevelHypotheses:
         """Multiply weights and process noise by factors of these logarithms, ``(3, N)``."""
         xp = self.xp
         return h._replace(
@@ -212,14 +212,14 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
             covariance=h.covariance + (xp.exp(logarithms[2]) - 1.0) * self.process,
         )
 
-    def update(self, state: Levels, given: Input) -> Levels:
+    def update(self, state: Levels, given: FilterInput) -> Levels:
         """Take in the readings one after the other, and report the moments of all."""
         xp, n, measurement, predicted = self.xp, self.n, given.measurement, state.hypotheses
-        steered = self.variances
+        scaled = self.variances
         if given.action is not None:
-            predicted = self.steer(predicted, given.action[:3])
+            predicted = self.apply_factors(predicted, given.action[:3])
             factors = xp.exp(given.action[3:])
-            steered = [factors[k] * variances for k, variances in enumerate(self.variances)]
+            scaled = [factors[k] * variances for k, variances in enumerate(self.variances)]
         mean, covariance = predicted.mean, predicted.covariance
         log_density, nis, sensors = 0.0, 0.0, []
         for k, rows in enumerate(self.rows):
@@ -230,7 +230,7 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
                 covariance,
                 reading,
                 rows,
-                noise_levels.SensorNoise(steered[k], predicted.sensors[k], self.prior.outlier, self.wide[k]),
+                noise_levels.SensorNoise(scaled[k], predicted.sensors[k], self.prior.outlier, self.wide[k]),
                 there,
             )
             mean, covariance = step.mean, step.covariance
@@ -243,10 +243,10 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
             whole.mean[:n],
             packed_covariance.unpack(whole.covariance, self.size)[:n, :n],
             likelihood_of(measurement, imm.log_sum(log_weights), weighted_sum(probability, nis), xp),
-            Hypotheses(mean, covariance, probability, tuple(sensors)),
+            LevelHypotheses(mean, covariance, probability, tuple(sensors)),
         )
 
-    def switch(self, memory: Hypotheses) -> Hypotheses:
+    def switch(self, memory: LevelHypotheses) -> LevelHypotheses:
         """Let levels change in every kind."""
         xp, each = self.xp, self.change.shape[0]
         parts = [
@@ -261,14 +261,14 @@ class LevelBank(Steerable[AutopilotProblem, Measurement, Levels]):
         ]
         if len(parts) == 1:
             return parts[0]
-        return Hypotheses(
+        return LevelHypotheses(
             xp.concat([part.mean for part in parts], axis=1),
             xp.concat([part.covariance for part in parts], axis=1),
             xp.concat([part.probability for part in parts]),
             tuple(xp.concat(list(q), axis=1) for q in zip(*(part.sensors for part in parts), strict=True)),
         )
 
-    def propagate(self, h: Hypotheses, measurement: Measurement) -> tuple[Array, Array]:
+    def propagate(self, h: LevelHypotheses, measurement: Measurement) -> tuple[Array, Array]:
         """Equations (10), (12) in every hypothesis."""
         xp, u = self.xp, measurement.control
         mean = [
@@ -292,7 +292,7 @@ class _KindModel:
         self, task: AutopilotProblem, kind: Kind, sigmas: numpy.ndarray, levels: numpy.ndarray
     ) -> None:
         p, n, errors = task.parameters, len(task.components), len(sigmas)
-        plant: Model = task.design.model if kind.lag == 1.0 else pitch_channel(p, kind.lag)
+        plant: Plant = task.design.model if kind.lag == 1.0 else pitch_channel(p, kind.lag)
         decay = math.exp(-p.value("sampling_interval") / kind.error_time)
         self.F = numpy.pad(plant.F, (0, errors)) + numpy.diag([0.0] * n + [decay] * errors)
         self.B = numpy.concatenate([plant.B, numpy.zeros((errors, 1))])

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..contract.parameters import Limits, TaskParameters, check, check_length, parameter
+from ..contract.parameters import ParameterLimits, TaskParameters, check, check_length, parameter
 from ..contract.task import Component
 
 COORDINATES: Mapping[str, tuple[Component, ...]] = {
@@ -191,7 +191,7 @@ class UavAutopilotParameters(TaskParameters):
         if not sensors or len(set(sensors)) != len(sensors):
             raise ValueError(f"sensors must name one or more coordinates, each once, got {sensors!r}")
         for sensor in sensors:
-            check("each of sensors", sensor, str, Limits(choices=names))
+            check("each of sensors", sensor, str, ParameterLimits(choices=names))
         missing = [sensor for sensor in sensors if sensor not in NOMINAL_SIGMAS[self.plant]]
         if missing and self.sensor_sigmas is None:
             raise ValueError(
@@ -220,7 +220,7 @@ class UavAutopilotParameters(TaskParameters):
         self._check_parts("sensor", self.sensor_levels, self.sensor_times)
         for name in ("changing_sensors", "biased_sensors"):
             for sensor in getattr(self, name) or ():
-                check(f"each of {name}", sensor, str, Limits(choices=sensors))
+                check(f"each of {name}", sensor, str, ParameterLimits(choices=sensors))
         if 0 < self.dropout_period <= self.dropout_length[1]:
             raise ValueError(
                 f"dropout_period must be longer than the longest dropout, {self.dropout_length[1]}, "
@@ -233,7 +233,9 @@ class UavAutopilotParameters(TaskParameters):
                 f"{kind}_levels must have one range more than {kind}_times, got {levels!r} and {times!r}"
             )
         for i in range(1, len(times)):
-            check(f"{kind}_times[{i}]", times[i], tuple[int, int], Limits(at_least=times[i - 1][1] + 1))
+            check(
+                f"{kind}_times[{i}]", times[i], tuple[int, int], ParameterLimits(at_least=times[i - 1][1] + 1)
+            )
 
     def value(self, name: str) -> Any:
         """Value of a constant that may have been left to the plant."""

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from ..contract.model import Episode, Model
 from ..drawing.rendering import Picture, Strip, error_strip
-from .banks import MODES, AutopilotBank, Filter
-from .hypotheses import HypothesesBank, SteeredLevels
+from .banks import MODES, AutopilotBank, KalmanState
+from .hypotheses import HypothesesBank, HypothesesState
 from .problem import AutopilotProblem
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
@@ -35,7 +35,7 @@ class UavAutopilotPicture(Picture):
     def records(self, state: Episode) -> dict[str, float]:
         """Signals of the loop, NIS, and the levels of the noise."""
         task, truth, estimator = self.task, state.truth, state.filter
-        assert isinstance(estimator, Filter | SteeredLevels)
+        assert isinstance(estimator, KalmanState | HypothesesState)
         answered = state.measurement.available[self.shown, 0] > 0.0
         values = {
             "command": truth.command[0],
@@ -49,7 +49,7 @@ class UavAutopilotPicture(Picture):
         }
         if self.model.control == "mode":
             values["mode"] = float(estimator.action[:, 0].argmax())
-        elif isinstance(estimator, SteeredLevels):
+        elif isinstance(estimator, HypothesesState):
             values |= self.beliefs(estimator)
         elif self.model.control == "noise":
             for name, action in zip(self.actions, estimator.action[:, 0], strict=True):
@@ -58,7 +58,7 @@ class UavAutopilotPicture(Picture):
             values["log10_scale"] = math.log10(estimator.scale[0])
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
-    def beliefs(self, estimator: SteeredLevels) -> dict[str, float]:
+    def beliefs(self, estimator: HypothesesState) -> dict[str, float]:
         """Probabilities of hypotheses about the gusts, by what is drawn as one."""
         assert isinstance(self.model.filter, HypothesesBank)
         designed, *others = estimator.probabilities[:, 0]

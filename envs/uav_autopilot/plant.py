@@ -10,7 +10,7 @@ from ...filters.gusts import vertical_gust
 from .parameters import COORDINATES, OUTPUT, UavAutopilotParameters
 
 
-class Model(NamedTuple):
+class Plant(NamedTuple):
     """Discrete plant with its noise in two parts, as NumPy arrays."""
 
     F: numpy.ndarray
@@ -23,7 +23,7 @@ class Model(NamedTuple):
     """Covariance of the rest, ``(n, n)``."""
 
 
-def constant_rate(parameters: UavAutopilotParameters) -> Model:
+def constant_rate(parameters: UavAutopilotParameters) -> Plant:
     """Plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
@@ -32,10 +32,10 @@ def constant_rate(parameters: UavAutopilotParameters) -> Model:
     T = parameters.value("sampling_interval")
     B = numpy.array([[T**2 / 2], [T]])
     Q = parameters.acceleration_sigma**2 * B @ B.T
-    return Model(numpy.array([[1.0, T], [0.0, 1.0]]), B, Q, numpy.zeros((2, 2)))
+    return Plant(numpy.array([[1.0, T], [0.0, 1.0]]), B, Q, numpy.zeros((2, 2)))
 
 
-def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Model:
+def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Plant:
     """Plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
 
     With the aerodynamic angle ``a = incidence + gust``:
@@ -65,15 +65,15 @@ def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0)
     _, scaled = linear_systems.van_loan(A, numpy.diag([0.0, 0.0, 0.0, 0.0, gust.intensity]), T)
     rest = numpy.diag([0.0, p.moment_disturbance, 0.0, p.actuator_disturbance, 0.0])
     _, other = linear_systems.van_loan(A, rest, T)
-    return Model(F, B, scaled, other)
+    return Plant(F, B, scaled, other)
 
 
 class Design(NamedTuple):
     """Everything that is computed once: believed and true plant, autopilot, filter, theory of the loop."""
 
-    model: Model
+    model: Plant
     """What the filter and the autopilot believe."""
-    true_model: Model
+    true_model: Plant
     H: numpy.ndarray
     """``(m, n)``."""
     R: numpy.ndarray

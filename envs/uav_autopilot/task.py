@@ -85,11 +85,11 @@ class UavAutopilot(AutopilotProblem):
     The cost of the loop at a measurement, which evaluations report, is
     ``((x - x_r)^T W (x - x_r) + R u^2) / sigma^2``. ``x_r`` is the equilibrium of the command (output r, all
     else zero), u the control that follows from the estimate, sigma the nominal standard deviation of the
-    output's sensor (U: 0.5 deg; P: 1 m). Most of it is what gusts and commands cost any control. Charged is what
+    output's sensor (U: 0.5 deg; P: 1 m). Most of it is what gusts and commands cost any control. What counts is what
     the agent can change, the loss of u against the optimal control u* of the true state,
     ``x = (R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation: on average it differs between two
-    filters by what the costs of their episodes differ. By default ("relative") the reward is what the paper's
-    filter is charged on the same noise less what the agent is charged, ``30 log(1 + x / 30)`` each; "cost" is the
+    filters by what the costs of their episodes differ. By default ("relative") the reward is that of the
+    paper's filter on the same noise less that of the agent, ``30 log(1 + x / 30)`` each; "cost" is the
     agent's own part, below zero. An action shows at once in the control and later in the estimate: the problem
     is not myopic.
 
@@ -101,7 +101,7 @@ class UavAutopilot(AutopilotProblem):
 
     Truncation after ``horizon`` measurements acted on (600: 12 s for U, 150 s for P). No termination: a loop
     that an unstable choice (such as raw readings of too few sensors) drives away stops at 10 000 units of
-    each coordinate and goes on being charged.
+    each coordinate and goes on costing.
 
     ## Arguments
 
@@ -122,7 +122,7 @@ class UavAutopilot(AutopilotProblem):
     banks = {"noise": NoiseBank, "gain": GainBank, "hypotheses": HypothesesBank, "mode": ModeBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
-    # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
+    # What gusts and sensors do rules the noise of the reward, and the paper's filter bears it too.
     reward = Reward(
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor",

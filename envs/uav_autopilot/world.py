@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...filters import linear_systems
-from ..contract.draws import Draws, Steps
+from ..contract.draws import Draws, StepSignal
 from ..contract.faults import Disturbances, undisturbed
 from ..contract.observation import Array
 from ..contract.world import World
@@ -32,9 +32,9 @@ class Truth(NamedTuple):
     """Of the disturbance in the interval before this measurement, ``(N,)``."""
     sensor_level: Array
     """Factor on the sensors' noise at this measurement, ``(m, N)``."""
-    commands: Steps
+    commands: StepSignal
     """Values ``(J + 1, N)``."""
-    levels: Steps
+    levels: StepSignal
     """Values ``(J + 1, N)``."""
     disturbances: dict[str, Any]
     """State of each by its name, see :mod:`.disturbances`."""
@@ -134,7 +134,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         covariance = xp.broadcast_to(self.initial_covariance, (*self.initial_covariance.shape[:2], len(zero)))
         return truth, Start(xp.zeros_like(state), covariance, zero)
 
-    def _commands(self, draws: Draws, zero: Array) -> Steps:
+    def _commands(self, draws: Draws, zero: Array) -> StepSignal:
         """Draw the command.
 
         In each period of random manoeuvres, at a random time, either a step to a new level or a doublet
@@ -142,7 +142,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         """
         xp, p = self.xp, self.parameters
         if p.step_size:
-            return Steps(xp.stack([zero, zero + p.step_size]), (zero + p.step_time)[None])
+            return StepSignal(xp.stack([zero, zero + p.step_size]), (zero + p.step_time)[None])
         low, high = p.command_amplitude
         values, times = [zero], [zero]
         for i in range(self.manoeuvres):
@@ -158,7 +158,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
                 xp.where(doublet, present - amplitude, amplitude),
                 xp.where(doublet, present, amplitude),
             ]
-        return Steps(xp.stack(values), xp.stack(times)[1:])
+        return StepSignal(xp.stack(values), xp.stack(times)[1:])
 
     def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
         """The control acts for one interval; the sensors that work answer.
@@ -217,7 +217,7 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
             total = total + weight * deviation * deviation
         return total * (1.0 / task.cost_unit)
 
-    def charge(self, truth: Truth, mean: Array) -> Array:
+    def counted_cost(self, truth: Truth, mean: Array) -> Array:
         """What the control that follows from an estimate loses against the optimal one for the true state.
 
         ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...envs.contract.filter import Filter, Input, Stated
+from ...envs.contract.filter import Filter, FilterInput, Stated
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.logs.flight_tables import clock_seconds, describe_time
@@ -227,7 +227,7 @@ class FileTrack(Filter[Task, Any, FileState]):
         none = numpy.zeros(width)
         return FileState(0, none, numpy.full(width, -1), none, none, initial)
 
-    def update(self, state: FileState, given: Input) -> FileState:
+    def update(self, state: FileState, given: FilterInput) -> FileState:
         """Find the row of each episode: the newest that is not later than the measurement."""
         width = given.measurement[0].shape[-1]
         lane = numpy.minimum(numpy.arange(width), len(self.names) - 1)

@@ -14,7 +14,7 @@ import numpy
 
 from ...compiler.namespace import NotTraceable
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, Input, Likelihood, State, Stated
+from ...envs.contract.filter import Filter, FilterInput, Likelihood, State, Stated
 from ...envs.contract.model import Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task, named_arrays
@@ -64,7 +64,7 @@ class Adapter(Filter[Task, Any, Adapted]):
         """State before the first measurement."""
         return Adapted(initial.mean, initial.covariance, memory, Likelihood.unknown(initial.mean[0]))
 
-    def update(self, state: Adapted, given: Input) -> Adapted:
+    def update(self, state: Adapted, given: FilterInput) -> Adapted:
         """Take its answer."""
         answer = self.ask(given, state.memory)
         if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
@@ -85,7 +85,7 @@ class Adapter(Filter[Task, Any, Adapted]):
         """Number of the reason among ``FAULTS`` for which it has no answer at all, as a program may have; 0: none."""
         return getattr(self.own, "fault", 0)
 
-    def ask(self, given: Input, memory: Any) -> Any:
+    def ask(self, given: FilterInput, memory: Any) -> Any:
         """Its answer to a measurement."""
         return self.own.update(memory, given.measurement)
 
@@ -102,11 +102,11 @@ class ReferenceAdapter(Adapter):
         super().__init__(task, own)
         self.knows = getattr(own, "knows", "") or "the truth"
 
-    def initialise(self, given: Input) -> Adapted:
+    def initialise(self, given: FilterInput) -> Adapted:
         """Start where everyone starts, with the truth."""
         return self.first(given.measurement, self.own.start(given.measurement, given.truth))
 
-    def ask(self, given: Input, memory: Any) -> Any:
+    def ask(self, given: FilterInput, memory: Any) -> Any:
         """Its answer to a measurement and the truth."""
         return self.own.update(memory, given.measurement, given.truth)
 
@@ -118,7 +118,7 @@ class BoundAdapter(ReferenceAdapter):
         """Nothing is known before the first measurement."""
         return Adapted(0.0 * initial.mean, None, memory, Likelihood.unknown(initial.mean[0]))
 
-    def ask(self, given: Input, memory: Any) -> Any:
+    def ask(self, given: FilterInput, memory: Any) -> Any:
         """Its limit, without a covariance."""
         limit, memory = super().ask(given, memory)
         return limit, None, memory
@@ -166,7 +166,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         """Number of the reason among ``FAULTS`` for which a program has no answer at all; 0: it has."""
         return self.own.fault if isinstance(self.own, Adapter) else 0
 
-    def _repeat_last(self, given: Input) -> Input:
+    def _repeat_last(self, given: FilterInput) -> FilterInput:
         """Copies, which may be changed in place."""
         if self.count is None:
             return given
@@ -174,7 +174,7 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         return given._replace(measurement=select_lanes(given.measurement, lanes))
 
-    def initialise(self, given: Input) -> Adapted:
+    def initialise(self, given: FilterInput) -> Adapted:
         """Keep its state."""
         with explain_errors(f"{self.name} failed at the start of the track"):
             self.memory = self.own.initialise(self._repeat_last(given))
@@ -183,9 +183,9 @@ class HeldInPython(Filter[Task, Any, Adapted]):
 
     def start(self, initial: Any) -> Adapted:
         """Start without the truth."""
-        return self.initialise(Input(initial))
+        return self.initialise(FilterInput(initial))
 
-    def update(self, state: Adapted, given: Input) -> Adapted:
+    def update(self, state: Adapted, given: FilterInput) -> Adapted:
         """Its answer.
 
         Raises:
@@ -275,10 +275,10 @@ class CheckedFilter(Filter[Task, Any, Checked]):
         """Let it predict."""
         return state._replace(own=self.own.predict(state.own, self.task.world.mask_missing(measurement)))
 
-    def update(self, state: Checked, given: Input) -> Checked:
+    def update(self, state: Checked, given: FilterInput) -> Checked:
         """Check its answer, and keep the last valid one."""
         received = self.task.world.mask_missing(given.measurement)
-        own = self.own.update(state.own, Input(received))
+        own = self.own.update(state.own, FilterInput(received))
         mean, covariance = self.own.mean(own), self.own.covariance(own)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         before, missing = state.fault, None
@@ -413,15 +413,15 @@ class BoundFilter(AroundBank[LimitState]):
         self.own, self.bank, self.in_python = own, bank, own.in_python
         self.knows = own.knows or "the truth"
 
-    def initialise(self, given: Input) -> LimitState:
+    def initialise(self, given: FilterInput) -> LimitState:
         """Start where everyone starts, with the truth."""
         return LimitState(self.bank.start(given.measurement), self.own.initialise(given))
 
     def start(self, initial: Any) -> LimitState:
         """Start without the truth."""
-        return self.initialise(Input(initial))
+        return self.initialise(FilterInput(initial))
 
-    def update(self, state: LimitState, given: Input) -> LimitState:
+    def update(self, state: LimitState, given: FilterInput) -> LimitState:
         """Compute the limit at this measurement."""
         own = self.own.update(state.own, given)
         space, N = self.bank.action_space, self.own.mean(own).shape[-1]

@@ -45,7 +45,7 @@ class Competitor(NamedTuple):
     """How the log was read that the competitor was fitted to (:class:`.baselines.fitted_filters.LogSetup`), or None."""
 
 
-class Source(NamedTuple):
+class CompetitorFiles(NamedTuple):
     """Competitors that are kept in files and folders."""
 
     find: Callable[[str, Any, bool, Callable[[str, str], Competitor]], Competitor | None]

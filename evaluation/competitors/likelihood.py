@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...compiler import namespace
-from ...compiler.functions import Function, empty_lanes, leaves, map_arrays, round_up_lanes
+from ...compiler.functions import CompiledFunction, empty_lanes, leaves, map_arrays, round_up_lanes
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ...compiler.sequence import CallSequence, moving_array
 from ...envs.contract.companions import find_companion
-from ...envs.contract.filter import Filter, Input
+from ...envs.contract.filter import Filter, FilterInput
 from ...envs.contract.log_format import LogFormat
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
@@ -150,7 +150,7 @@ def _update(
 
 def _step(filter: Filter, measurement: Any, state: Any) -> tuple[Any, Array]:
     received = filter.task.world.mask_missing(measurement)
-    after = filter.step(state, Input(received))
+    after = filter.step(state, FilterInput(received))
     return after, filter.records(after, received).get("log_likelihood")
 
 
@@ -177,13 +177,13 @@ class WindowLikelihood:
     ) -> None:
         self.task, self.windows, self.apply, self.in_lanes = task, windows, apply, in_lanes
         self.names = tuple(start)
-        self._compiled: Function | None = None
+        self._compiled: CompiledFunction | None = None
         if in_lanes and AVAILABLE:
             graph = Graph()
             with namespace.tracing(graph):
                 traced = type(task)(task.parameters, namespace)
             update = functools.partial(_update, traced, self.names, apply)
-            self._compiled = Function(update, graph, unchanged=0)
+            self._compiled = CompiledFunction(update, graph, unchanged=0)
         self._counts = windows.counts
         self._tiles: dict[int, tuple[Any, list[numpy.ndarray]]] = {}
         first = self._by_measurement(numpy.array([[value] for value in start.values()], dtype=float))[:, :, 0]
@@ -255,7 +255,7 @@ class WindowLikelihood:
 
     def _run_compiled(
         self,
-        function: Function,
+        function: CompiledFunction,
         values: numpy.ndarray,
         measurements: Sequence[numpy.ndarray],
         memory: Any,

@@ -122,7 +122,7 @@ class Program:
         return ProgramEstimator(task, self)
 
 
-class Field(NamedTuple):
+class ArrayField(NamedTuple):
     """An array of what is written to a program."""
 
     name: str
@@ -135,18 +135,18 @@ class Field(NamedTuple):
     """What it is, and its unit."""
 
 
-def fields_of(part: Any, prefix: str = "") -> Iterator[Field]:
+def fields_of(part: Any, prefix: str = "") -> Iterator[ArrayField]:
     """Say what the arrays of nested NamedTuples ``(..., N)`` are, in the order of ``leaves``."""
     about = field_words(type(part))
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
             yield from fields_of(value, f"{prefix}{name}.")
         elif value is None:
-            yield Field(prefix + name, None, "", about.get(name, ""))
+            yield ArrayField(prefix + name, None, "", about.get(name, ""))
         else:
             array = numpy.asarray(value)
             kind = {"b": "bool", "f": "float64"}.get(array.dtype.kind, "int64")
-            yield Field(prefix + name, array.shape[:-1], kind, about.get(name, ""))
+            yield ArrayField(prefix + name, array.shape[:-1], kind, about.get(name, ""))
 
 
 def parameters_of(task: Task) -> dict[str, Any]:
@@ -204,12 +204,12 @@ class ProgramEstimator:
         self.last: int | None = None
         self.fault, self.step_number = 0, 0
         self.feedback: numpy.ndarray | None = None
-        self._steering: Field | None = None
+        self._feedback_field: ArrayField | None = None
         """Feedback of a track: offered in the hello, and reported from then on; None where it is not."""
         self._process: ProgramProcess | None = None
         self._format = ""
         self._initial: numpy.ndarray | None = None
-        self._fields: list[Field] = []
+        self._fields: list[ArrayField] = []
 
     def start(self, initial: Any, N: int) -> int:
         """Start the program; what it is told waits for the first measurement, whose fields it is told too.
@@ -221,11 +221,11 @@ class ProgramEstimator:
         self.fault, self.step_number = 0, 0
         self.count = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
-        self.feedback, self._steering = None, None
+        self.feedback, self._feedback_field = None, None
         meaning = array_meanings(self.task).feedback
         if self.task.closes_loop and meaning:
             shape = self.task.feedback(initial.mean, initial.covariance, initial).shape[:-1]
-            self._steering = Field("feedback", shape, "float64", meaning)
+            self._feedback_field = ArrayField("feedback", shape, "float64", meaning)
         try:
             own = self.program.environment
             variables = {**os.environ, "PATH": search_path()} if own is None else dict(own)
@@ -266,8 +266,8 @@ class ProgramEstimator:
             answer = numpy.full((self.count, self._answer_size), numpy.nan)
         lanes = numpy.minimum(numpy.arange(width), self.count - 1)
         answer = answer[lanes].T
-        if self._steering is not None:
-            self.feedback = answer[C + C * C :].reshape(*(self._steering.shape or ()), width)
+        if self._feedback_field is not None:
+            self.feedback = answer[C + C * C :].reshape(*(self._feedback_field.shape or ()), width)
         return answer[:C], answer[C : C + C * C].reshape(C, C, width), self.step_number
 
     def processor_seconds(self) -> float:
@@ -285,9 +285,9 @@ class ProgramEstimator:
         C, measured = len(self.task.components), list(fields_of(measurement))
         numbers = {"initial": _count(self._fields), "measurement": _count(measured), "answer": C + C * C}
         offered = {}
-        if self._steering is not None:
-            offered = {"feedback": [self._steering._asdict()]}
-            numbers["feedback"] = _count([self._steering])
+        if self._feedback_field is not None:
+            offered = {"feedback": [self._feedback_field._asdict()]}
+            numbers["feedback"] = _count([self._feedback_field])
         return {
             "filtergym": VERSION,
             "tracks": self.count,
@@ -308,7 +308,7 @@ class ProgramEstimator:
     def _answer_size(self) -> int:
         """Numbers of a track that an answer has."""
         C = len(self.task.components)
-        return C + C * C + (0 if self._steering is None else _count([self._steering]))
+        return C + C * C + (0 if self._feedback_field is None else _count([self._feedback_field]))
 
     def _greet(self, measurement: Any) -> None:
         """Say hello, and hand over the initial estimate."""
@@ -328,11 +328,11 @@ class ProgramEstimator:
             warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
         self._format = answer["format"]
         if answer.get("feedback") is not True:
-            self._steering = None
+            self._feedback_field = None
         self._process.tell(self._message("initial", self._fields, self._initial))
         self._fields = list(fields_of(measurement))
 
-    def _message(self, name: str, fields: Sequence[Field], rows: numpy.ndarray) -> bytes:
+    def _message(self, name: str, fields: Sequence[ArrayField], rows: numpy.ndarray) -> bytes:
         if self._format == "float64":
             return rows.tobytes()
         content, place = {}, 0
@@ -358,8 +358,8 @@ class ProgramEstimator:
         )
         found = []
         asked = [("mean", (self.count, C)), ("covariance", (self.count, C, C))]
-        if self._steering is not None:
-            asked.append(("feedback", (self.count, *(self._steering.shape or ()))))
+        if self._feedback_field is not None:
+            asked.append(("feedback", (self.count, *(self._feedback_field.shape or ()))))
         for name, shape in asked:
             try:
                 values = numpy.array(answered.get(name), dtype=float)  # None is NaN
@@ -372,7 +372,7 @@ class ProgramEstimator:
         return numpy.concatenate(found, axis=1)
 
 
-def _count(fields: Sequence[Field]) -> int:
+def _count(fields: Sequence[ArrayField]) -> int:
     """Numbers of a track."""
     return sum(int(numpy.prod(own.shape, dtype=int)) for own in fields if own.shape is not None)
 

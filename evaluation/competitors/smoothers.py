@@ -7,7 +7,7 @@ import numpy
 
 from ...compiler.functions import map_arrays
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, Input
+from ...envs.contract.filter import Filter, FilterInput
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
@@ -34,7 +34,7 @@ class SmoothedTrack(Filter[Task, Any, int]):
         """Nothing is measured yet."""
         return 0
 
-    def update(self, state: int, given: Input) -> int:
+    def update(self, state: int, given: FilterInput) -> int:
         """Count the measurement."""
         return state + 1
 

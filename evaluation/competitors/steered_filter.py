@@ -11,10 +11,10 @@ import numpy
 
 from ...compiler import namespace
 from ...compiler.block import LANES
-from ...compiler.functions import Function, Specialised, leaves, map_arrays
+from ...compiler.functions import CompiledFunction, Specialised, leaves, map_arrays
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
-from ...envs.contract.filter import Input
+from ...envs.contract.filter import FilterInput
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array, DecisionMeans
 from ...envs.engine.compiled import CompiledModel, warn_of
@@ -121,7 +121,7 @@ class Decider:
         return flatten(answer), map_arrays(lambda array: flatten(array, next(remembered)), memory)
 
 
-class Steered(NamedTuple):
+class PolicyFilterState(NamedTuple):
     """State of a steered filter."""
 
     bank: Any
@@ -130,7 +130,7 @@ class Steered(NamedTuple):
     """Of the policy."""
 
 
-class SteeredFilter(AroundBank[Steered]):
+class SteeredFilter(AroundBank[PolicyFilterState]):
     """A bank closed by a policy.
 
     Args:
@@ -143,17 +143,17 @@ class SteeredFilter(AroundBank[Steered]):
         self.model, self.bank, self.decider = model, model.filter, decider
         self.adapts_covariance = self.bank.adapts_covariance
 
-    def start(self, initial: Any) -> Steered:
+    def start(self, initial: Any) -> PolicyFilterState:
         """Start the bank; the policy begins at its first decision."""
-        return Steered(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
+        return PolicyFilterState(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
 
-    def update(self, state: Steered, given: Input) -> Steered:
+    def update(self, state: PolicyFilterState, given: FilterInput) -> PolicyFilterState:
         """Ask the policy where a decision is due, and apply its action."""
         observation = self.model.observe(Episode(None, given.measurement, state.bank))
         action, decisions = self.decider.decide(observation, state.policy)
-        return Steered(self.bank.act(state.bank, given.measurement, action), decisions)
+        return PolicyFilterState(self.bank.act(state.bank, given.measurement, action), decisions)
 
-    def records(self, state: Steered, measurement: Any) -> dict[str, Array]:
+    def records(self, state: PolicyFilterState, measurement: Any) -> dict[str, Array]:
         """Those of the bank."""
         return self.bank.records(state.bank, measurement)
 
@@ -195,14 +195,14 @@ def trace_policy(model: CompiledModel, policy: Policy) -> Specialised:
     return Specialised(decider.decide, graph, given, unchanged=0, given_turned=True)
 
 
-def trace_decision(model: CompiledModel, policy: Policy) -> tuple[Function, Decisions]:
+def trace_decision(model: CompiledModel, policy: Policy) -> tuple[CompiledFunction, Decisions]:
     """Return the same of a policy that is asked only where a decision is due, and its memory before the first one.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.
     """
     decider, graph, given = _trace_decider(model, policy, 1)
-    function = Function(decider.decide, graph, unchanged=0)
+    function = CompiledFunction(decider.decide, graph, unchanged=0)
     function.specialise(*given)
     return function, given[1]
 

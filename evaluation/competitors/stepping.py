@@ -15,7 +15,7 @@ MODEL_ROWS = 128
 """Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
 
 
-class Memory(NamedTuple):
+class PolicyMemory(NamedTuple):
     """What a policy remembers between two steps."""
 
     calls: list[Any]
@@ -54,13 +54,13 @@ class SteppingPolicy(Policy):
         scenario = {} if self.scenario is None else {"scenario": self.scenario}
         return {"control": self.control, **scenario, **self.task_keywords}
 
-    def begin(self, seeds: Sequence[int]) -> Memory:
+    def begin(self, seeds: Sequence[int]) -> PolicyMemory:
         """Return the state for the first :meth:`predict` of the episodes with these seeds.
 
         Only policies that draw numbers need it, ``random`` for one; for the others None does.
         """
         own = self.policy
-        return Memory(
+        return PolicyMemory(
             [
                 own.begin([seeds[i] for i in call]) if isinstance(own, Policy) else None
                 for call in self._calls(len(seeds))
@@ -71,10 +71,10 @@ class SteppingPolicy(Policy):
     def predict(
         self,
         observation: numpy.ndarray,
-        state: Memory | None = None,
+        state: PolicyMemory | None = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[numpy.ndarray, Memory]:
+    ) -> tuple[numpy.ndarray, PolicyMemory]:
         """Choose actions.
 
         Args:
@@ -107,7 +107,7 @@ class SteppingPolicy(Policy):
             answers.append(check_action(self.model.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
-        return (action[0] if single else action), Memory(kept, False)
+        return (action[0] if single else action), PolicyMemory(kept, False)
 
     def _ask(
         self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool

@@ -29,7 +29,7 @@ from .print_layout import (
 )
 
 
-class Panel(NamedTuple):
+class CurvePanel(NamedTuple):
     """One pair of axes with lines over time."""
 
     label: str
@@ -96,11 +96,11 @@ def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
 
 def _over_time(
     curves: xarray.Dataset,
-    panels: Sequence[Panel],
+    panels: Sequence[CurvePanel],
     look: Mapping[str, Mapping[str, Any]],
     title: str,
     columns: int,
-    finish: Callable[[Any, Panel], None],
+    finish: Callable[[Any, CurvePanel], None],
 ) -> Any:
     """Draw lines over time, each panel below the other: those of a look in colour, the others grey."""
     from matplotlib.lines import Line2D
@@ -157,7 +157,11 @@ def _over_time(
 
 
 def _draw_bands(
-    axis: Any, x: numpy.ndarray, panel: Panel, distinct: Iterable[str], look: Mapping[str, Mapping[str, Any]]
+    axis: Any,
+    x: numpy.ndarray,
+    panel: CurvePanel,
+    distinct: Iterable[str],
+    look: Mapping[str, Mapping[str, Any]],
 ) -> bool:
     """Draw the bands about lines, and return whether some were left out: those that on average fill a third of the
     axis, where they hide all lines and say only that there are too few episodes.
@@ -209,14 +213,14 @@ def draw_error_over_time(
     """
     look = looks(curves) if look is None else look
     panels = [
-        Panel(
+        CurvePanel(
             wrap_label(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
             *(curves[f"rmse{ending}"].sel(quantity=name) for ending in ("", "_low", "_high")),
         )
         for name, unit in zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True)
     ]
 
-    def finish(axis: Any, panel: Panel) -> None:
+    def finish(axis: Any, panel: CurvePanel) -> None:
         if not len(positive(panel.values.values)):
             return  # of who is told the truth; a logarithmic axis has no zero
         axis.set_yscale("log")
@@ -247,14 +251,14 @@ def draw_cost_difference(
     over = curves.drop_dims(["time", "window"])
     over = with_windows(over.rename({k: v for k, v in renamed.items() if k in over.coords}), windows)
     bases = {"paper": curves.attrs["paper"], "best": curves.attrs.get("best", "")}
-    drawn: dict[str, Panel] = {}
+    drawn: dict[str, CurvePanel] = {}
     for key, base in bases.items():
         name = f"cost_minus_{key}"
         if name in over:
             bands = (over[f"{name}{ending}"] for ending in ("", "_low", "_high"))
-            drawn.setdefault(base, Panel(wrap_label(f"cost less that of {base}", columns), *bands))
+            drawn.setdefault(base, CurvePanel(wrap_label(f"cost less that of {base}", columns), *bands))
 
-    def finish(axis: Any, panel: Panel) -> None:
+    def finish(axis: Any, panel: CurvePanel) -> None:
         axis.axhline(0.0, color="0.3", lw=0.6, zorder=1.2)
         shown = [panel.values.sel(policy=name).values for name in look]
         # One line, or a moment, must not squash all others.
@@ -279,12 +283,12 @@ def draw_consistency(
     """
     look = looks(curves) if look is None else look
     panels = [
-        Panel(f"mean {metric.upper()}\nover its dimension", curves[f"a{metric}"])
+        CurvePanel(f"mean {metric.upper()}\nover its dimension", curves[f"a{metric}"])
         for metric in ("nees", "nis")
         if f"a{metric}" in curves
     ]
 
-    def finish(axis: Any, panel: Panel) -> None:
+    def finish(axis: Any, panel: CurvePanel) -> None:
         low, high = (curves[f"{panel.values.name}_{end}"].values for end in ("low", "high"))
         axis.fill_between(_abscissa(curves), low, high, color="0.6", alpha=0.5, lw=0, zorder=0.5)
         axis.axhspan(0.5, 2.0, color="0.6", alpha=0.15, lw=0, zorder=0.3)
@@ -409,9 +413,9 @@ def draw_true_class_probability(
     """
     look = looks(curves) if look is None else look
     endings = ("", "_low", "_high")
-    panel = Panel("weight of the true class", *(curves[f"true_class_probability{e}"] for e in endings))
+    panel = CurvePanel("weight of the true class", *(curves[f"true_class_probability{e}"] for e in endings))
 
-    def finish(axis: Any, panel: Panel) -> None:
+    def finish(axis: Any, panel: CurvePanel) -> None:
         axis.set_ylim(-0.02, 1.02)
 
     return _over_time(curves, [panel], look, f"{_title(curves)}, 95 % bands", columns, finish)

@@ -29,7 +29,7 @@ Box = tuple[float, float, float, float]
 """Left, bottom, right, top, pixels."""
 
 
-class Panel(NamedTuple):
+class FrontPanel(NamedTuple):
     """What is drawn of one environment in one scenario."""
 
     title: str
@@ -70,7 +70,7 @@ def draw_front(curves: xarray.Dataset, learned: Sequence[str] = (), *, columns: 
     """
     attrs = curves.attrs
     figure, (axis,) = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.4}[columns])
-    panel = Panel("", points_of_curves(curves), attrs["paper"], attrs["reference"], learned)
+    panel = FrontPanel("", points_of_curves(curves), attrs["paper"], attrs["reference"], learned)
     title = (
         f"{attrs['environment']}, scenario {attrs['scenario']}: cost and time of {attrs['episodes']} episodes"
     )
@@ -80,7 +80,7 @@ def draw_front(curves: xarray.Dataset, learned: Sequence[str] = (), *, columns: 
     return figure
 
 
-def draw_panel(axis: Any, panel: Panel) -> None:
+def draw_panel(axis: Any, panel: FrontPanel) -> None:
     """Draw points, front and reference, without names."""
     axis.set_title(panel.title, loc="left")
     axis.set_xscale("log")
@@ -111,7 +111,7 @@ def draw_panel(axis: Any, panel: Panel) -> None:
         axis.plot(point.time.nanoseconds, point.cost, **_marker(point, panel, point.name in names))
 
 
-def legend_of(panels: Iterable[Panel]) -> list[Any]:
+def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
     """Handles of what the panels show."""
     from matplotlib.lines import Line2D
 
@@ -130,7 +130,7 @@ def legend_of(panels: Iterable[Panel]) -> list[Any]:
     return [handles[name] for name in order if name in handles]
 
 
-def name_points(figure: Any, panels: Mapping[Any, Panel]) -> None:
+def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
     """Write names where nothing else is: of who lies on the front, of the paper's algorithm, of the learned, and of the
     reference.
 
@@ -163,7 +163,7 @@ class _Names:
         self.lines: list[numpy.ndarray] = []
         """Points along lines, ``(n, 2)``."""
 
-    def place(self, panel: Panel) -> None:
+    def place(self, panel: FrontPanel) -> None:
         """Write all names."""
         on_front = _on_front(panel)
         low, high = self.axis.get_ylim()
@@ -321,23 +321,23 @@ def _percent(octaves: Any) -> Any:
     return 100.0 * (2.0 ** numpy.asarray(octaves) - 1.0)
 
 
-def _on_front(panel: Panel) -> list[Point]:
+def _on_front(panel: FrontPanel) -> list[Point]:
     by_name = {point.name: point for point in panel.points}
     return [by_name[name] for name in front(panel.points)]
 
 
-def _origin(point: Point, panel: Panel) -> str:
+def _origin(point: Point, panel: FrontPanel) -> str:
     if point.name == panel.paper:
         return "paper's algorithm"
     return "learned" if point.name in panel.learned else point.kind
 
 
-def _colour(point: Point, panel: Panel) -> str:
+def _colour(point: Point, panel: FrontPanel) -> str:
     """Colour of a name."""
     return {"paper's algorithm": PAPER, "learned": LEARNED}.get(_origin(point, panel), "black")
 
 
-def _marker(point: Point, panel: Panel, on_front: bool) -> dict[str, Any]:
+def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
     where = _origin(point, panel)
     colour = _colour(point, panel) if on_front or where in ("paper's algorithm", "learned") else CLASSICAL
     shape = {"paper's algorithm": "*", "learned": "D", "estimator": "s"}.get(where, "o")

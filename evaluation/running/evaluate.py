@@ -178,7 +178,7 @@ def run_experiment(
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
-        truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
+        truth), ``cost``, ``compressed_cost`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
         ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
         action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
         :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component,
@@ -188,8 +188,8 @@ def run_experiment(
         regularly. Of a set of flights ``flight`` and ``length`` say which each episode
         flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
         recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
-        ``error``, ``cost``, ``charge`` nor ``nees``, and where some of it is not known, errors of that are NaN,
-        ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
+        ``error``, ``cost``, ``compressed_cost`` nor ``nees``, and where some of it is not known, errors of that are
+        NaN, ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
         ``to_netcdf`` saves it; :mod:`.evaluation.storage.dataset` reads windows, groups and keywords out of it.
 
     Raises:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...envs.contract.model import Episode, Model
-from ...envs.engine.reward import charge
+from ...envs.engine.reward import compressed_cost
 from ...filters.gaussian import log_density
 
 DRAWN_PREFIX = "drawn_"
@@ -18,7 +18,7 @@ def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
     return {
         "error": error,
         "cost": model.cost(episode),
-        "charge": charge(model, episode),
+        "compressed_cost": compressed_cost(model, episode),
         "causes": model.causes(episode),
         **_normalised_error(model, error, model.covariance(episode)),
         **model.records(episode),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..competitors.kinds import RANKED
-from ..statistics.bootstrap import RESAMPLES, Bootstrap, Estimate, ratio, share_interval
+from ..statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, ratio, share_interval
 from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from .own_metrics import OwnMetrics
 
-NOTHING = Estimate(math.nan, math.nan, math.nan)
+NOTHING = IntervalEstimate(math.nan, math.nan, math.nan)
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
 
@@ -68,7 +68,7 @@ class Measure(NamedTuple):
     metric: str
     component: str
     window: str
-    estimate: Estimate
+    estimate: IntervalEstimate
     unit: str
 
 
@@ -173,8 +173,8 @@ def record_statistics(
             yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood[:, times])
     if not is_bound and judged:
         yield from means("cost", "", "1", run["cost"].values)
-        charge = run["charge"].values
-        total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
+        cost = run["compressed_cost"].values
+        total = numpy.nansum(cost, axis=1) if "flight" in run.coords else cost.sum(axis=1)
         yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
     if CAUSES in run and not is_bound and judged:
         nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
@@ -228,7 +228,7 @@ def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, 
     return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
-def _band(means: numpy.ndarray, episodes: int) -> Estimate:
+def _band(means: numpy.ndarray, episodes: int) -> IntervalEstimate:
     """Where the mean of that many chi-square numbers, each over its degrees of freedom, lies with 95 %.
 
     The chi-square distribution of the same variance; the very one where all degrees are equal.
@@ -242,7 +242,7 @@ def _band(means: numpy.ndarray, episodes: int) -> Estimate:
         return NOTHING
     total = numpy.array([count**2 / inverse])
     low, high = chi_square_band(total)
-    return Estimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
+    return IntervalEstimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
 
 
 def consistency_metrics(run: "xarray.Dataset") -> list[str]:
@@ -286,7 +286,7 @@ def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarra
 
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
-) -> Estimate:
+) -> IntervalEstimate:
     """(C_paper - C) / (C_paper - C_reference), from means, and resampled ones, of three costs or their logarithms."""
     room = paper - reference
     # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
@@ -352,9 +352,9 @@ class _Against:
             difference = self._difference(name, self.best)
             yield Measure("behind_best", self.best, "all", difference, "1")
             share = float(self.chosen[name])
-            yield Measure("best_share", "", "all", Estimate(share, math.nan, math.nan), "1")
+            yield Measure("best_share", "", "all", IntervalEstimate(share, math.nan, math.nan), "1")
 
-    def _difference(self, name: str, other: str) -> Estimate:
+    def _difference(self, name: str, other: str) -> IntervalEstimate:
         """Geometric mean of the ratios of two costs, less one."""
         with numpy.errstate(invalid="ignore", over="ignore"):
             return self.bootstrap.interval(numpy.expm1(self.logs[name] - self.logs[other]))
@@ -503,7 +503,7 @@ def contender_of(
     for (kind, *words), value in results.items():
         if kind == "record":
             metric, component, window, unit = words
-            estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
+            estimate = value if isinstance(value, IntervalEstimate) else bootstrap.interval(value)
             measures.append(Measure(metric, component, window, estimate, unit))
     if (nees := results.get(("episodes", "anees"))) is not None:
         middle = bootstrap.interval(bootstrap.quantiles(nees, chosen=~numpy.isnan(nees)))
@@ -515,7 +515,7 @@ def contender_of(
         found, causes = split(results["causes",], run, bootstrap)
         further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     if (time := time_of(run)) is not None:
-        estimate = Estimate(time.nanoseconds, math.nan, math.nan)
+        estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
         measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
     return Contender(
         name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes

@@ -34,7 +34,7 @@ MEANINGS = {
     "log_likelihood": ("nat", "log-density of the measurement as it was predicted, in its units"),
     "mode_probability": ("1", "probability of each hypothesis"),
     "action": ("1", "action as the filter got it, normalised to its space"),
-    "charge": ("1", "minus the reward `cost`: normalised to the unit of the reward, and compressed"),
+    "compressed_cost": ("1", "minus the reward `cost`: normalised to the unit of the reward, and compressed"),
     "lost": ("1", "number of the reason why the episode is lost, 0 where it is not"),
     "causes": ("1", "bit field of the causes that hold, in the order of the coordinate cause"),
 }

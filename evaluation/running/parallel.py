@@ -43,7 +43,7 @@ Function = Callable[[Any, Progress], Any]
 """Of a module: from a piece of work, and what is told of measurements done, to its result."""
 
 
-class Place(NamedTuple):
+class ImportPaths(NamedTuple):
     """Where the modules and files are that pieces of work name."""
 
     folder: str
@@ -86,20 +86,20 @@ def _end_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _run_piece(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
+def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths) -> Outcome:
     """Do a piece of work, in a process that may know nothing yet."""
     with suppress(OSError):  # another machine may not have it
-        os.chdir(place.folder)
-    if place.safe_path is None:  # programs that compete are the user's
+        os.chdir(paths.folder)
+    if paths.safe_path is None:  # programs that compete are the user's
         os.environ.pop("PYTHONSAFEPATH", None)
     # Engines search the working directory, too, where a file is no library, unless this command does.
-    unwanted = {"", place.folder} - set(place.paths)
+    unwanted = {"", paths.folder} - set(paths.paths)
     sys.path[:] = [path for path in sys.path if path not in unwanted]
-    sys.path.extend(path for path in place.paths if path not in sys.path and Path(path).is_dir())
+    sys.path.extend(path for path in paths.paths if path not in sys.path and Path(path).is_dir())
     with warnings.catch_warnings(record=True) as noted, one_thread():
         try:
             function = pickle.loads(packed)  # only now: its modules may lie on those paths
-            with on_path(place.named_in):
+            with on_path(paths.named_in):
                 item = pickle.loads(packed_item)
             found = Outcome(index, function(item, lambda measurements: None), None, "", [])
         except Exception as error:
@@ -218,9 +218,9 @@ class Workers:
                     result = function(item, tick)
                 yield index, result
             return
-        place = Place(os.getcwd(), list(sys.path), list(FOUND_IN), os.environ.get("PYTHONSAFEPATH"))
+        paths = ImportPaths(os.getcwd(), list(sys.path), list(FOUND_IN), os.environ.get("PYTHONSAFEPATH"))
         packed = cloudpickle.dumps(function)
-        calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
+        calls = ((index, packed, cloudpickle.dumps(item), paths) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         shown_warnings: set[tuple[str, type[Warning]]] = set()
         # Processes that begin search no libraries in the working directory; :func:`_run_piece` tells them the paths.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ...envs.contract.filter import Filter, Initial, Input
+from ...envs.contract.filter import Filter, FilterInput, Initial
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.task import Task, named_arrays
 from ...envs.data.foreign_files import MOST_NUMBERS
@@ -29,7 +29,7 @@ class NoFilter(Filter[Task, Any, Initial]):
         """Report the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 
-    def update(self, state: Initial, given: Input) -> Initial:
+    def update(self, state: Initial, given: FilterInput) -> Initial:
         """Learn nothing."""
         return state
 

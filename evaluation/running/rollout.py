@@ -189,33 +189,33 @@ def run_episodes(
         tick: told of measurements done.
         more: what is reported of the first episodes beside it.
     """
-    count, steering, tick = len(seeds), None, tick or (lambda measurements: None)
-    steers = kind == "policy"
-    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
-    if steers:
-        steering = _steering_of(model, competitor, name)
+    count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
+    is_policy = kind == "policy"
+    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    if is_policy:
+        compiled_policy = _compiled_policy_of(model, competitor, name)
     compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
-    if compiled and (steering is not None or not steers):
+    if compiled and (compiled_policy is not None or not is_policy):
         if more is None:
-            return _run_compiled(looped, steering, seeds, report, tick)
-        parts = [_run_compiled(looped, steering, seeds[: more.episodes], more.report, tick)]
+            return _run_compiled(looped, compiled_policy, seeds, report, tick)
+        parts = [_run_compiled(looped, compiled_policy, seeds[: more.episodes], more.report, tick)]
         if more.episodes < count:
-            parts.append(_run_compiled(looped, steering, seeds[more.episodes :], report, tick))
+            parts.append(_run_compiled(looped, compiled_policy, seeds[more.episodes :], report, tick))
         return _one_after_another(parts)
     steps = (
         _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
-        if steers
+        if is_policy
         else _step_filter(looped, seeds, report if more is None else more.report)
     )
-    return _step_episodes(steps, count, steers, tick, more)
+    return _step_episodes(steps, count, is_policy, tick, more)
 
 
 def _run_compiled(
-    looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
+    looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
     """Run compiled episodes as one call of native code."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
-    reports, actions = lanes.run(report, steering)
+    reports, actions = lanes.run(report, compiled_policy)
     tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
     found = {name: _episodes_first(values, count) for name, values in reports.items()}
     return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
@@ -234,7 +234,7 @@ def _one_after_another(parts: Sequence[Flown]) -> Flown:
 
 
 def _step_episodes(
-    steps: Iterator[tuple[Any, Array]], count: int, steers: bool, tick: Progress, more: More | None
+    steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, more: More | None
 ) -> Flown:
     """Keep what is reported of episodes that are stepped."""
     series: dict[str, list[numpy.ndarray]] = {}
@@ -247,10 +247,10 @@ def _step_episodes(
         actions.append(numpy.asarray(action))
         tick(count)
     together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
-    return Flown(together, numpy.stack(actions, axis=1) if steers else None)
+    return Flown(together, numpy.stack(actions, axis=1) if is_policy else None)
 
 
-def _steering_of(model: Model, competitor: Any, name: str) -> Specialised | None:
+def _compiled_policy_of(model: Model, competitor: Any, name: str) -> Specialised | None:
     """Return what steers the model in native code; None of a policy that is asked in Python."""
 
     def trace() -> Specialised | None:
@@ -327,20 +327,20 @@ def measure_time(
     if kind in ("smoother", "bound") or answers_by_track(competitor):
         return None
     seeds = list(itertools.islice(itertools.cycle(seeds), TIMED_EPISODES))
-    task, steers = model.task, kind == "policy"
+    task, is_policy = model.task, kind == "policy"
     clock = time.process_time
     if own := is_program(competitor):
         competitor = competitor(task)
         clock = competitor.processor_seconds
     decisions = max(1, min(TIMED_MEASUREMENTS, task.horizon) // task.decision_interval)
-    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
-    steering = _steering_of(model, competitor, name) if steers else None
-    if can_step(looped, _report_estimate) and (steering is not None or not steers):
-        spent = _time_compiled(looped, steering, seeds, decisions)
+    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    compiled_policy = _compiled_policy_of(model, competitor, name) if is_policy else None
+    if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
+        spent = _time_compiled(looped, compiled_policy, seeds, decisions)
         return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
     steps = (
         _steer_by_python(model, competitor, seeds, _report_estimate, name)
-        if steers
+        if is_policy
         else _step_filter(looped, seeds, _report_estimate)
     )
     with warnings.catch_warnings():
@@ -357,7 +357,7 @@ def _report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
 
 
 def _time_compiled(
-    looped: Model, steering: Specialised | None, seeds: Sequence[int], decisions: int
+    looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], decisions: int
 ) -> float:
     """Seconds of a decision of all episodes, in the quickest run of optimised code."""
     identities = identities_of_seeds(seeds)
@@ -367,7 +367,7 @@ def _time_compiled(
     def run(count: int) -> float:
         lanes.begin(identities)
         began = time.process_time()
-        lanes.run(_report_estimate, steering, count * interval)
+        lanes.run(_report_estimate, compiled_policy, count * interval)
         return time.process_time() - began
 
     with optimised_code():

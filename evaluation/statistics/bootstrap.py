@@ -33,7 +33,7 @@ FEWEST, MEASUREMENTS = 256, 2**20
 CONFIDENCE = 0.95
 
 
-class Estimate(NamedTuple):
+class IntervalEstimate(NamedTuple):
     """A value and its bootstrap interval; NaN where there is none."""
 
     value: float
@@ -68,7 +68,7 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
     return numpy.concatenate([samples[:1], ends])
 
 
-def share_interval(share: float, number: int) -> Estimate:
+def share_interval(share: float, number: int) -> IntervalEstimate:
     """A share of independent episodes and its 95 % interval, which has a width where none or all are counted, too.
 
     Wilson's score interval (E. B. Wilson, Probable inference, the law of succession, and statistical inference, Journal
@@ -83,7 +83,7 @@ def share_interval(share: float, number: int) -> Estimate:
     half = z / (1.0 + z * z / number) * math.sqrt(share * (1.0 - share) / number + (0.5 * z / number) ** 2)
     # The ends are exact there but for rounding.
     low, high = 0.0 if share == 0.0 else middle - half, 1.0 if share == 1.0 else middle + half
-    return Estimate(share, low, high)
+    return IntervalEstimate(share, low, high)
 
 
 def block_of(times: int) -> int:
@@ -209,20 +209,20 @@ class Bootstrap:
             found.append(numpy.where(weights[:, -1] > 0.0, ordered[enough.argmax(axis=1)], numpy.nan))
         return numpy.concatenate(found)
 
-    def interval(self, statistics: numpy.ndarray) -> Estimate:
+    def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
         """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""
-        return Estimate(*percentile_interval(statistics).tolist())
+        return IntervalEstimate(*percentile_interval(statistics).tolist())
 
-    def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> Estimate:
+    def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
         """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
         return self.interval(means / others - 1.0)
 
-    def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> Estimate:
+    def geometric_difference(self, costs: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
         """Geometric mean of the ratios of two competitors' costs in every episode, ``(episodes,)``, less one."""
         return self.estimate(numpy.log(costs / others), numpy.expm1)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m
-    ) -> Estimate:
+    ) -> IntervalEstimate:
         """Interval of a function of the means of ``values`` over the episodes."""
         return self.interval(of_means(self.means(values)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy
 
 from ...envs.contract.causes import RESERVED
-from .bootstrap import Bootstrap, Estimate, ratio
+from .bootstrap import Bootstrap, IntervalEstimate, ratio
 
 if TYPE_CHECKING:
     import xarray
@@ -31,7 +31,7 @@ class CauseMeasure(NamedTuple):
 
     metric: str
     cause: str
-    estimate: Estimate
+    estimate: IntervalEstimate
     opponent: str = ""
     """With whom it is compared."""
 

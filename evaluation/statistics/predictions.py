@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy
 
 from ...envs.contract.task import Task
-from .bootstrap import Bootstrap, Estimate, ratio
+from .bootstrap import Bootstrap, IntervalEstimate, ratio
 
 if TYPE_CHECKING:
     import xarray
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 STRETCHES = 30
 """Into which measurements are cut for intervals, at most; a stretch has at least ``SHORTEST_STRETCH``."""
 SHORTEST_STRETCH = 8
-UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+UNKNOWN = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 class Predictions:
@@ -59,7 +59,7 @@ class Predictions:
         found: numpy.ndarray = numpy.moveaxis(values, -1, 0)
         return found
 
-    def correlations(self, name: str, mask: numpy.ndarray) -> dict[str, Estimate]:
+    def correlations(self, name: str, mask: numpy.ndarray) -> dict[str, IntervalEstimate]:
         """Correlation of the successive prediction errors of each number that is measured, each received one with the
         last received before; empty where all are of one group.
 
@@ -87,7 +87,7 @@ class Predictions:
         there = mask & (degrees > 0.0) & numpy.isfinite(nis)
         return float(nis[there].sum() / degrees[there].sum()) if there.any() else math.nan
 
-    def difference(self, name: str, other: str, mask: numpy.ndarray | None = None) -> Estimate:
+    def difference(self, name: str, other: str, mask: numpy.ndarray | None = None) -> IntervalEstimate:
         """Mean difference of log-likelihoods per measurement, paired.
 
         Args:
@@ -106,7 +106,7 @@ def mean_of(values: numpy.ndarray, mask: numpy.ndarray) -> float:
     return float(values[there].mean()) if there.any() else math.nan
 
 
-def relative_error(squares: numpy.ndarray, others: numpy.ndarray, mask: numpy.ndarray) -> Estimate:
+def relative_error(squares: numpy.ndarray, others: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
     """Root mean square over that of another, less one, paired.
 
     Args:
@@ -119,7 +119,7 @@ def relative_error(squares: numpy.ndarray, others: numpy.ndarray, mask: numpy.nd
     )
 
 
-def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> Estimate:
+def correlation(errors: numpy.ndarray, mask: numpy.ndarray) -> IntervalEstimate:
     """Correlation of successive prediction errors; zero where they are white.
 
     Args:
@@ -142,7 +142,7 @@ def _last_before(errors: numpy.ndarray) -> numpy.ndarray:
 
 def stretch_interval(
     mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
-) -> Estimate:
+) -> IntervalEstimate:
     """Value and 95 % interval of a function of two means over measurements, by resampling stretches of them.
 
     Args:
@@ -162,6 +162,6 @@ def stretch_interval(
     )
     sums = sums[numpy.bincount(number, minlength=count) > 0]
     if len(sums) < 2:
-        return Estimate(float(function(sums)[0]), math.nan, math.nan)
+        return IntervalEstimate(float(function(sums)[0]), math.nan, math.nan)
     bootstrap = Bootstrap(len(sums))
     return bootstrap.interval(function(bootstrap.means(sums)))

@@ -27,7 +27,7 @@ from ..competitors.online import OnlineFilter
 from ..competitors.online_state import OnlineState
 from ..running.evaluate import Experiment, control_of
 from ..running.seeds import episode_seeds
-from ..statistics.bootstrap import Bootstrap, Estimate
+from ..statistics.bootstrap import Bootstrap, IntervalEstimate
 from ..storage.dataset import FAULTS
 from .alterations import AFTERWARDS, ALTERATIONS, SETTLED, Alteration
 from .streams import Stream, record_streams
@@ -361,7 +361,7 @@ class CrashTest:
             beside = f", of {self.reference_name} {_text(other)} times" if math.isfinite(other) else ""
             yield f"error {_text(error)} times that without{beside}"
 
-    def _inconsistency(self, alteration: str, anees: Estimate, plain: Run) -> Iterator[str]:
+    def _inconsistency(self, alteration: str, anees: IntervalEstimate, plain: Run) -> Iterator[str]:
         """Say where the covariance does not tell how large the errors are."""
         usual = 1.0 if alteration == UNALTERED else max(1.0, float(numpy.nanmean(plain.nees[SETTLED:])))
         if anees.low > INCONSISTENT * usual:
@@ -385,7 +385,7 @@ class CrashTest:
             ratio: numpy.ndarray = own / theirs
         return ratio
 
-    def _mean(self, values: numpy.ndarray) -> Estimate:
+    def _mean(self, values: numpy.ndarray) -> IntervalEstimate:
         """Mean over measurements and episodes, with its interval."""
         with numpy.errstate(all="ignore"):
             each = values.mean(axis=0) if len(values) else numpy.full(values.shape[1], numpy.nan)
@@ -459,7 +459,7 @@ def _geometric_mean(ratio: Any) -> float:
     return float(numpy.exp(logs.mean())) if len(logs) else math.nan
 
 
-def _anees_text(anees: Estimate) -> str:
+def _anees_text(anees: IntervalEstimate) -> str:
     return f"ANEES {_text(anees.value)} [{_text(anees.low)}, {_text(anees.high)}]"
 
 

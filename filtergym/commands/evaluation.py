@@ -28,7 +28,7 @@ from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.metrics import Record, flight_records
 from ..evaluation.running.parallel import Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
-from ..evaluation.statistics.bootstrap import Estimate
+from ..evaluation.statistics.bootstrap import IntervalEstimate
 from ..evaluation.statistics.cause_split import phrases_of
 from ..evaluation.statistics.predictions import Predictions, mean_of
 from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
@@ -235,7 +235,7 @@ def flights_of(found: Evaluation) -> list[Record]:
     return flight_records(found.dataset) if each else []
 
 
-def likelihood_differences(problem: Problem, dataset: xarray.Dataset) -> dict[str, Estimate]:
+def likelihood_differences(problem: Problem, dataset: xarray.Dataset) -> dict[str, IntervalEstimate]:
     """Return the log-likelihood per measurement less that of the best, by name."""
     predictions = Predictions(dataset, make_task(problem.task))
     everywhere = numpy.ones(predictions.shape, dtype=bool)
@@ -249,7 +249,7 @@ def tables_of(
     problem: Problem,
     found: Evaluation,
     flights: list[Record],
-    differences: Mapping[str, Estimate],
+    differences: Mapping[str, IntervalEstimate],
     width: int,
 ) -> list[Table]:
     """Return what is printed in so many columns, widest first."""

@@ -14,7 +14,7 @@ from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
 from ..compiler.interpretation import first_steps, interpret
 from ..compiler.library import portable
 from ..compiler.native import AVAILABLE, native
-from ..compiler.program import Program
+from ..compiler.program import StraightLineProgram
 from ..envs.contract.model import Episode, Model
 from ..envs.engine.backend import make_model
 from ..evaluation.competitors.kinds import kind_of
@@ -210,7 +210,7 @@ class _CompiledUpdate:
         if shown:  # what a network is shown is computed before it is asked, and once more with its answer
             first = first_steps(code, shown)
             steps, origins = code.steps[:first], code.origins[:first]
-            self._before = _Code(Program(steps, code.constants, code.results[:shown], origins), E)
+            self._before = _Code(StraightLineProgram(steps, code.constants, code.results[:shown], origins), E)
 
     def __call__(self, given: dict[int, Any], network: _Network | None) -> list[numpy.ndarray]:
         if network is not None and self._before is not None:
@@ -221,7 +221,7 @@ class _CompiledUpdate:
 class _Code:
     """Compiled code of a program for E lanes, whose results are the rows of one array."""
 
-    def __init__(self, code: Program, E: int) -> None:
+    def __init__(self, code: StraightLineProgram, E: int) -> None:
         self.E = E
         self._inputs = sorted({step.arguments for step in code.steps if step.operation == "input"})
         rows = {argument: 1 + row for argument, row in self._inputs}  # the last one counts

@@ -20,9 +20,9 @@ from ..agents.residual import ResidualPolicy
 from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
-from ..compiler.program import Graph, Program, Result, Steps, program
+from ..compiler.program import Graph, ProgramResult, ProgramSteps, StraightLineProgram, program
 from ..envs.contract.companions import array_meanings
-from ..envs.contract.filter import Filter, Input
+from ..envs.contract.filter import Filter, FilterInput
 from ..envs.contract.model import Model
 from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
@@ -53,9 +53,9 @@ class Member(NamedTuple):
 class TracedFilter(NamedTuple):
     """A filter as two programs."""
 
-    start: Program
+    start: StraightLineProgram
     """From the initial estimate to the state."""
-    update: Program
+    update: StraightLineProgram
     """From state and measurement to state and estimate; what a network is shown comes first among the results."""
     initial: list[Member]
     measurement: list[Member]
@@ -76,7 +76,7 @@ class FilterSteps:
         filter: on traced arrays.
         masked: puts something in place of what was not received, of what never sees it.
         decider: asks a network inside; None without one.
-        steers: whether it is asked what steers the world, as a bank is.
+        reports_feedback: whether it is asked what steers the world, as a bank is.
     """
 
     def __init__(
@@ -84,18 +84,20 @@ class FilterSteps:
         filter: Filter,
         masked: Callable[[Any], Any] | None = None,
         decider: Decider | None = None,
-        steers: bool = False,
+        reports_feedback: bool = False,
     ) -> None:
         self.filter, self.masked, self.decider = filter, masked, decider
-        self.steers = steers and bool(array_meanings(filter.task).feedback) and filter.task.closes_loop
+        self.reports_feedback = (
+            reports_feedback and bool(array_meanings(filter.task).feedback) and filter.task.closes_loop
+        )
 
     def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
         """Its state after a measurement, and its answer."""
         own, received = self.filter, measurement if self.masked is None else self.masked(measurement)
-        after = own.step(state, Input(received))
+        after = own.step(state, FilterInput(received))
         told = own.records(after, received)
         known = {name: told[name] for name in LIKELIHOODS if told.get(name) is not None}
-        feedback = own.feedback(after, received) if self.steers else None
+        feedback = own.feedback(after, received) if self.reports_feedback else None
         if feedback is not None:
             known[FEEDBACK] = feedback
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
@@ -205,7 +207,7 @@ def steps_of(
     steered = steer(Model(traced, control), policy)
     # Where a field says by its name what is received, the program around the filter puts a number there.
     masked = None if traced.world.received_field else functools.partial(clear_missing, traced)
-    return FilterSteps(steered, masked, steered.decider, steers=True), network
+    return FilterSteps(steered, masked, steered.decider, reports_feedback=True), network
 
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
@@ -386,12 +388,12 @@ def _trace(
     update = program(
         graph,
         [
-            *(Result(SHOWN, row, node) for row, node in enumerate(shown)),
-            *(Result(STATE, place[member], after[member]) for member in live),
-            *(Result(ESTIMATE, row, node) for row, node in enumerate(results)),
+            *(ProgramResult(SHOWN, row, node) for row, node in enumerate(shown)),
+            *(ProgramResult(STATE, place[member], after[member]) for member in live),
+            *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
         ],
     )
-    start = program(graph, [Result(STATE, place[member], first[member]) for member in live])
+    start = program(graph, [ProgramResult(STATE, place[member], first[member]) for member in live])
     listed = members_of(state)
     return TracedFilter(
         start,
@@ -422,11 +424,11 @@ def _live_members(
         live = more
 
 
-def _renumbered(code: Program, place: dict[int, int]) -> Program:
+def _renumbered(code: StraightLineProgram, place: dict[int, int]) -> StraightLineProgram:
     """The program with the rows of the state that are kept."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
     rows = 1 + inputs[arguments[inputs] == STATE]
     arguments[rows] = [place[row] for row in arguments[rows].tolist()]
-    renumbered = Steps(steps.names, steps.kinds, steps.begins, arguments, steps.logical)
+    renumbered = ProgramSteps(steps.names, steps.kinds, steps.begins, arguments, steps.logical)
     return code._replace(steps=renumbered)

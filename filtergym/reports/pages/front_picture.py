@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
-from ...evaluation.figures.front_figure import Panel, draw_panel, name_points
+from ...evaluation.figures.front_figure import FrontPanel, draw_panel, name_points
 from ...evaluation.figures.print_layout import DOTS_PER_INCH, figure_with_axes, in_print
 from ...evaluation.running.times import front, points_of_records
 from ..tables.headline import headline
@@ -37,14 +37,14 @@ def front_images(results: Sequence[Result]) -> list[FrontImage]:
         on_front = [points[name] for name in front(list(points.values()))]
         words = ", ".join(f"{p.name} {p.cost:+.3g} % in {p.time.nanoseconds:.2g} ns" for p in on_front)
         title = result.short if result.default else f"{result.short}, {result.scenario}"
-        panel = Panel(title, list(points.values()), result.paper, result.reference, result.learned)
+        panel = FrontPanel(title, list(points.values()), result.paper, result.reference, result.learned)
         encoded = base64.b64encode(_draw(panel, columns=1)).decode()
         found.append(FrontImage(title, words, f"data:image/png;base64,{encoded}"))
     return found
 
 
 @in_print
-def _draw(panel: Panel, *, columns: int) -> bytes:
+def _draw(panel: FrontPanel, *, columns: int) -> bytes:
     """Return the panel as a PNG of twice the width that a page shows it in."""
     from matplotlib import rc_context
 

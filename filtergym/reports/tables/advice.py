@@ -14,7 +14,7 @@ from ...baselines.judgement import JudgedFilter
 from ...baselines.table import Tunable
 from ...envs.contract.log_format import deviation_words, is_assumed
 from ...envs.data.recording import Recording
-from ...evaluation.statistics.bootstrap import Estimate
+from ...evaluation.statistics.bootstrap import IntervalEstimate
 
 MOST_OUTLIERS = 12
 """Named in a sentence."""
@@ -209,15 +209,15 @@ def _label(advice: Advice, one: JudgedFilter) -> str:
     return f"{one.name} ({role})" if role else one.name
 
 
-def _percent(estimate: Estimate) -> Estimate:
-    return Estimate(*(100.0 * value for value in estimate))
+def _percent(estimate: IntervalEstimate) -> IntervalEstimate:
+    return IntervalEstimate(*(100.0 * value for value in estimate))
 
 
 def _number(value: float, form: str = ".4g") -> str:
     return "-" if math.isnan(value) else format(value, form)
 
 
-def _interval(estimate: Estimate, form: str) -> str:
+def _interval(estimate: IntervalEstimate, form: str) -> str:
     if math.isnan(estimate.value):
         return "-"
     if math.isnan(estimate.low) or estimate.low == estimate.high:
@@ -318,7 +318,7 @@ def _operations(advice: Advice, name: str, other: str) -> str:
     return f"takes {one:,.0f} operations an update for {two:,.0f}" if max(one, two) < math.inf else ""
 
 
-def _amount(advice: Advice, relative: Estimate) -> str:
+def _amount(advice: Advice, relative: IntervalEstimate) -> str:
     """How much less or more error, with its interval."""
     value, low, high = _percent(relative)
     kind = "error" if advice.recording.truth is not None else "error of prediction"

@@ -17,7 +17,7 @@ from ...agents.training_run import Passed, TrainingRun
 from ...agents.validation import TrainingEpisodes, validation_backend
 from ...envs.contract.model import Episode, Model
 from ...evaluation.competitors.kinds import RandomPolicy
-from ...evaluation.statistics.bootstrap import Bootstrap, Estimate
+from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...filters.gaussian import log_density
 from .terminal_tables import INCONSISTENT, consistency, plain_table, with_interval
 
@@ -135,7 +135,7 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
                 with_interval(difference, 100.0, negligible=0.005),
                 f"{100.0 * (own.mean() / paper.mean() - 1.0):+.1f}",
             ]
-        row.append(consistency(Estimate(float(line.means["anees"].mean()), 0.0, 0.0)))
+        row.append(consistency(IntervalEstimate(float(line.means["anees"].mean()), 0.0, 0.0)))
         passed = line.beat_paper
         row.append("-" if passed is None else f"{passed['steps']:,}\n({passed['seconds']:.1f} s)")
         table.add_row(*row)
