@@ -21,7 +21,6 @@ import gymnasium
 import numpy
 import torch
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -35,19 +34,10 @@ from .gate import Gate, PolicyMaker, as_trained
 from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
 from .residual import policy_to_correct
+from .sb3_algorithms import ALGORITHMS, SPACES
 from .sb3_policy import Sb3Policy
 from .training_run import TrainingRun, check_trust, save_run, schedule
 from .training_session import Bookkeeping, Session, Trainee, curves_beside, interruption, logger_in
-
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
-}  # fmt: skip
-SPACES: dict[str, tuple[type[gymnasium.Space], ...]] = {
-    "ppo": (gymnasium.spaces.Box, gymnasium.spaces.Discrete),
-    "recurrent-ppo": (gymnasium.spaces.Box, gymnasium.spaces.Discrete),
-    "sac": (gymnasium.spaces.Box,),
-    "dqn": (gymnasium.spaces.Discrete,),
-}
 
 
 class _Trainer(BaseCallback):

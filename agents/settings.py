@@ -159,7 +159,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
         known |= {"first_action", "fields_kept", "longest_memory", "max_action_grad", "network"}
         known |= {"teacher", "teacher_share"}
     else:
-        from .sb3_training import ALGORITHMS
+        from .sb3_algorithms import ALGORITHMS
 
         cls = ALGORITHMS[algorithm]
         known |= {"normalize", *inspect.signature(cls).parameters} - OF_THE_RUN

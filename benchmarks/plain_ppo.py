@@ -66,7 +66,7 @@ def run(chosen: argparse.Namespace, id: str, seed: int) -> dict:
     import torch
 
     from filtergym.agents import to_sb3
-    from filtergym.agents.sb3_training import ALGORITHMS
+    from filtergym.agents.sb3_algorithms import ALGORITHMS
     from filtergym.agents.settings import parse_settings
 
     algo, envs = chosen.algo, chosen.envs

@@ -18,13 +18,9 @@ from .envs.contract.task import Component
 from .envs.engine.catalogue import nearest
 from .envs.linear.equations import StateSpaceDefinition, StateSpaceModel
 from .envs.linear.inputs import Input
+from .envs.linear.parameters import StateSpaceParameters
 from .envs.linear.sensors import Sensor
-from .envs.linear.state_space import (
-    StateSpace,
-    StateSpaceParameters,
-    components_measured,
-    state_space_attributes,
-)
+from .envs.linear.state_space import StateSpace, components_measured, state_space_attributes
 from .evaluation.running.seeds import episode_seeds
 from .own_angles import find_periods, warn_of_turns
 from .own_equations import (
@@ -110,7 +106,7 @@ def state_space(
             Filters then are interacting multiple models of all of them.
         transition: probabilities that one model follows another (row = from), ``(M, M)``; default: it stays with 0.95.
         switching: whether the world switches; otherwise only the filters take it for possible.
-        **parameters: of :class:`filtergym.envs.linear.state_space.StateSpaceParameters` in the training distribution,
+        **parameters: of :class:`filtergym.envs.linear.parameters.StateSpaceParameters` in the training distribution,
             such as ``horizon`` and ``process_noise``.
 
     Returns:

@@ -75,7 +75,7 @@ def test_random_actions_are_one_draw_after_another(control):
 
 def test_a_model_is_asked_about_as_many_always():
     pytest.importorskip("sb3_contrib")
-    from filtergym.agents.sb3_training import ALGORITHMS
+    from filtergym.agents.sb3_algorithms import ALGORITHMS
 
     env = gymnasium.make(ID, horizon=10)
     model = ALGORITHMS["recurrent-ppo"]("MlpLstmPolicy", env, seed=0, device="cpu", n_steps=8, batch_size=8)

@@ -1,7 +1,7 @@
-"""The line through the house: the core knows no problem and no companion, and is small."""
+"""The line through the house: the core knows no problem and no companion, and is small; no files import in a circle."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -45,6 +45,11 @@ KNOWN = {
 """Parts that a part may import, of those that know few."""
 MOST_LINES = 36_000
 """Of the core."""
+CIRCLES: set[frozenset[str]] = {
+    frozenset({"compiler/namespace.py", "compiler/numpy_functions.py"}),
+}
+"""Files that import one another, also where an import is late or for types alone: the methods by which NumPy calls a
+traced array are written with the functions of the namespace that returns such arrays."""
 TYPES_ALONE = Path("filtergym/__init__.py")
 """Names the functions of the package for type checkers, and imports them when they are first used."""
 
@@ -90,3 +95,45 @@ def test_the_core_is_small() -> None:
         (ROOT / file).read_text(encoding="utf-8").count("\n") for file in FILES if part_of(file) == "core"
     )
     assert lines <= MOST_LINES
+
+
+def circles(arrows: Mapping[str, set[str]]) -> set[frozenset[str]]:
+    """Groups of several nodes of which each reaches each (strongly connected components, by Kosaraju's algorithm)."""
+    back: dict[str, set[str]] = {node: set() for node in arrows}
+    for node, targets in arrows.items():
+        for target in targets:
+            back[target].add(node)
+
+    def visit(start: str, graph: Mapping[str, set[str]], seen: set[str]) -> list[str]:
+        """Nodes that can be reached and were not seen before, each after those that follow from it."""
+        seen.add(start)
+        path, order = [(start, iter(graph[start]))], []
+        while path:
+            targets = path[-1][1]
+            following = next((target for target in targets if target not in seen), None)
+            if following is None:
+                order.append(path.pop()[0])
+            else:
+                seen.add(following)
+                path.append((following, iter(graph[following])))
+        return order
+
+    seen: set[str] = set()
+    order = [node for start in arrows if start not in seen for node in visit(start, arrows, seen)]
+    seen = set()
+    groups = [frozenset(visit(start, back, seen)) for start in reversed(order) if start not in seen]
+    return {group for group in groups if len(group) > 1}
+
+
+def test_files_import_one_way() -> None:
+    inner = [file for file in FILES if file.name != "__init__.py"]
+    arrows = {
+        str(file): {str(other) for other in imported_files(file) if other in inner and other != file}
+        for file in inner
+    }
+    assert circles(arrows) == CIRCLES
+
+
+def test_the_check_sees_circles() -> None:
+    arrows = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": {"f"}, "f": {"d"}, "g": {"a"}}
+    assert circles(arrows) == {frozenset("abc"), frozenset("def")}

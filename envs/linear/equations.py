@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
@@ -29,11 +29,10 @@ from ...filters.innovation_update import Received, kalman_gain, keep_received
 from ...filters.small_matrices import apply, product, transpose
 from ...filters.unscented import GAUSSIAN, Spread, narrow, sigma_points
 from ..contract.observation import Array
+from ..contract.task import Task
 from .inputs import Input
+from .parameters import StateSpaceParameters
 from .sensors import Channel
-
-if TYPE_CHECKING:
-    from .state_space import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +257,25 @@ Passed = StateSpaceMeasurement | Passage
 """What says how a state moved since the measurement before."""
 
 
+class StateSpaceProblem(Task):
+    """What equations, world, filters and live input use of a task of state-space models."""
+
+    definition: ClassVar[StateSpaceDefinition]
+    parameters: StateSpaceParameters
+
+    def set_up(self) -> None:
+        """Put the models that the filters believe on the task's arrays."""
+        own = self.definition
+        self.believed = [Equations(self, model) for model in own.filters]
+        count = len(own.filters)
+        self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
+        self.transition = self.constant([list(row) for row in own.transition])
+
+    def _sampling_interval(self) -> float | None:
+        """Return the time between measurements, s; None where it differs."""
+        return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
+
+
 class Equations:
     """A model on the arrays of a task.
 
@@ -266,7 +284,7 @@ class Equations:
         model: the equations.
     """
 
-    def __init__(self, task: "StateSpace", model: StateSpaceModel) -> None:
+    def __init__(self, task: StateSpaceProblem, model: StateSpaceModel) -> None:
         self.model, self.xp = model, task.xp
         self.components = [component.name for component in task.components]
         self._R = self._constant(task, model.R)
@@ -283,7 +301,7 @@ class Equations:
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
     @staticmethod
-    def _constant(task: "StateSpace", noise: numpy.ndarray | VectorFunction) -> Array | None:
+    def _constant(task: StateSpaceProblem, noise: numpy.ndarray | VectorFunction) -> Array | None:
         return None if isinstance(noise, VectorFunction) else task.constant(noise)
 
     def move(self, x: Array, passed: Passed) -> Array:

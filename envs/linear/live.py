@@ -1,15 +1,12 @@
 """Measurements of a state-space model as they come one by one, see :mod:`..contract.live_input`."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy
 
 from ..contract.live_input import LiveInput, Memory
-from .equations import find_invalid_noise
-
-if TYPE_CHECKING:
-    from .state_space import StateSpace
+from .equations import StateSpaceProblem, find_invalid_noise
 
 UNEVEN = 0.01
 """Share of the sampling interval by which a time may be off, as in tables of regular measurements."""
@@ -21,7 +18,7 @@ class StateSpaceInput(LiveInput):
     else.
     """
 
-    def __init__(self, task: "StateSpace", initial: Any, measurement: Any, tracks: int) -> None:
+    def __init__(self, task: StateSpaceProblem, initial: Any, measurement: Any, tracks: int) -> None:
         self.definition = task.definition
         self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]

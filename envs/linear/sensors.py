@@ -6,7 +6,8 @@ say at one time is taken in together: their noises are independent, so the order
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -15,9 +16,7 @@ from ..contract.causes import Cause, Moment
 from ..contract.draws import Draws
 from ..contract.observation import Array
 from ..contract.parameters import ParameterLimits, check, freeze
-
-if TYPE_CHECKING:
-    from .state_space import StateSpace
+from .parameters import StateSpaceParameters
 
 LIMITS: dict[str, tuple[Any, ParameterLimits]] = {
     "interval": (float | None, ParameterLimits(above=0.0)),
@@ -121,16 +120,24 @@ class Receptions:
     """When the sensors of a simulation speak, and which of them has an offset.
 
     Args:
-        task: with its parameters.
+        parameters: of the task.
+        xp: its array namespace.
+        channels: the sensors.
         deviations: of the noise of the m numbers, ``(m,)``.
 
     Attributes:
         row_uniforms: uniform numbers that are taken at each measurement.
     """
 
-    def __init__(self, task: "StateSpace", deviations: numpy.ndarray) -> None:
-        self.parameters, self.xp = task.parameters, task.xp
-        self.channels, self.deviations = task.definition.channels, deviations
+    def __init__(
+        self,
+        parameters: StateSpaceParameters,
+        xp: ModuleType,
+        channels: Sequence[Channel],
+        deviations: numpy.ndarray,
+    ) -> None:
+        self.parameters, self.xp = parameters, xp
+        self.channels, self.deviations = channels, deviations
         self.due = [channel for channel in self.channels if channel.interval is not None]
         self.losing = [channel for channel in self.channels if channel.availability < 1.0]
         self.pauses = self.parameters.gaps > 0.0

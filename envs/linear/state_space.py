@@ -12,7 +12,6 @@ filters may believe others. Functions are traced once, on vectors of symbols, an
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy
@@ -27,45 +26,21 @@ from ..contract.draws import Draws, category, draw_between
 from ..contract.filter import Initial
 from ..contract.live_input import LiveReader
 from ..contract.observation import Array
-from ..contract.parameters import TaskParameters, parameter
-from ..contract.task import Component, PaperPolicy, Reward, Scenario, Task
+from ..contract.task import Component, PaperPolicy, Reward, Scenario
 from ..contract.world import World
-from .equations import Equations, Passage, StateSpaceDefinition, StateSpaceMeasurement, usual_sensor_noise
+from .equations import (
+    Equations,
+    Passage,
+    StateSpaceDefinition,
+    StateSpaceMeasurement,
+    StateSpaceProblem,
+    usual_sensor_noise,
+)
 from .inputs import InputCourses
 from .live import StateSpaceInput
+from .parameters import StateSpaceParameters
 from .sensors import Receptions, SensorStates, silence_causes
-
-
-@dataclass(frozen=True)
-class StateSpaceParameters(TaskParameters):
-    """Parameters of every task of state-space models."""
-
-    sampling_interval: float = parameter(1.0, above=0.0)
-    """Time between measurements, s; of a timed model on average."""
-    jitter: float = parameter(0.0, at_least=0.0, below=1.0)
-    """Share of the sampling interval by which the interval before a measurement differs at most, of a timed model."""
-    process_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
-    """Limits of the factor by which the true Q differs from the model's, drawn log-uniformly for every episode."""
-    measurement_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
-    """Likewise of R."""
-    availability: float = parameter(1.0, at_least=0.0, at_most=1.0)
-    """Probability that a measurement is received."""
-    gaps: float = parameter(0.0, at_least=0.0, below=1.0)
-    """Probability at a measurement that a gap of a sensor begins, in which it says nothing; of each sensor."""
-    gap_length: float = parameter(10.0, at_least=1.0)
-    """Measurements in a gap, on average."""
-    bias: float = parameter(0.0, at_least=0.0)
-    """Offset of one sensor, up or down, in standard deviations of its noise."""
-    late: float = parameter(0.0, at_least=0.0, below=1.0)
-    """Probability that what a sensor says comes late, of each sensor."""
-    lateness: int = parameter(3, at_least=1, at_most=20)
-    """Measurements after its own with which it then comes."""
-    noise_decades: float = parameter(2.0, above=0.0)
-    """Decades by which an action of one scales Q or R (control ``noise``)."""
-    gain_factor: float = parameter(4.0, above=1.0)
-    """Factor by which an action of one multiplies the gain of a component (control ``gain``)."""
-    evidence_scale: float = parameter(2.0, above=0.0)
-    """Nats that an evidence of one adds to the log-posterior (control ``evidence``)."""
+from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
 
 
 class StateSpaceTruth(NamedTuple):
@@ -88,14 +63,14 @@ class StateSpaceTruth(NamedTuple):
     comes late."""
 
 
-class StateSpaceWorld(World["StateSpace", StateSpaceTruth, StateSpaceMeasurement]):
+class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasurement]):
     """A state that moves by one model, or switches between several."""
 
     parameters: StateSpaceParameters
     received_field: ClassVar[str] = "values"
     cost_remedy: ClassVar[str] = ", give state_space weights= of zero for them"
 
-    def __init__(self, task: "StateSpace") -> None:
+    def __init__(self, task: StateSpaceProblem) -> None:
         super().__init__(task)
         own = task.definition
         self.equations = [Equations(task, model) for model in own.world]
@@ -117,7 +92,7 @@ class StateSpaceWorld(World["StateSpace", StateSpaceTruth, StateSpaceMeasurement
         self.loses = self.parameters.availability < 1.0
         self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
         usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
-        self.receptions = Receptions(task, numpy.sqrt(numpy.diag(usual)))
+        self.receptions = Receptions(task.parameters, task.xp, own.channels, numpy.sqrt(numpy.diag(usual)))
         self.delayed = self.drawn + self.receptions.row_uniforms
         self.delays = self.parameters.late > 0.0
         self.row_uniforms = self.delayed + len(own.channels) * self.delays
@@ -317,7 +292,7 @@ def components_measured(h: VectorFunction) -> list[int | None]:
     return [rows.index(unit) if unit in rows else None for unit in units]
 
 
-class StateSpace(Task):
+class StateSpace(StateSpaceProblem):
     """A state-space model of your own, and the filters that estimate its state.
 
     ## Description
@@ -352,22 +327,9 @@ class StateSpace(Task):
     * v0: first release
     """
 
-    definition: ClassVar[StateSpaceDefinition]
     Parameters = StateSpaceParameters
     World = StateSpaceWorld
     reward = Reward("weighted squared error of the components", "log-relative")
-
-    def set_up(self) -> None:
-        """Put the models that the filters believe on the task's arrays."""
-        own = self.definition
-        self.believed = [Equations(self, model) for model in own.filters]
-        count = len(own.filters)
-        self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
-        self.transition = self.constant([list(row) for row in own.transition])
-
-    def _sampling_interval(self) -> float | None:
-        """Return the time between measurements, s; None where it differs."""
-        return None if self.parameters.jitter > 0.0 else self.parameters.sampling_interval
 
 
 REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}
@@ -375,7 +337,7 @@ REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("ev
 
 
 def _explain_loss(
-    task: StateSpace, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
+    task: StateSpaceProblem, mean: Array, covariance: Array, measurement: StateSpaceMeasurement
 ) -> str:
     """Name the function of the filters' first model that is not finite near an estimate."""
     return task.believed[0].explain_loss(mean, covariance, measurement)
@@ -393,8 +355,6 @@ def state_space_attributes(
         components: of the state.
         defaults: parameters in the training distribution, where they are not those of every such task.
     """
-    from .state_space_banks import StateSpaceKalmanNetBank, bank_tables
-
     banks, actions = bank_tables(len(definition.filters))
     control = next(iter(banks))
     count = {"noise": 2, "evidence": len(definition.filters)}[control]

@@ -36,8 +36,8 @@ from ..contract.observation import (
     nis_block,
     relative_likelihood_block,
 )
-from .equations import Equations
-from .state_space import StateSpace, StateSpaceMeasurement, StateSpaceParameters
+from .equations import Equations, StateSpaceMeasurement, StateSpaceProblem
+from .parameters import StateSpaceParameters
 
 AVERAGED = 0.1
 """Weight of the newest measurement in the averages that are shown."""
@@ -70,12 +70,12 @@ class ExtendedKalmanState(NamedTuple):
     """Of the state by the last update, in deviations of the process noise, ``(n, N)``; None where none sees it."""
 
 
-class StateSpaceBank(Bank[StateSpace, StateSpaceMeasurement, ExtendedKalmanState]):
+class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalmanState]):
     """What the banks with one filter share."""
 
     parameters: StateSpaceParameters
 
-    def __init__(self, task: StateSpace, control: str) -> None:
+    def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
         self.equations: Equations = task.believed[0]
         own = self.equations.model
@@ -233,7 +233,7 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
     written.
     """
 
-    def __init__(self, task: StateSpace, control: str) -> None:
+    def __init__(self, task: StateSpaceProblem, control: str) -> None:
         super().__init__(task, control)
         usual = task.definition.usual_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
@@ -345,7 +345,7 @@ class Mixture(NamedTuple):
     """``(M, N)``."""
 
 
-class MultipleModelBank(Bank[StateSpace, StateSpaceMeasurement, Mixture]):
+class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture]):
     """Control ``evidence``: an interacting multiple model of extended Kalman filters, see :mod:`..filters.imm`.
 
     Args:
@@ -361,7 +361,7 @@ class MultipleModelBank(Bank[StateSpace, StateSpaceMeasurement, Mixture]):
 
     def __init__(
         self,
-        task: StateSpace,
+        task: StateSpaceProblem,
         control: str,
         process_noise: Any = 1.0,
         measurement_noise: Any = 1.0,

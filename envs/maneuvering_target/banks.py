@@ -7,7 +7,7 @@ probabilities (13), averages and gains hold.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -33,10 +33,8 @@ from ..contract.observation import (
     relative_likelihood_block,
 )
 from .parameters import ManeuveringTargetParameters
+from .problem import TargetProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import ManeuveringTarget
 
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
@@ -110,12 +108,12 @@ class Filters(NamedTuple):
     """Position gains used last, ``(M, N)``."""
 
 
-class RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
+class RadarBank(Bank[TargetProblem, Measurement, Any]):
     """What both banks share: the averages that are shown, and the end of the observation."""
 
     parameters: ManeuveringTargetParameters
 
-    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+    def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         self.T = self.parameters.sampling_interval
         self.regular = task.regular
@@ -336,7 +334,7 @@ class FilterBank(RadarBank):
 
     least_interval = LEAST_INTERVAL
 
-    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+    def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         p = self.parameters
         self.count = len(p.gains)
@@ -486,7 +484,7 @@ class FilterBank(RadarBank):
 class GainsBank(FilterBank):
     """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
 
-    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+    def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 

@@ -1,22 +1,20 @@
 """The constant-velocity model of ManeuveringTarget, over the time between two scans, whatever it is."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...filters import kalman
 from ...filters.small_matrices import outer
 from ..contract.filter import Likelihood
 from ..contract.observation import Array
+from .problem import TargetProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import ManeuveringTarget
 
 
 class ConstantVelocityModel:
     """The constant-velocity model in x and y."""
 
-    def __init__(self, task: "ManeuveringTarget") -> None:
+    def __init__(self, task: TargetProblem) -> None:
         self.task, self.parameters, self.xp = task, task.parameters, task.xp
         moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
         self.unmoved = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]

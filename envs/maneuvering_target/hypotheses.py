@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
@@ -23,11 +23,9 @@ from ..contract.observation import (
 )
 from .banks import RadarBank
 from .kalman_net import FRAME, frame_of
+from .problem import TargetProblem
 from .semi_markov import SemiMarkov, SemiMarkovState
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import ManeuveringTarget
 
 GROUPS = ("straight", "ended", "begun", "thrust", "left", "right", "old_thrust", "old_left", "old_right")
 """Of hypotheses whose probabilities are shown: straight flight older than the first age and of the first age,
@@ -59,7 +57,7 @@ class HypothesesBank(SettingsBank, RadarBank):
 
     strong = SemiMarkov
 
-    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+    def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         thrust, *turns = self.own.kinds
         sided = list(zip(self.own.turns, turns, strict=True))

@@ -25,7 +25,7 @@ of them that nobody knows.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -37,10 +37,8 @@ from ..contract.filter import Bank, Initial
 from ..contract.observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, innovation_block, prior_block
 from .banks import SCANS_SHOWN
 from .parameters import ManeuveringTargetParameters
+from .problem import TargetProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import ManeuveringTarget
 
 NOMINAL_ACCELERATION = 1.0
 """Standard deviation of the acceleration without the network, m/s^2, about that of all flights of ``random``."""
@@ -173,13 +171,13 @@ def advance(mean: Array, acceleration: Array, T: Array) -> tuple[Array, Array]:
     return xp.concat([position, (1.0 + faster) * turned[2:4]]), turning
 
 
-class KalmanNetBank(Bank["ManeuveringTarget", Measurement, KalmanNetState]):
+class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
     """An extended Kalman filter whose noises, gain and motion the action sets."""
 
     parameters: ManeuveringTargetParameters
     action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
 
-    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+    def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         # Columns of the identity.
         columns = numpy.eye(4)[:, :, None]

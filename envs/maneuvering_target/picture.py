@@ -27,7 +27,7 @@ from ..drawing.rendering import (
 from .banks import AlphaBeta, Filters
 from .hypotheses import GROUPS, HypothesesState
 from .kalman_net import FRAME
-from .task import ManeuveringTarget
+from .problem import TargetProblem
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
@@ -67,7 +67,7 @@ class ManeuveringTargetPicture(Picture):
     strips_left = 0.545
     strip_columns = 1
 
-    task: ManeuveringTarget
+    task: TargetProblem
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)

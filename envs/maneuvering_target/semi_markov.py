@@ -19,7 +19,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
 from ...filters.ordered_sums import ordered_sum, weighted_sum
@@ -29,10 +29,8 @@ from ..contract.controls import SteerableFilter
 from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .constant_velocity import ConstantVelocityModel
+from .problem import TargetProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import ManeuveringTarget
 
 DURATIONS = (0.0, 0.0, *[1.0] * 10)
 """Relative probabilities of manoeuvres of 1, 2, ... scans in the training distribution."""
@@ -141,7 +139,7 @@ class SemiMarkovState(NamedTuple):
     """With packed covariances."""
 
 
-class SemiMarkov(ConstantVelocityModel, SteerableFilter["ManeuveringTarget", Measurement, SemiMarkovState]):
+class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measurement, SemiMarkovState]):
     """Gaussian sum over straight flight, constant thrust and coordinated turns with the time since each began.
 
     Every hypothesis of kind and age has a Kalman filter, an extended one of the turn, and manoeuvres last as their
@@ -154,7 +152,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter["ManeuveringTarget", Mea
         **changed: fields of the prior.
     """
 
-    def __init__(self, task: "ManeuveringTarget", prior: SemiMarkovPrior = TRAINING, **changed: Any) -> None:
+    def __init__(self, task: TargetProblem, prior: SemiMarkovPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
         self.settings = {
             "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25

@@ -12,7 +12,7 @@ from ..contract.causes import Causes
 from ..contract.companions import Actions, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward, Task
+from ..contract.task import Component, PaperPolicy, Reward
 from . import ID
 from .banks import FilterBank, GainBank, GainsBank
 from .causes import CAUSES
@@ -20,7 +20,7 @@ from .clutter import ReportedTrack
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
 from .parameters import ManeuveringTargetParameters
-from .scans import has_regular_scans
+from .problem import TargetProblem
 from .scenarios import SCENARIOS
 from .student import RadarStudentBank
 from .world import RadarWorld
@@ -33,7 +33,7 @@ def _picture(model: Model) -> Any:
     return PICTURE(model)
 
 
-class ManeuveringTarget(Task):
+class ManeuveringTarget(TargetProblem):
     """Radar tracking of an aircraft that manoeuvres, with fixed-gain filters (Bakulev, Sychev, Nguyen).
 
     ## Description
@@ -157,16 +157,11 @@ class ManeuveringTarget(Task):
         ),
     )
 
-    parameters: ManeuveringTargetParameters
-
     def set_up(self) -> None:
         """Name the hypotheses and the paper's action."""
+        super().set_up()
         count = len(self.parameters.gains)
         self.flights = self.parameters.track_scans
-        self.regular = self.parameters.regular and (
-            self.recording is None or has_regular_scans(self.recording, self.parameters)
-        )
-        """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
         self.closes_loop = self.parameters.cluttered
@@ -174,10 +169,6 @@ class ManeuveringTarget(Task):
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
         """Track about which the radar looks for plots."""
         return ReportedTrack(mean, covariance)
-
-    def _sampling_interval(self) -> float | None:
-        """Return the time between scans, s; None where some miss the target, or come early."""
-        return self.parameters.sampling_interval if self.regular else None
 
 
 TASK = ManeuveringTarget

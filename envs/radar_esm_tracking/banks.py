@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import gymnasium
 import numpy
@@ -31,10 +31,8 @@ from ..contract.observation import (
     within,
 )
 from .parameters import RadarEsmTrackingParameters
+from .problem import RadarEsmProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import RadarEsmTracking
 
 TIME_SHOWN = 60.0
 """Seconds of track that the clock in the observation shows as one."""
@@ -88,12 +86,12 @@ def _design_channels(
     return class_fusion.design_channels(*design_models(parameters), parameters.horizon + 1)
 
 
-class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
+class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     """Every control: one Kalman filter for each class; with class transitions they mix on their weights."""
 
     parameters: RadarEsmTrackingParameters
 
-    def __init__(self, task: "RadarEsmTracking", control: str) -> None:
+    def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
         p, constant = self.parameters, task.constant
         self.forgetting = math.exp(-1.0 / p.averaging_measurements)

@@ -17,7 +17,7 @@ and reading stand in ``maneuvering_target/kalman_net.py``.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -28,10 +28,8 @@ from ...filters.small_matrices import apply, cholesky
 from ..contract.controls import bank_probabilities
 from ..contract.observation import KEPT_AS_LOG, Array, Block, last_action_block
 from .banks import ClassBank
+from .problem import RadarEsmProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import RadarEsmTracking
 
 EVIDENCE = 12.0
 """Nats that an answer of one adds to the logarithm of a class's probability: here nobody explores."""
@@ -73,7 +71,7 @@ class NetFilters(NamedTuple):
 class KalmanNetBank(ClassBank):
     """The paper's filters, whose noises, gains and weights the action sets."""
 
-    def __init__(self, task: "RadarEsmTracking", control: str) -> None:
+    def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
         models, _ = task.design_models(self.parameters)
         classes = range(task.classes)

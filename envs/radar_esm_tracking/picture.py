@@ -21,7 +21,7 @@ from ..drawing.rendering import (
     error_strip,
     grown,
 )
-from .task import RadarEsmTracking
+from .problem import RadarEsmProblem
 
 ACCELERATION = (0.105, 0.555, 0.395, 0.345)
 DECISIONS = (0.105, 0.075, 0.395, 0.38)
@@ -43,7 +43,7 @@ class RadarEsmTrackingPicture(Picture):
     strips_left = 0.56
     strip_columns = 1
 
-    task: RadarEsmTracking
+    task: RadarEsmProblem
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)

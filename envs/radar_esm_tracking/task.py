@@ -7,21 +7,19 @@ theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/sing
 
 from typing import Any
 
-import numpy
-
 from ...extensions import load_present
-from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward, Task
+from ..contract.task import Component, PaperPolicy, Reward
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
 from .kalman_net import KalmanNetBank
 from .parameters import RadarEsmTrackingParameters
+from .problem import RadarEsmProblem
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
 
@@ -44,7 +42,7 @@ def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str
     return own
 
 
-class RadarEsmTracking(Task):
+class RadarEsmTracking(RadarEsmProblem):
     """Radar and ESM fused, the target's class recognised (Ivanov, Seliverstov).
 
     ## Description
@@ -167,36 +165,12 @@ class RadarEsmTracking(Task):
         *load_present(("logs:LOG_FORMAT", "live:LIVE_READER"), __package__),
     )
 
-    parameters: RadarEsmTrackingParameters
-
     def set_up(self) -> None:
-        """Count classes and types, and make the models of the classes."""
-        p = self.parameters
-        self.classes, self.types = len(p.manoeuvrability), len(p.recognition)
-        self.modes = p.class_names
-        self.companions = (Causes(causes_of(p.class_names)), *type(self).companions)
+        """Name the classes, and with them the paper's action and the causes of cost."""
+        super().set_up()
+        self.modes = self.parameters.class_names
+        self.companions = (Causes(causes_of(self.modes)), *type(self).companions)
         self.paper_policy = PaperPolicy("evidence", (0.0,) * self.classes)
-        models, _ = self.design_models(p)
-        self.models = class_fusion.Models(*(self.constant(matrix) for matrix in models))
-
-    @staticmethod
-    def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:
-        """Models of the classes and the covariances that the track starts with, ``(3, 3, M)``."""
-        T = p.sampling_interval
-        Q = []
-        for alpha, sigma in zip(p.manoeuvrability, p.acceleration_sigma, strict=True):
-            noise = singer.process_noise(alpha, sigma, T)
-            if p.process_noise == "acceleration":
-                noise = numpy.diag([0.0, 0.0, noise[2, 2]])
-            Q.append(noise)
-        models = class_fusion.Models(
-            Phi=numpy.stack([singer.transition(alpha, T) for alpha in p.manoeuvrability], axis=-1),
-            Q=numpy.stack(Q, axis=-1),
-            H=numpy.eye(2, 3),
-            R=numpy.diag([p.range_sigma**2, p.range_rate_sigma**2]),
-        )
-        starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
-        return models, numpy.stack(starts, axis=-1)
 
 
 TASK = RadarEsmTracking

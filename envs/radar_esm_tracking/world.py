@@ -1,7 +1,7 @@
 """The target of RadarEsmTracking, the radar that measures it and the ESM station that listens to it."""
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -12,9 +12,7 @@ from ..contract.faults import Disturbance, Disturbances, GaussMarkov, Glint, und
 from ..contract.observation import Array
 from ..contract.world import World
 from .parameters import RadarEsmTrackingParameters
-
-if TYPE_CHECKING:
-    from .task import RadarEsmTracking
+from .problem import RadarEsmProblem
 
 DISTURBANCES: tuple[type[Disturbance], ...] = (Glint,)
 """Of the radar, beside its correlated and coloured errors; a further one comes last, so that episodes stay."""
@@ -94,13 +92,13 @@ class Start(NamedTuple):
     """The measurement of scan 0; its ESM decision is not yet taken in."""
 
 
-class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
+class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     """A target of one class on one range channel, seen by a radar and heard by an ESM station."""
 
     parameters: RadarEsmTrackingParameters
     reading_field = "radar"
 
-    def __init__(self, task: "RadarEsmTracking") -> None:
+    def __init__(self, task: RadarEsmProblem) -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
         self.disturbances = Disturbances.of(task, DISTURBANCES)

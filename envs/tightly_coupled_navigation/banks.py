@@ -11,7 +11,7 @@ estimates, otherwise the matrix is not symmetric.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -35,11 +35,8 @@ from ..contract.observation import (
 )
 from ..contract.task import Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
+from .problem import NavigationProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
-
 
 EFFICIENT = 1.345
 """Threshold that keeps 95 % of the efficiency where the noise is Gaussian (Huber, Robust Statistics, 1981)."""
@@ -96,7 +93,7 @@ class Filters(NamedTuple):
 class SatelliteBank(Bank[Task, Measurement, Any]):
     """What all controls share: what each filter of a bank says by group of sensors, and what comes with it."""
 
-    task: "TightlyCoupledNavigation"
+    task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
     hypotheses: Sequence[str] = HYPOTHESES
 

@@ -7,16 +7,14 @@ alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="k
 """
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
 from ..contract.draws import Draws, draw_between
 from ..contract.observation import Array
 from .parameters import DEGREE, LINE, REST, SINGER
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
+from .problem import NavigationProblem
 
 
 class Legs(NamedTuple):
@@ -37,7 +35,7 @@ class Course:
         task: the problem, with parameters and models.
     """
 
-    def __init__(self, task: "TightlyCoupledNavigation") -> None:
+    def __init__(self, task: NavigationProblem) -> None:
         self.task, self.parameters, self.xp = task, task.parameters, task.xp
         self.singer_root = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
 

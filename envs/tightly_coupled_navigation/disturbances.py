@@ -1,16 +1,14 @@
 """What may go wrong with the sensors of TightlyCoupledNavigation: a class for each."""
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import gnss_ins
 from ..contract.causes import Cause, Moment, context_flag
 from ..contract.draws import Draws, draw_between
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput, undisturbed
 from ..contract.observation import Array
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
+from .problem import NavigationProblem
 
 QUANTILE_95 = 1.6448536269514722
 """Of the standard normal distribution."""
@@ -51,7 +49,7 @@ def _is_pulled(moment: Moment) -> Array | None:
 class _OfSatellites(Disturbance):
     """What concerns satellites, S of them; pseudoranges come first in the readings, then their rates."""
 
-    def __init__(self, task: "TightlyCoupledNavigation") -> None:
+    def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
         self.task, self.satellites = task, task.satellites
         self.places = task.constant(range(task.satellites))[:, None]
@@ -216,7 +214,7 @@ class LostRates(_Once):
 class RangeColour(ColouredErrors):
     """Errors of the pseudoranges that last: diffuse multipath, atmosphere, ephemerides."""
 
-    def __init__(self, task: "TightlyCoupledNavigation") -> None:
+    def __init__(self, task: NavigationProblem) -> None:
         p = task.parameters
         super().__init__(task, p.sampling_interval, task.satellites, p.pseudorange_coloured[1] > 0.0)
 
@@ -262,7 +260,7 @@ class Reflections(_OfSatellites):
 
     name = "reflections"
 
-    def __init__(self, task: "TightlyCoupledNavigation") -> None:
+    def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
         self.row_uniforms = self.satellites if self.parameters.urban else 0
         self.normals = 2 * self.row_uniforms

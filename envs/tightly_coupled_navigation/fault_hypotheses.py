@@ -33,7 +33,7 @@ their levels, of accelerometers. Where a rate is missing its levels stay what th
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -44,10 +44,8 @@ from ..contract.controls import SteerableFilter
 from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .parameters import LINE, REST, SINGER
+from .problem import NavigationProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
 
 LEAST_PROBABILITY = 1e-30
 """Of constant velocity: what is merged has weights that are never zero by zero."""
@@ -175,7 +173,7 @@ class FaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class FaultHypotheses(SteerableFilter["TightlyCoupledNavigation", Measurement, FaultState]):
+class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState]):
     """Extended Kalman filters over the motion, with errors of pseudoranges and levels of rates.
 
     Args:
@@ -184,9 +182,7 @@ class FaultHypotheses(SteerableFilter["TightlyCoupledNavigation", Measurement, F
         **changed: fields of the prior.
     """
 
-    def __init__(
-        self, task: "TightlyCoupledNavigation", prior: FaultPrior = TRAINING, **changed: Any
-    ) -> None:
+    def __init__(self, task: NavigationProblem, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
         self.settings = {
             "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,

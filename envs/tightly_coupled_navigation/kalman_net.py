@@ -18,7 +18,7 @@ noise of the motion. References and reading stand in ``maneuvering_target/kalman
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy
 
@@ -28,10 +28,8 @@ from ..contract.filter import Initial
 from ..contract.observation import KEPT_AS_LOG, Array, Block
 from .banks import Filters, Prediction, RobustBank
 from .parameters import HYPOTHESES, SINGER
+from .problem import NavigationProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
 
 MANOEUVRE_RANGE = 30.0
 """Largest factor and divisor of the deviation of the acceleration."""
@@ -47,7 +45,7 @@ class KalmanNetBank(RobustBank):
     hypotheses = HYPOTHESES[SINGER:]
     reach: float = 1.0  # it learns through the filter, and does not explore
 
-    def __init__(self, task: "TightlyCoupledNavigation", control: str) -> None:
+    def __init__(self, task: NavigationProblem, control: str) -> None:
         super().__init__(task, control)
         only = slice(SINGER, SINGER + 1)
         model = task.models[SINGER]

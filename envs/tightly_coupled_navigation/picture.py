@@ -10,7 +10,7 @@ from ...filters import gnss_ins
 from ..contract.model import Episode, Model
 from ..drawing.rendering import BLACK, BLUE, CURVES, FIGURE_SIZE, PALE, History, Picture, Strip, grown
 from .parameters import HYPOTHESES, LINE, REST, SINGER
-from .task import TightlyCoupledNavigation
+from .problem import NavigationProblem
 
 COURSE = (0.065, 0.53, 0.43, 0.37)
 MOTION = (0.125, 0.29, 0.37, 0.15)
@@ -38,7 +38,7 @@ class TightlyCoupledNavigationPicture(Picture):
     strips_left = 0.56
     strip_columns = 1
 
-    task: TightlyCoupledNavigation
+    task: NavigationProblem
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)

@@ -12,17 +12,15 @@ before the readings weigh them by their densities. Between houses, where reflect
 """
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ...filters import imm, range_errors
 from ...filters.ordered_sums import weighted_sum
 from ..contract.filter import Filter, FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .fault_hypotheses import TRAINING, FaultHypotheses, FaultPrior, FaultState
+from .problem import NavigationProblem
 from .world import Measurement
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
 
 
 class OneFault(FaultHypotheses):
@@ -35,7 +33,7 @@ class OneFault(FaultHypotheses):
         walk: m, standard deviation of a step of its error in a second.
     """
 
-    def __init__(self, task: "TightlyCoupledNavigation", prior: FaultPrior, wrong: int, walk: float) -> None:
+    def __init__(self, task: NavigationProblem, prior: FaultPrior, wrong: int, walk: float) -> None:
         super().__init__(task, prior)
         self.wrong, self.walk = wrong, task.constant(walk**2 * task.common.T)
 
@@ -66,7 +64,7 @@ class SatelliteFaultState(NamedTuple):
     likelihood: Likelihood
 
 
-class SatelliteFaults(Filter["TightlyCoupledNavigation", Measurement, SatelliteFaultState]):
+class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState]):
     """`fault-hypotheses`, and a copy of it for a fault of each pseudorange that jumps and walks off to the end.
 
     Args:
@@ -79,7 +77,7 @@ class SatelliteFaults(Filter["TightlyCoupledNavigation", Measurement, SatelliteF
 
     def __init__(
         self,
-        task: "TightlyCoupledNavigation",
+        task: NavigationProblem,
         prior: FaultPrior = TRAINING,
         begins: float = 0.05,
         walk: float = 3.0,

@@ -18,21 +18,20 @@ step 3 in :mod:`.banks`.
 
 from typing import Any
 
-import numpy
-
 from ...extensions import load_present
-from ...filters import gnss_ins, satellites
+from ...filters import gnss_ins
 from ..contract.causes import Causes
 from ..contract.companions import Actions, ArrayMeanings, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward, Task
+from ..contract.task import Component, PaperPolicy, Reward
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
 from .hypotheses import FaultHypothesesBank
 from .kalman_net import KalmanNetBank
-from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
+from .parameters import HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
+from .problem import NavigationProblem
 from .scenarios import SCENARIOS
 from .world import NavigationWorld
 
@@ -44,7 +43,7 @@ def _picture(model: Model) -> Any:
     return PICTURE(model)
 
 
-class TightlyCoupledNavigation(Task):
+class TightlyCoupledNavigation(NavigationProblem):
     """Steer a bank of extended Kalman filters over pseudoranges, their rates, and inertial sensors.
 
     ## Description
@@ -183,58 +182,6 @@ class TightlyCoupledNavigation(Task):
         ),
         *load_present(("live:LIVE_READER",), __package__),
     )
-
-    parameters: TightlyCoupledNavigationParameters
-
-    def set_up(self) -> None:
-        """List the sensors, tabulate the satellites and discretise the models."""
-        p, constant = self.parameters, self.constant
-        T = p.sampling_interval
-        self.closes_loop = bool(p.aperture)
-        self.satellites = len(p.satellites)
-        self.sensors = p.sensors
-        each = [s for s in self.sensors for _ in range(s.readings.start, s.readings.stop)]
-        self.sensor_sigma = constant([s.sigma for s in each])[:, None]
-        self.sensor_variance = [s.sigma**2 for s in each]
-        apertures = [s.aperture for s in each if s.aperture is not None]
-        self.apertures = constant(apertures)[:, None]
-        self.tracked = slice(0, len(apertures))
-        """Readings that tracking loops make: pseudoranges and rates."""
-
-        times = p.epoch + T * numpy.arange(p.horizon + 2)
-        local, velocity = satellites.local_orbits(p.satellites, times, *p.site)
-        self._satellite_position = constant(local)
-        self._satellite_velocity = constant(velocity)
-
-        self.common = gnss_ins.common_model(
-            T,
-            p.frequency_density,
-            p.frequency_walk_density,
-            p.angle_walk * DEGREE,
-            p.attitude_rate_sigma * DEGREE,
-            p.attitude_rate_time,
-        )
-        self.models = (
-            gnss_ins.rest_model(T, p.rest_velocity_sigma, p.reset_acceleration_sigma),
-            gnss_ins.constant_velocity_model(T, p.increment_sigma, p.reset_acceleration_sigma),
-            gnss_ins.singer_model(T, p.singer_alpha, p.singer_sigma),
-        )
-        self.axis = constant(numpy.stack([m.transition for m in self.models], axis=-1)[..., None])
-        noises = [gnss_ins.process_noise(m, self.common) for m in self.models]
-        self.process_noise = constant(numpy.stack(noises, axis=-1)[..., None])
-        self.transition = constant(p.transition)
-
-    def _row(self, number: Array) -> Array:
-        """Where a measurement stands in the tables; an episode that is over stays at the end."""
-        return self.xp.clip(number, None, self.horizon + 1)
-
-    def satellites_at(self, number: Array) -> tuple[Array, Array]:
-        """Positions, m, and velocities, m/s, of the satellites at a measurement, ``(3, S, N)`` each."""
-        row = self._row(number)
-        return (
-            self.xp.take(self._satellite_position, row, axis=2),
-            self.xp.take(self._satellite_velocity, row, axis=2),
-        )
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> Array:
         """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""

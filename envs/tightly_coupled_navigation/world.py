@@ -3,7 +3,7 @@ is a part of its own (:mod:`.course`).
 """
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -18,9 +18,7 @@ from ..contract.world import World
 from .course import Course, Legs
 from .disturbances import DISTURBANCES, DRAWN_FIRST
 from .parameters import DEGREE, SINGER, TightlyCoupledNavigationParameters
-
-if TYPE_CHECKING:
-    from .task import TightlyCoupledNavigation
+from .problem import NavigationProblem
 
 KNOWN_AT_START = (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) * 6
 """One for what is exact and known with errors, position, velocity and acceleration; clock and attitude errors
@@ -76,7 +74,7 @@ class Measurement(NamedTuple):
 class NavigationWorld(World[Task, Truth, Measurement]):
     """An aircraft with a satellite receiver and an inertial system."""
 
-    task: "TightlyCoupledNavigation"
+    task: NavigationProblem
     parameters: TightlyCoupledNavigationParameters
     received_field = "readings"
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -26,10 +26,8 @@ from ..contract.observation import (
     last_action_block,
 )
 from .parameters import UavAutopilotParameters
+from .problem import AutopilotProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
 
 MODES = ("nominal", "wide-band", "raw-sensors", "over-smoothed")
 FLOORED_LOG = Compression(
@@ -67,7 +65,7 @@ class KalmanState(NamedTuple):
     """Short average of the NIS, ``(N,)``."""
 
 
-class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
+class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
     """What all controls share: the innovations that are shown, and what comes with them."""
 
     parameters: UavAutopilotParameters
@@ -75,7 +73,7 @@ class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
     no_action: tuple[float, ...]
     """What is shown as the last action before the first."""
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         constant, n, m = task.constant, len(task.components), len(task.sensors)
         self.sensor_identity = constant(numpy.eye(m)[:, :, None])
@@ -210,7 +208,7 @@ class AutopilotBank(Bank["UavAutopilot", Measurement, Any]):
 class _KalmanBank(AutopilotBank):
     """One Kalman filter: a subclass says what an action does to its noises."""
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         constant, n = task.constant, len(task.components)
         model, pack = task.design.model, packed_covariance.pack
@@ -334,7 +332,7 @@ class GainBank(_KalmanBank):
 class NoiseBank(_KalmanBank):
     """Control ``noise``: the action scales the process noise and the noise of every sensor."""
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         self.no_action = (0.0,) * (1 + len(task.sensors))
         self.nominal_variances = task.constant(task.sensor_variances)[:, None]
@@ -369,7 +367,7 @@ class ModeBank(_KalmanBank):
     action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
     no_action = (1.0, 0.0, 0.0, 0.0)
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         # Of raw readings it is the covariance of their nominal noise; a coordinate without a sensor, taken as
         # zero, has the stationary variance of the nominal loop.

@@ -1,15 +1,13 @@
 """What may go wrong with the sensors of UavAutopilot: a class for each. Nobody says any of it but that one answers."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
 from ..contract.draws import Draws, StepSignal, within
 from ..contract.faults import ColouredErrors, ColouredErrorsState, Disturbance, DisturbanceInput
 from ..contract.observation import Array
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
+from .problem import AutopilotProblem
 
 RAISED = 2.0
 """Factor on a nominal noise from which it is raised."""
@@ -39,7 +37,7 @@ def draw_steps(
 class _OfSensors(Disturbance):
     """What concerns each of m sensors, or those that are named."""
 
-    def __init__(self, task: "UavAutopilot") -> None:
+    def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
         self.task, self.count = task, len(task.sensors)
         self.sigmas = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
@@ -169,7 +167,7 @@ class SensorBias(_OfSensors):
 class SensorColour(ColouredErrors):
     """Errors of the sensors that last."""
 
-    def __init__(self, task: "UavAutopilot") -> None:
+    def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
         super().__init__(task, p.value("sampling_interval"), len(task.sensors), p.sensor_coloured[1] > 0.0)
         self.sigmas = task.constant(p.value("sensor_sigmas"))[:, None]

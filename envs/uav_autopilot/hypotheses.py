@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import LevelHypotheses
@@ -22,10 +22,8 @@ from ..contract.observation import (
 )
 from .banks import AutopilotBank
 from .level_bank import LevelBank, Levels, grid
+from .problem import AutopilotProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
 
 
 class HypothesesState(NamedTuple):
@@ -66,7 +64,7 @@ class HypothesesBank(SettingsBank, AutopilotBank):
 
     strong = LevelBank
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         prior = self.own.prior
         self.names = ("designed", *(f"level_{i}" for i in range(1, prior.gust_points + 1)))

@@ -17,7 +17,7 @@ alone, because they are known here.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -25,10 +25,8 @@ import numpy
 from ...filters import packed_covariance
 from ..contract.observation import SIGNED_LOG, Array, Block, last_action_block
 from .banks import NoiseBank
+from .problem import AutopilotProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
 
 AGILITY = 5.0
 """Largest factor and divisor of the disturbances' deviations in the gain alone."""
@@ -59,7 +57,7 @@ class NetFilter(NamedTuple):
 class KalmanNetBank(NoiseBank):
     """The paper's filter, whose noises and gain the action sets."""
 
-    def __init__(self, task: "UavAutopilot", control: str) -> None:
+    def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         model, sensors = task.design.model, task.sensors
         parts = {"disturbance": model.scaled_noise, "other": model.other_noise}

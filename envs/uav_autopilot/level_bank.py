@@ -20,7 +20,7 @@ other probabilities of a change would; Q is the process noise of the hypothesis,
 """
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -31,10 +31,8 @@ from ..contract.controls import SteerableFilter
 from ..contract.filter import FilterInput, Initial, Likelihood
 from ..contract.observation import Array
 from .plant import Plant, pitch_channel
+from .problem import AutopilotProblem
 from .world import Measurement, Start
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
 
 
 class Kind(NamedTuple):
@@ -122,7 +120,7 @@ def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, x
     return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
-class LevelBank(SteerableFilter["UavAutopilot", Measurement, Levels]):
+class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
     """Gaussian sum over levels of gusts and sensors that switch at unknown times, merged like an IMM.
 
     Args:
@@ -131,7 +129,7 @@ class LevelBank(SteerableFilter["UavAutopilot", Measurement, Levels]):
         **changed: fields of the prior that differ.
     """
 
-    def __init__(self, task: "UavAutopilot", prior: LevelPrior = TRAINING, **changed: Any) -> None:
+    def __init__(self, task: AutopilotProblem, prior: LevelPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
         self.prior = prior = prior._replace(**changed)
         p, constant, n = task.parameters, task.constant, len(task.components)
@@ -291,7 +289,7 @@ class _KindModel:
     """
 
     def __init__(
-        self, task: "UavAutopilot", kind: Kind, sigmas: numpy.ndarray, levels: numpy.ndarray
+        self, task: AutopilotProblem, kind: Kind, sigmas: numpy.ndarray, levels: numpy.ndarray
     ) -> None:
         p, n, errors = task.parameters, len(task.components), len(sigmas)
         plant: Plant = task.design.model if kind.lag == 1.0 else pitch_channel(p, kind.lag)

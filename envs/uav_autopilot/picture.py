@@ -7,7 +7,7 @@ from ..contract.model import Episode, Model
 from ..drawing.rendering import Picture, Strip, error_strip
 from .banks import MODES, AutopilotBank, KalmanState
 from .hypotheses import HypothesesBank, HypothesesState
-from .task import UavAutopilot
+from .problem import AutopilotProblem
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
 GUSTS = ("designed", "weaker", "stronger")
@@ -21,7 +21,7 @@ class UavAutopilotPicture(Picture):
 
     strip_columns = 2
 
-    task: UavAutopilot
+    task: AutopilotProblem
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)

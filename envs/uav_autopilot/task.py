@@ -24,14 +24,14 @@ from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import PaperPolicy, Reward, Task
+from ..contract.task import PaperPolicy, Reward
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
 from .hypotheses import HypothesesBank
 from .kalman_net import KalmanNetBank
-from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
-from .plant import design
+from .parameters import COORDINATES, UavAutopilotParameters
+from .problem import AutopilotProblem
 from .scenarios import SCENARIOS
 from .world import AircraftWorld, Measurement, Start
 
@@ -48,7 +48,7 @@ def _records(model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str
     return {"control_signal": model.feedback(episode.filter, episode.measurement)}
 
 
-class UavAutopilot(Task):
+class UavAutopilot(AutopilotProblem):
     """Steer the Kalman filter that feeds the autopilot of a small unmanned aircraft.
 
     ## Description
@@ -163,43 +163,9 @@ class UavAutopilot(Task):
         *load_present(("live:LIVE_READER",), __package__),
     )
 
-    parameters: UavAutopilotParameters
-
-    def set_up(self) -> None:
-        """Design the loop."""
-        p = self.parameters
-        self.design = design(p)
-        self.components = COORDINATES[p.plant]
-        names = [c.name for c in self.components]
-        self.sensors: tuple[str, ...] = p.value("sensors")
-        self.measured = tuple(names.index(sensor) for sensor in self.sensors)
-        """Coordinate that each sensor reads."""
-        self.output = names.index(OUTPUT[p.plant])
-        """Coordinate that the command is for."""
-        sigmas = dict(zip(self.sensors, p.value("sensor_sigmas"), strict=True))
-        self.sensor_variances = tuple(float(sigma) ** 2 for sigma in sigmas.values())
-        """Nominal, of each sensor."""
-        self.output_sigma = float({**NOMINAL_SIGMAS[p.plant], **sigmas}[OUTPUT[p.plant]])
-        """Nominal sigma of the output's sensor; of its default where the output is not measured."""
-        self.cost_unit = self.output_sigma**2
-        """What a cost of one is in units of the weighted squares, for comparison with theory."""
-        self._L = self.constant(self.design.feedback)
-
-    def _sampling_interval(self) -> float:
-        """Return what was left to the plant too, s."""
-        return float(self.parameters.value("sampling_interval"))
-
-    def autopilot(self, estimate: Array, command: Array) -> Array:
-        """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
-        return self.design.feedforward * command - self.xp.matmul(self._L, estimate)[0]
-
     def feedback(self, mean: Array, covariance: Array, measurement: Measurement | Start) -> Array:
         """Report the control that follows from an estimate, ``(N,)``."""
         return self.autopilot(mean, measurement.command)
-
-    def readings_of(self, state: Array) -> Array:
-        """Measured coordinates of ``(n, N)``, ``(m, N)``."""
-        return self.xp.stack([state[i] for i in self.measured])
 
 
 TASK = UavAutopilot

@@ -1,7 +1,7 @@
 """The aircraft of UavAutopilot, what disturbs it, and its sensors; equations (8) and (9)."""
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -12,9 +12,7 @@ from ..contract.observation import Array
 from ..contract.world import World
 from .disturbances import DISTURBANCES, DRAWN_FIRST, draw_steps
 from .parameters import UavAutopilotParameters
-
-if TYPE_CHECKING:
-    from .task import UavAutopilot
+from .problem import AutopilotProblem
 
 FARTHEST = 1e4
 """Where a coordinate of a lost loop stops, in its own unit: far beyond what any stable loop reaches, and
@@ -73,13 +71,13 @@ class Measurement(NamedTuple):
     """u in force since the measurement before: what was fed back, m/s^2 (plant P) or deg (U), ``(N,)``."""
 
 
-class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
+class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
     """An aircraft that is flown by what is fed back, its gusts, and its sensors."""
 
     parameters: UavAutopilotParameters
     received_field = "reading"
 
-    def __init__(self, task: "UavAutopilot") -> None:
+    def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
         p, constant, plant = self.parameters, task.constant, task.design.true_model
         scaled, other = (

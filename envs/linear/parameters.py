@@ -1,0 +1,37 @@
+"""Every constant of a task of state-space models beside its models, with its limits."""
+
+from dataclasses import dataclass
+
+from ..contract.parameters import TaskParameters, parameter
+
+
+@dataclass(frozen=True)
+class StateSpaceParameters(TaskParameters):
+    """Parameters of every task of state-space models."""
+
+    sampling_interval: float = parameter(1.0, above=0.0)
+    """Time between measurements, s; of a timed model on average."""
+    jitter: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Share of the sampling interval by which the interval before a measurement differs at most, of a timed model."""
+    process_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """Limits of the factor by which the true Q differs from the model's, drawn log-uniformly for every episode."""
+    measurement_noise: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """Likewise of R."""
+    availability: float = parameter(1.0, at_least=0.0, at_most=1.0)
+    """Probability that a measurement is received."""
+    gaps: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Probability at a measurement that a gap of a sensor begins, in which it says nothing; of each sensor."""
+    gap_length: float = parameter(10.0, at_least=1.0)
+    """Measurements in a gap, on average."""
+    bias: float = parameter(0.0, at_least=0.0)
+    """Offset of one sensor, up or down, in standard deviations of its noise."""
+    late: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Probability that what a sensor says comes late, of each sensor."""
+    lateness: int = parameter(3, at_least=1, at_most=20)
+    """Measurements after its own with which it then comes."""
+    noise_decades: float = parameter(2.0, above=0.0)
+    """Decades by which an action of one scales Q or R (control ``noise``)."""
+    gain_factor: float = parameter(4.0, above=1.0)
+    """Factor by which an action of one multiplies the gain of a component (control ``gain``)."""
+    evidence_scale: float = parameter(2.0, above=0.0)
+    """Nats that an evidence of one adds to the log-posterior (control ``evidence``)."""

@@ -1,0 +1,22 @@
+"""What world, filters and picture of ManeuveringTarget use of their task."""
+
+from ..contract.task import Task
+from .parameters import ManeuveringTargetParameters
+from .scans import has_regular_scans
+
+
+class TargetProblem(Task):
+    """The radar's parameters, and whether its scans are regular."""
+
+    parameters: ManeuveringTargetParameters
+
+    def set_up(self) -> None:
+        """Find out whether the scans are regular."""
+        self.regular = self.parameters.regular and (
+            self.recording is None or has_regular_scans(self.recording, self.parameters)
+        )
+        """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
+
+    def _sampling_interval(self) -> float | None:
+        """Return the time between scans, s; None where some miss the target, or come early."""
+        return self.parameters.sampling_interval if self.regular else None

@@ -1,0 +1,39 @@
+"""What world, filters and picture of RadarEsmTracking use of their task: counts and models of the classes."""
+
+import numpy
+
+from ...filters import class_fusion, singer
+from ..contract.task import Task
+from .parameters import RadarEsmTrackingParameters
+
+
+class RadarEsmProblem(Task):
+    """Classes and emitter types, and the motion and measurement of a target of each class."""
+
+    parameters: RadarEsmTrackingParameters
+
+    def set_up(self) -> None:
+        """Count classes and types, and make the models of the classes."""
+        p = self.parameters
+        self.classes, self.types = len(p.manoeuvrability), len(p.recognition)
+        models, _ = self.design_models(p)
+        self.models = class_fusion.Models(*(self.constant(matrix) for matrix in models))
+
+    @staticmethod
+    def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:
+        """Models of the classes and the covariances that the track starts with, ``(3, 3, M)``."""
+        T = p.sampling_interval
+        Q = []
+        for alpha, sigma in zip(p.manoeuvrability, p.acceleration_sigma, strict=True):
+            noise = singer.process_noise(alpha, sigma, T)
+            if p.process_noise == "acceleration":
+                noise = numpy.diag([0.0, 0.0, noise[2, 2]])
+            Q.append(noise)
+        models = class_fusion.Models(
+            Phi=numpy.stack([singer.transition(alpha, T) for alpha in p.manoeuvrability], axis=-1),
+            Q=numpy.stack(Q, axis=-1),
+            H=numpy.eye(2, 3),
+            R=numpy.diag([p.range_sigma**2, p.range_rate_sigma**2]),
+        )
+        starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
+        return models, numpy.stack(starts, axis=-1)
