@@ -106,8 +106,8 @@ def _temporary_folder(tmp_path_factory):
         own.mkdir()
         patch.setenv("TMPDIR", str(own))
         patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
-        # Stable-Baselines3 leaves a folder for every model that learns without a logger, Torch a cache, Ray its logs.
-        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR", "RAY_TMPDIR"):
+        # Stable-Baselines3 leaves a folder for every model that learns without a logger, Torch a cache, Ray logs, Dask space.
+        for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR", "RAY_TMPDIR", "DASK_TEMPORARY_DIRECTORY"):
             patch.setenv(variable, str(of_libraries))
         yield
         left = sorted(path.name for path in own.iterdir())
