@@ -106,7 +106,7 @@ def _temporary_folder(tmp_path_factory):
         own.mkdir()
         patch.setenv("TMPDIR", str(own))
         patch.setattr(tempfile, "tempdir", None)  # from the variable at its next use
-        # Stable-Baselines3 leaves a folder for every model that learns without a logger, Torch a cache, Ray and Dask logs.
+        # Stable-Baselines3 leaves a folder for each model without a logger, Torch a cache, Ray and Dask their logs.
         for variable in ("SB3_LOGDIR", "TORCHINDUCTOR_CACHE_DIR", "RAY_TMPDIR", "DASK_TEMPORARY_DIRECTORY"):
             patch.setenv(variable, str(of_libraries))
         yield
