@@ -7,6 +7,7 @@ from typing import Any
 from ..baselines.problem import Problem
 from ..envs.contract.companions import action_reach
 from ..envs.contract.task import Task
+from ..envs.data.foreign_files import is_folder
 from ..evaluation.competitors.kinds import Competitor, CompetitorFiles
 from .gate import PolicyMaker, as_trained
 from .learned_policy import load_policy, pretrained_path
@@ -34,7 +35,7 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
     path = Path(name)
-    if _is_folder(path):
+    if is_folder(path):
         return _agent_of_run(cls, path, trust)
     if name.endswith(".safetensors"):
         return load_policy(cls, path)
@@ -45,14 +46,6 @@ def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     return (
         _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
     )
-
-
-def _is_folder(path: Path) -> bool:
-    """Whether there is a folder of this name; not for a name that no folder can have."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
 
 
 def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:

@@ -108,6 +108,14 @@ def _size(count: int) -> str:
     return f"{count / 1e9:g} GB" if count >= 1e9 else f"{count / 1e6:g} MB"
 
 
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder of this name; not for a name that no folder can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
+
+
 def read_content(path: Path, most: int | None = None) -> bytes:
     """Return the bytes of a file.
 

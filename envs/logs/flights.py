@@ -22,6 +22,7 @@ import numpy
 
 from ...filters.geodesy import east_north
 from ..contract.parameters import ParameterLimits, check, quote_shortened
+from ..data.foreign_files import is_folder
 from ..data.scenario_data import FlightData
 from ..data.trajectory import Trajectory, trajectory_of
 from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
@@ -189,14 +190,6 @@ def names_flights(source: Any) -> bool:
         is_path = bool(suffix_of(Path(source))) or glob.has_magic(source) or is_folder(Path(source))
         return bool(source) and is_path
     return isinstance(source, list | tuple) and len(source) > 0
-
-
-def is_folder(path: Path) -> bool:
-    """Whether there is a folder of this name; not for a name that no folder can have."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):  # a name that no file can have
-        return False
 
 
 TRAFFIC = "traffic:"

@@ -42,7 +42,7 @@ class Competitor(NamedTuple):
     identity: str | None = None
     """Words that change whenever the maker does; None where nothing says whether it is what it was."""
     log: Any = None
-    """How the log was read that the competitor was fitted to (:class:`.baselines.fitted_filters.LogSetup`), or None."""
+    """How the log was read that the competitor was fitted to (:class:`.envs.contract.log_format.LogSetup`), or None."""
 
 
 class CompetitorFiles(NamedTuple):

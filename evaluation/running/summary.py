@@ -222,9 +222,10 @@ def summaries(
             :func:`.evaluate.run_experiment`.
     """
     store = store or Store()
+    work = [one.work() for one in asked]
     missing = []
     for i, one in enumerate(asked):
-        found = store.read(one.work(), Summary)
+        found = store.read(work[i], Summary)
         if found is None:
             missing.append(i)
             continue
@@ -232,7 +233,7 @@ def summaries(
             progress(one.measurements)
         yield i, found
     for i, found in _summarise(asked, missing, workers, progress):
-        store.write(asked[i].work(), found)
+        store.write(work[i], found)
         yield i, found
 
 
@@ -323,8 +324,8 @@ def run_requests(
 
     Args:
         asked: one request for each.
-        workers: who does it.
-        progress: told of measurements done.
+        workers: share the work.
+        progress: called with the number of measurements done.
         store: as of :func:`summaries`.
         whole: keep every number of every episode; flights and recordings have no summary.
 
