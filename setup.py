@@ -10,12 +10,24 @@ import tarfile
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents")
 FRONT = find_packages("filtergym", exclude=("papers", "papers.*", *ROOMS, *(f"{room}.*" for room in ROOMS)))
 """What is found in the folder ``filtergym`` itself: the rooms are links there, and papers are not installed."""
-DATE = int(os.environ.setdefault("SOURCE_DATE_EPOCH", "1767225600"))  # 1 January 2026; the wheel reads it, too
+DATE = int(
+    os.environ.setdefault("SOURCE_DATE_EPOCH", "1767225600")
+)  # 1 January 2026; the wheel reads it, too
+os.umask(0o022)  # a wheel keeps the permissions of what is written here
+
+
+class ReproducibleBuild(build_py):
+    """Files of the wheel, with permissions that are not those of the checkout."""
+
+    def copy_file(self, infile, outfile, preserve_mode=True, *more, **named):  # type: ignore[no-untyped-def]
+        """Copy a file, but not its permissions."""
+        return super().copy_file(infile, outfile, False, *more, **named)
 
 
 def without_machine(member: tarfile.TarInfo) -> tarfile.TarInfo:
@@ -45,7 +57,7 @@ class ReproducibleSource(sdist):
 
 
 setup(
-    cmdclass={"sdist": ReproducibleSource},
+    cmdclass={"build_py": ReproducibleBuild, "sdist": ReproducibleSource},
     packages=[
         *("filtergym", *(f"filtergym.{name}" for name in FRONT)),
         *(f"filtergym.{room}" for room in ROOMS),
