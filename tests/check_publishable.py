@@ -96,7 +96,7 @@ def check_types(folder: Path) -> str:
 def rate(tools: Path) -> str:
     """Return pyroma's rating, and what it misses."""
     text = run([tools / "pyroma", "--min=8", "."])
-    missed = [line for line in re.findall(r"-{5,}\n(.*)\n-{5,}", text, re.S)[0].splitlines() if line.strip()]
+    missed = [line for line in re.split(r"-{5,}", text)[1].splitlines() if line.strip()]
     other = [line for line in missed if not LACKING.search(line)]
     assert not other, other
     return f"{re.findall(r'rating: (.*)', text)[0]}; no address of authors or repository yet"
@@ -116,8 +116,8 @@ def main() -> None:
         "check-wheel-contents": lambda: run([tools / "check-wheel-contents", folder / "first-distributions"]),
         "validate-pyproject": lambda: run([tools / "validate-pyproject", "pyproject.toml"]),
         "cffconvert": lambda: run([tools / "cffconvert", "--validate"]),
-        "repo-review": lambda: run([tools / "repo-review", ".", "--format", "html"])[:0],
-        "zizmor": lambda: run([tools / "zizmor", "--offline", "--min-severity", "medium", ".github"]),
+        "repo-review": lambda: f"{run([tools / 'repo-review', '.']).count('✅')} checks",
+        "zizmor": lambda: run([tools / "zizmor", "--offline", "--quiet", "--min-severity", "medium", ".github"]),
         "pyroma": lambda: rate(tools),
         "reuse": lambda: run([tools / "reuse", "lint"]),
         "types": lambda: check_types(folder),
@@ -126,10 +126,10 @@ def main() -> None:
     for name, check in checks.items():
         try:
             words = [line for line in COLOURS.sub("", check()).splitlines() if line.strip()]
-            print(f"{name:22} passed  {words[-1].strip() if words else ''}", flush=True)
+            print(f"{name:20} passed  {words[-1].strip() if words else ''}", flush=True)
         except AssertionError as error:
             failed += 1
-            print(f"{name:22} FAILED  {error}", flush=True)
+            print(f"{name:20} FAILED  {error}", flush=True)
     raise SystemExit(1 if failed else 0)
 
 
