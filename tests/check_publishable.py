@@ -12,6 +12,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import venv
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -93,10 +94,24 @@ def check_types(folder: Path) -> str:
     return f"{share:.1%} of all names, all of {' and '.join(PUBLIC)}"
 
 
+def compare_recipe() -> str:
+    """The conda recipe asks for what pyproject.toml asks for, with the same bounds."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = {*project["dependencies"], *project["optional-dependencies"]["fast"]}
+    lines = re.findall(
+        r"^    - ([\w-]+) >=([\d.]+)", (ROOT / "conda" / "recipe.yaml").read_text(encoding="utf-8"), re.M
+    )
+    given = {f"{name.removesuffix('-base')}>={bound}" for name, bound in lines if name != "python"}
+    assert given == wanted, sorted(given ^ wanted)
+    return f"{len(given)} requirements"
+
+
 def rate(tools: Path) -> str:
     """Return pyroma's rating, and what it misses."""
     text = run([tools / "pyroma", "--min=8", "."])
-    missed = [line for line in re.split(r"-{5,}", text)[1].splitlines() if line.strip()]
+    missed = [
+        line for line in re.split(r"-{5,}", text.split("Found filtergym")[1])[1].splitlines() if line.strip()
+    ]
     other = [line for line in missed if not LACKING.search(line)]
     assert not other, other
     return f"{re.findall(r'rating: (.*)', text)[0]}; no address of authors or repository yet"
@@ -116,8 +131,11 @@ def main() -> None:
         "check-wheel-contents": lambda: run([tools / "check-wheel-contents", folder / "first-distributions"]),
         "validate-pyproject": lambda: run([tools / "validate-pyproject", "pyproject.toml"]),
         "cffconvert": lambda: run([tools / "cffconvert", "--validate"]),
+        "conda recipe": compare_recipe,
         "repo-review": lambda: f"{run([tools / 'repo-review', '.']).count('✅')} checks",
-        "zizmor": lambda: run([tools / "zizmor", "--offline", "--quiet", "--min-severity", "medium", ".github"]),
+        "zizmor": lambda: run(
+            [tools / "zizmor", "--offline", "--quiet", "--min-severity", "medium", ".github"]
+        ),
         "pyroma": lambda: rate(tools),
         "reuse": lambda: run([tools / "reuse", "lint"]),
         "types": lambda: check_types(folder),
