@@ -106,38 +106,13 @@ exit:
   ret void
 }
 """
-"""The driver, in LLVM's words; it is given what :class:`CallList` and :class:`CallSequence` put together."""
+"""The driver, in LLVM's words; it is given what :class:`CallSequence` puts together."""
 
 
 @functools.cache
 def _driver() -> Native:
     driver: Native = native_text(TEXT, level=0)  # nearly all the time passes in what it calls
     return driver
-
-
-class CallList:
-    """Calls one after another, some lanes after the others through all of them, as one native call.
-
-    Args:
-        calls: in their order.
-    """
-
-    def __init__(self, calls: Sequence[Call]) -> None:
-        self._calls = calls
-        self._natives: list[Native | None] = [call.native or call.expect(0) for call in calls]
-        self._codes = numpy.array(list(map(address_of_code, self._natives)), dtype=numpy.int64)
-        self._tables = numpy.array([call.address for call in calls], dtype=numpy.int64)
-        addresses = address_of(self._codes), address_of(self._tables)
-        self._given = numpy.array([*addresses, len(calls), 0, 0, 0, 1, TILE], dtype=numpy.int64)
-        self._address, self._run = address_of(self._given), _driver()
-
-    def __call__(self, first: int, last: int) -> None:
-        """Run from one lane to another."""
-        natives = [call.native for call in self._calls]
-        if natives != self._natives:  # better code
-            self._natives = natives
-            self._codes[:] = list(map(address_of_code, natives))
-        self._run(self._address, first, last)
 
 
 class Moving(NamedTuple):
@@ -162,53 +137,80 @@ def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
 
 
 class CallSequence:
-    """Calls that are run over many steps.
+    """Calls that are run over one step or many, as one native call.
 
     Args:
         even: those of an even step, in their order.
-        odd: those of an odd step, as many.
-        moving: what moves on with every step, in tables of these calls; the calls' own stay as they are.
+        odd: those of an odd step, as many; needed where there is more than one step.
+        moving: what moves on with every step, in tables of these calls; after the last step it is where it was.
+        tile: lanes that go through all steps together.
     """
 
-    def __init__(self, even: Sequence[Call], odd: Sequence[Call], moving: Sequence[Moving]) -> None:
-        self._calls, self._count = [*even, *odd], len(even)
+    def __init__(
+        self, even: Sequence[Call], odd: Sequence[Call] = (), moving: Sequence[Moving] = (), tile: int = TILE
+    ) -> None:
+        self._calls = [*even, *odd]
+        self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
+        self._natives: list[Native | None] = []
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
-        numbers = {id(call): i for i, call in enumerate(self._calls)}
-        starts = numpy.cumsum([0, *(len(call.table) for call in self._calls)])
-        self._starts = starts[:-1]
-        self._places = numpy.array(
-            [starts[numbers[id(each.call)]] + each.entry for each in moving], dtype=numpy.int64
+        self._moving = moving
+        self._tables = numpy.array([call.address for call in self._calls], dtype=numpy.int64)
+        self._entries = numpy.array(
+            [each.call.address + 8 * each.entry for each in moving], dtype=numpy.int64
+        )
+        self._given = self._put_together(self._tables, self._entries, len(even), tile)
+        self._address, self._driver = address_of(self._given), _driver()
+
+    def _put_together(
+        self, tables: numpy.ndarray, entries: numpy.ndarray, count: int, tile: int
+    ) -> numpy.ndarray:
+        """What the driver is given; the number of steps is still one."""
+        addresses = address_of(self._codes), address_of(tables), count, address_of(entries)
+        return numpy.array(
+            [*addresses, address_of(self._amounts), len(self._amounts), 1, tile], dtype=numpy.int64
         )
 
-    def run(self, steps: int, width: int, threads: int = 1, tile: int = TILE) -> None:
+    def expect(self, lanes: int, in_sequence: bool = False) -> None:
+        """Let every call use the code for running over so many lanes in all, see :meth:`.functions.Call.expect`."""
+        for call in self._calls:
+            call.expect(lanes, in_sequence)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Use the code that the calls have now."""
+        natives = [call.native for call in self._calls]
+        if natives != self._natives:
+            self._natives = [call.native or call.expect(0) for call in self._calls]
+            self._codes[:] = list(map(address_of_code, self._natives))
+
+    def run(self, steps: int, width: int, threads: int = 1) -> None:
         """Run the steps over all lanes.
 
         Args:
             steps: how many; the first is an even one.
             width: lanes.
             threads: how many share the lanes.
-            tile: lanes that go through all steps together.
         """
-        codes = numpy.array(
-            [address_of_code(call.expect(steps * width // 2, True)) for call in self._calls],
-            dtype=numpy.int64,
+        if not self._natives:
+            self.refresh()
+        self._given[6] = steps
+        if threads > 1 and len(self._amounts):
+            run_over(self._share, width, threads)
+        else:
+            run_over(self, width, threads)
+
+    def __call__(self, first: int, last: int) -> None:
+        """Run from one lane to another."""
+        self._driver(self._address, first, last)
+
+    def _share(self, first: int, last: int) -> None:
+        """Run from one lane to another with tables of its own, since entries move."""
+        tables = [call.table.copy() for call in self._calls]
+        places = {id(call): table for call, table in zip(self._calls, tables, strict=True)}
+        addresses = numpy.array(list(map(address_of, tables)), dtype=numpy.int64)
+        entries = numpy.array(
+            [address_of(places[id(each.call)]) + 8 * each.entry for each in self._moving], dtype=numpy.int64
         )
-        tables = numpy.concatenate([call.table for call in self._calls])
-
-        def lanes(first: int, last: int) -> None:
-            # Of each thread its own: entries move.
-            own = tables.copy()
-            addresses, entries = (
-                address_of(own) + own.itemsize * places for places in (self._starts, self._places)
-            )
-            given = numpy.array(
-                [
-                    *(address_of(codes), address_of(addresses), self._count),
-                    *(address_of(entries), address_of(self._amounts), len(self._amounts)),
-                    *(steps, tile),
-                ],
-                dtype=numpy.int64,
-            )
-            _driver()(address_of(given), first, last)
-
-        run_over(lanes, width, threads)
+        given = self._put_together(addresses, entries, int(self._given[2]), int(self._given[7]))
+        given[6] = self._given[6]
+        self._driver(address_of(given), first, last)

@@ -72,6 +72,7 @@ class ModelStepper:
         """What is shown, ``(fields, width)``; None until it is computed."""
         self._action: Array = None
         self._report: Any = None
+        self._reports: list[Any] = []
 
     def begin(self, uniforms: Array, normals: Array, noise: EpisodeNoise) -> None:
         """Start new episodes everywhere and let their first measurement arrive."""
@@ -117,11 +118,31 @@ class ModelStepper:
         """Go on to the next measurement, see :meth:`.Stepper.arrive`."""
         self.load(self.model.measure(self._episode, noise.row))
 
-    def step(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
-        """Answer and go on to the next measurement, and let others do so after it."""
+    def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
+        """Answer all measurements of a decision by the action, see :meth:`.Stepper.decide`."""
+        means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
+        total: Any = 0.0
         for each in (self, *others):
-            each.answer()
-            each.arrive(noise)
+            each._reports = []
+        for _ in range(means.interval):
+            noise.advance()
+            for each in (self, *others):
+                each.answer()
+                each._reports.append(each._report)
+                each.arrive(noise)
+            if means.columns:
+                total = means.add(total, self.observation_by_field())
+        if means.columns:
+            self._shown = means.show(self.observation_by_field(), total, self.model.task.xp)
+
+    def reports(self) -> list[Any]:
+        """Return the reports on the measurements of the last :meth:`decide`, in arrays ``(..., width)``."""
+        return self._reports
+
+    @property
+    def rewards(self) -> list[Array]:
+        """The same."""
+        return self._reports
 
     @property
     def filter_state(self) -> Any:
@@ -146,10 +167,6 @@ class ModelStepper:
     def observation_if_computed(self) -> Array:
         """What is shown where it was computed, else None."""
         return self._shown
-
-    def show_means(self, means: DecisionMeans, total: Array) -> None:
-        """Show means over a decision, of which the sums are given."""
-        self._shown = means.show(self.observation_by_field(), total, self.model.task.xp)
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -266,8 +283,21 @@ class Lanes:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        answers = self.decide(action, OWN_REWARDS[kind])
-        return mean_of([own if other is None else own - other for own, other in answers])[: self.count]
+        own, *beside = self._take_and_decide(action, OWN_REWARDS[kind])
+        rewards = (
+            own.rewards
+            if not beside
+            else [a - b for a, b in zip(own.rewards, beside[0].rewards, strict=True)]
+        )
+        return mean_of(rewards)[: self.count]
+
+    def _take_and_decide(self, action: Array, report: Report) -> list[Any]:
+        """Apply one decision to all its measurements; returns the steppers that have the reports."""
+        steppers = self._reporting(report)
+        steppers[0].take(action)
+        steppers[0].decide(self.noise, steppers[1:])
+        self.decisions += 1
+        return steppers
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
         """Apply one decision to as many measurements as it holds for, and report on each.
@@ -280,21 +310,9 @@ class Lanes:
             The reports on every measurement that the decision held for, arrays ``(..., width)``: of the model, and of
             ``beside`` (None without).
         """
-        steppers = self._reporting(report)
-        own = steppers[0]
-        own.take(action)
-        answers: list[tuple[Any, Any]] = []
-        total: Any = 0.0
-        for _ in range(self.task.decision_interval):
-            self.noise.advance()
-            own.step(self.noise, steppers[1:])
-            answers.append((own.report(), steppers[1].report() if self.beside else None))
-            if self._means.columns:
-                total = self._means.add(total, own.observation_by_field())
-        if self._means.columns:
-            own.show_means(self._means, total)
-        self.decisions += 1
-        return answers
+        own, *beside = self._take_and_decide(action, report)
+        reports = own.reports()
+        return list(zip(reports, beside[0].reports() if beside else [None] * len(reports), strict=True))
 
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None

@@ -15,9 +15,8 @@ from ...compiler.functions import (
     empty_lanes,
     leaves,
     map_arrays,
-    run_over,
 )
-from ...compiler.sequence import CallList, CallSequence, Moving, moving_array
+from ...compiler.sequence import CallSequence, Moving, moving_array
 from ..contract.model import Episode
 from ..contract.observation import Array, DecisionMeans
 from .episode_noise import EpisodeNoise
@@ -125,7 +124,21 @@ class Stepper:
             self._calls.append(step)
             self._begin.append(begin)
         self._now = 0
-        self._lists: dict[tuple[Call, ...], CallList] = {}
+        self._lists: dict[tuple[Call, ...], CallSequence] = {}
+        self._interval, self._means = (
+            model.task.decision_interval,
+            DecisionMeans(model.fields, model.task.decision_interval),
+        )
+        self._decisions: list[CallSequence] = []
+        """All measurements of a decision, which begins with either copy; bound at the first."""
+        self._draw: Call | None = None
+        """What makes their noise."""
+        self._shown_by: list[Call] = []
+        """Calls of decisions that write what is shown."""
+        self._passing: numpy.ndarray | None = None
+        """What is shown at each measurement of a decision, ``(interval, width, fields)``, where means of it are."""
+        self.reported: list[numpy.ndarray] = []
+        """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
         self._stepped = 0
         """Lanes that steps went over and that no code was told of."""
         self._small: dict[int, Stepper] = {}
@@ -213,22 +226,53 @@ class Stepper:
             memory[...] = values
         self._is_put = True
 
-    def step(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
-        """Answer and go on to the next measurement, and let others do so after it: some lanes after the others through
-        all of it.
-        """
-        calls = self._calls_of_step(noise)
-        for each in others:
-            calls += each._calls_of_step(noise)
-        self._run_calls(calls)
+    def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
+        """Answer all measurements of a decision by the action, and report on each; others do so beside it.
 
-    def _calls_of_step(self, noise: EpisodeNoise) -> tuple[Call, ...]:
-        self._stepped += self.width
+        A tile of lanes goes through all of it, with the others, as one native call.
+        """
+        draw = noise.call_of_each()
+        if self._given:
+            self._show_in(numpy.empty_like(self._shown))
+        if draw is not self._draw:
+            self._bind_decisions(draw, noise, others)
+        self._stepped += self.width * self._interval
         if self._stepped > UNCOUNTED:
-            for call in itertools.chain(*self._calls):
-                call.expect(self._stepped // 2)
+            for sequence in self._decisions:
+                sequence.expect(self._stepped // 2)
             self._stepped = 0
-        return self._go_on(self._calls[self._now], noise)
+        self._decisions[self._now].run(self._interval, self.width, self._threads)
+        if self._interval % 2:
+            for each in (self, *others):
+                each._now = 1 - each._now
+        if self._passing is not None:
+            self._shown[...] = self._passing[-1]
+            total = sum(self._passing[..., self._means.columns], start=0.0)
+            self._shown[:, self._means.columns] = total / self._interval
+
+    def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
+        """Bind all measurements of a decision, of the task and of what runs beside it, to memory."""
+        self._draw, self._shown_by = draw, []
+        if self._means.columns:
+            self._passing = numpy.empty((self._interval, *self._shown.shape))
+        turns: list[list[Call]] = [[draw], [draw]]
+        moving: list[Moving] = []
+        for each in (self, *others):
+            each.reported = [
+                empty_lanes((self._interval, *array.shape[:-1]), self.width) for array in each._reported
+            ]
+            for now, turn in enumerate(turns):
+                calls = [call.copy() for call in each._calls[now]]
+                tell, last = calls[1], calls[-1]
+                moving += [moving_array(tell, each._report_place + i, a) for i, a in enumerate(each.reported)]
+                if each._world_of is None:
+                    calls[-2].table[each._row_entry] = noise.address
+                if each is self and self._passing is not None:
+                    moving.append(moving_array(last, len(last.arrays) - 1, self._passing))
+                elif each is self:
+                    self._shown_by.append(last)
+                turn += calls
+        self._decisions = [CallSequence(*turns, moving), CallSequence(*turns[::-1], moving)]
 
     def _run(self, calls: Sequence[Call], noise: Any) -> None:
         self._run_calls(self._go_on(calls, noise))
@@ -245,8 +289,9 @@ class Stepper:
     def _run_calls(self, calls: tuple[Call, ...]) -> None:
         found = self._lists.get(calls)
         if found is None:
-            found = self._lists[calls] = CallList(calls)
-        run_over(found, self.width, self._threads)
+            found = self._lists[calls] = CallSequence(calls)
+        found.refresh()
+        found.run(1, self.width, self._threads)
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.
@@ -281,7 +326,9 @@ class Stepper:
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
-        CallSequence(turns[0], turns[1], moving).run(steps, self.width, self._threads)
+        sequence = CallSequence(turns[0], turns[1], moving)
+        sequence.expect(steps * self.width // 2, in_sequence=True)
+        sequence.run(steps, self.width, self._threads)
         self._now = (self._now + steps) % 2
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
@@ -301,16 +348,26 @@ class Stepper:
         return blank
 
     def report(self) -> Any:
-        """Return the last report, in arrays ``(..., width)`` that stay as they are."""
+        """Return the report of the last :meth:`answer`, in arrays ``(..., width)`` that stay as they are."""
         return _copy_numbers(self._report_template, self._reported, self._report_kinds)
+
+    def reports(self) -> list[Any]:
+        """Return the reports on the measurements of the last :meth:`decide`, each as of :meth:`report`."""
+        return [
+            _copy_numbers(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
+            for k in range(self._interval)
+        ]
+
+    @property
+    def rewards(self) -> numpy.ndarray:
+        """These reports where each is one number, ``(interval, width)``; more than one row changes with the next
+        decision.
+        """
+        return self.reported[0] if self._interval > 1 else self.reported[0].copy()
 
     def observation_by_field(self) -> numpy.ndarray:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
-
-    def show_means(self, means: DecisionMeans, total: numpy.ndarray) -> None:
-        """Show means over a decision, of which the sums are given."""
-        means.write(self._shown.T, total)
 
     def observation(self, count: int) -> numpy.ndarray:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -322,7 +379,7 @@ class Stepper:
     def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
         self._shown, self._given = memory, False
-        for *_, predict in (*self._calls, *self._begin):
+        for predict in (*(calls[-1] for calls in (*self._calls, *self._begin)), *self._shown_by):
             predict.replace(len(predict.arrays) - 1, memory)
 
 
