@@ -143,13 +143,19 @@ class CallSequence:
         even: those of an even step, in their order.
         odd: those of an odd step, as many; needed where there is more than one step.
         moving: what moves on with every step, in tables of these calls; after the last step it is where it was.
+        steps: how many; the first is an even one.
         tile: lanes that go through all steps together.
     """
 
     def __init__(
-        self, even: Sequence[Call], odd: Sequence[Call] = (), moving: Sequence[Moving] = (), tile: int = TILE
+        self,
+        even: Sequence[Call],
+        odd: Sequence[Call] = (),
+        moving: Sequence[Moving] = (),
+        steps: int = 1,
+        tile: int = TILE,
     ) -> None:
-        self._calls = [*even, *odd]
+        self._calls, self._form = [*even, *odd], (len(even), steps, tile)
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
         self._natives: list[Native | None] = []
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
@@ -158,16 +164,15 @@ class CallSequence:
         self._entries = numpy.array(
             [each.call.address + 8 * each.entry for each in moving], dtype=numpy.int64
         )
-        self._given = self._put_together(self._tables, self._entries, len(even), tile)
-        self._address, self._driver = address_of(self._given), _driver()
+        self._given = self._put_together(self._tables, self._entries)
+        self._run = functools.partial(_driver(), address_of(self._given))
 
-    def _put_together(
-        self, tables: numpy.ndarray, entries: numpy.ndarray, count: int, tile: int
-    ) -> numpy.ndarray:
-        """What the driver is given; the number of steps is still one."""
+    def _put_together(self, tables: numpy.ndarray, entries: numpy.ndarray) -> numpy.ndarray:
+        """What the driver is given."""
+        count, steps, tile = self._form
         addresses = address_of(self._codes), address_of(tables), count, address_of(entries)
         return numpy.array(
-            [*addresses, address_of(self._amounts), len(self._amounts), 1, tile], dtype=numpy.int64
+            [*addresses, address_of(self._amounts), len(self._amounts), steps, tile], dtype=numpy.int64
         )
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
@@ -183,25 +188,14 @@ class CallSequence:
             self._natives = [call.native or call.expect(0) for call in self._calls]
             self._codes[:] = list(map(address_of_code, self._natives))
 
-    def run(self, steps: int, width: int, threads: int = 1) -> None:
-        """Run the steps over all lanes.
-
-        Args:
-            steps: how many; the first is an even one.
-            width: lanes.
-            threads: how many share the lanes.
-        """
+    def run(self, width: int, threads: int = 1) -> None:
+        """Run over all lanes, shared by some threads."""
         if not self._natives:
             self.refresh()
-        self._given[6] = steps
-        if threads > 1 and len(self._amounts):
-            run_over(self._share, width, threads)
+        if threads == 1:
+            self._run(0, width)
         else:
-            run_over(self, width, threads)
-
-    def __call__(self, first: int, last: int) -> None:
-        """Run from one lane to another."""
-        self._driver(self._address, first, last)
+            run_over(self._share if self._moving else self._run, width, threads)
 
     def _share(self, first: int, last: int) -> None:
         """Run from one lane to another with tables of its own, since entries move."""
@@ -211,6 +205,4 @@ class CallSequence:
         entries = numpy.array(
             [address_of(places[id(each.call)]) + 8 * each.entry for each in self._moving], dtype=numpy.int64
         )
-        given = self._put_together(addresses, entries, int(self._given[2]), int(self._given[7]))
-        given[6] = self._given[6]
-        self._driver(address_of(given), first, last)
+        _driver()(address_of(self._put_together(addresses, entries)), first, last)

@@ -350,7 +350,7 @@ def test_a_sequence_runs_its_calls_over_all_steps(threads):
         moving += [moving_array(calls[0], 1, y), moving_array(calls[1], 1, told)]
         turns.append(calls)
     tables = [call.table.copy() for calls in turns for call in calls]
-    CallSequence(*turns, moving, tile=40).run(steps, width, threads)
+    CallSequence(*turns, moving, steps, tile=40).run(width, threads)
     expected = [x]
     for row in y:
         expected.append(expected[-1] + row)

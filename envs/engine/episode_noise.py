@@ -187,9 +187,10 @@ class EpisodeNoise:
 
         It is for whoever goes on over several in native code, and is run at least once.
         """
-        self.advance()
-        self._due = False
-        return self._next_call()
+        if self._due:
+            _ = self.row
+        self._row = None
+        return self._next or self._next_call()
 
     @property
     def address(self) -> int:

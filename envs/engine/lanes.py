@@ -19,24 +19,18 @@ import numpy
 
 from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
-from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
 from .reward import OWN_REWARDS, RewardBaseline
-from .stepper import Stepper
+from .stepper import Stepper, mean_of
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
     """Report the state itself."""
     return episode
-
-
-def mean_of(rewards: Sequence[Array]) -> Array:
-    """Mean over the measurements of one decision."""
-    return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
@@ -108,6 +102,10 @@ class ModelStepper:
             turned = xp.concat([turned, padding], axis=-1)
         self._action = turned
 
+    def take_alone(self, action: Array) -> None:
+        """Apply an action of the first lane from the next step on."""
+        self.take(action[None])
+
     def answer(self) -> None:
         """Apply the action to the measurement at hand, and report on it."""
         self._episode = self.model.act(self._episode, self._action)
@@ -143,6 +141,15 @@ class ModelStepper:
     def rewards(self) -> list[Array]:
         """The same."""
         return self._reports
+
+    def first_reward(self, beside: "ModelStepper | None") -> float:
+        """Mean of the same of the first lane, where each is one number, less those of what runs beside it."""
+        others = [0.0] * len(self._reports) if beside is None else beside._reports
+        return float(mean_of([a - b for a, b in zip(self._reports, others, strict=True)])[0])
+
+    def observation_of_first(self) -> Array:
+        """Observation of the first lane; the caller may keep it."""
+        return self.observation(1)[0]
 
     @property
     def filter_state(self) -> Any:
@@ -291,6 +298,23 @@ class Lanes:
         )
         return mean_of(rewards)[: self.count]
 
+    def step_alone(self, action: Array, kind: str) -> tuple[Array, float, bool]:
+        """Apply one decision of the only lane; returns observation, reward, and whether the episode is over.
+
+        Args:
+            action: as the action space has it.
+            kind: as of :meth:`step_reward`, whose numbers these are.
+        """
+        steppers, report = self._moving, OWN_REWARDS[kind]
+        if steppers is not self._steppers.get(report):
+            steppers = self._reporting(report)
+        own, beside = steppers[0], steppers[1:]
+        own.take_alone(action)
+        own.decide(self.noise, beside)
+        self.decisions[0] = taken = self.decisions.item(0) + 1
+        reward = own.first_reward(beside[0] if beside else None)
+        return own.observation_of_first(), reward, taken >= self._lengths.item(0)
+
     def _take_and_decide(self, action: Array, report: Report) -> list[Any]:
         """Apply one decision to all its measurements; returns the steppers that have the reports."""
         steppers = self._reporting(report)
@@ -388,6 +412,11 @@ class Lanes:
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
                 averaged = i == 0 and self._means.columns
                 new.load(old.episode(), old.observation_by_field().copy() if averaged else None)
+
+    @property
+    def flies_alone(self) -> bool:
+        """Whether the first lane has an episode that is not over."""
+        return bool(self._moving) and self.decisions.item(0) < self._lengths.item(0)
 
     @property
     def has_episodes(self) -> bool:

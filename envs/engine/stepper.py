@@ -17,10 +17,17 @@ from ...compiler.functions import (
     map_arrays,
 )
 from ...compiler.sequence import CallSequence, Moving, moving_array
+from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode
 from ..contract.observation import Array, DecisionMeans
 from .episode_noise import EpisodeNoise
 from .programs import Report
+
+
+def mean_of(rewards: Sequence[Any]) -> Any:
+    """Mean over the measurements of one decision."""
+    return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
+
 
 ANSWERING = 2
 """Of the four parts of a step the first ones: update and report; the others let a measurement arrive."""
@@ -60,8 +67,10 @@ class Stepper:
 
         self.action = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
+        self._first_action = self.action[..., 0]
         fields = predict.outputs[-1].shape[0] if world_of is None else 0
         self._shown, self._given = numpy.empty((width, fields)), False
+        self._first_shown = self._shown[0]
         self._reported = memory(tell.outputs)
         knows = bool(model.filter.knows)
         # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
@@ -139,6 +148,7 @@ class Stepper:
         """What is shown at each measurement of a decision, ``(interval, width, fields)``, where means of it are."""
         self.reported: list[numpy.ndarray] = []
         """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
+        self._first_rewards = numpy.empty(0)
         self._stepped = 0
         """Lanes that steps went over and that no code was told of."""
         self._small: dict[int, Stepper] = {}
@@ -201,6 +211,10 @@ class Stepper:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
+    def take_alone(self, action: numpy.ndarray) -> None:
+        """Apply an action of the first lane from the next step on."""
+        self._first_action[...] = action
+
     def answer(self) -> None:
         """Apply the action to the measurement at hand, and report on it."""
         for call in self._calls[self._now][:ANSWERING]:
@@ -241,26 +255,33 @@ class Stepper:
             for sequence in self._decisions:
                 sequence.expect(self._stepped // 2)
             self._stepped = 0
-        self._decisions[self._now].run(self._interval, self.width, self._threads)
+        self._decisions[self._now].run(self.width, self._threads)
         if self._interval % 2:
-            for each in (self, *others):
-                each._now = 1 - each._now
+            self._now = 1 - self._now
+            for each in others:
+                each._now = self._now
         if self._passing is not None:
             self._shown[...] = self._passing[-1]
-            total = sum(self._passing[..., self._means.columns], start=0.0)
-            self._shown[:, self._means.columns] = total / self._interval
+            # The first axis is added up row by row, whatever the width, as a sum of the rows would be.
+            total = numpy.add.reduce(self._averaged, 0, initial=0.0)
+            total /= self._interval
+            self._shown[:, self._means.columns] = total[:, self._averages]
 
     def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
         """Bind all measurements of a decision, of the task and of what runs beside it, to memory."""
         self._draw, self._shown_by = draw, []
         if self._means.columns:
             self._passing = numpy.empty((self._interval, *self._shown.shape))
+            first, last = min(self._means.columns), max(self._means.columns)
+            self._averaged = self._passing[..., first : last + 1]
+            self._averages = numpy.array(self._means.columns) - first
         turns: list[list[Call]] = [[draw], [draw]]
         moving: list[Moving] = []
         for each in (self, *others):
             each.reported = [
                 empty_lanes((self._interval, *array.shape[:-1]), self.width) for array in each._reported
             ]
+            each._first_rewards = each.reported[0].reshape(self._interval, -1)[:, 0]
             for now, turn in enumerate(turns):
                 calls = [call.copy() for call in each._calls[now]]
                 tell, last = calls[1], calls[-1]
@@ -272,7 +293,9 @@ class Stepper:
                 elif each is self:
                     self._shown_by.append(last)
                 turn += calls
-        self._decisions = [CallSequence(*turns, moving), CallSequence(*turns[::-1], moving)]
+        self._decisions = [
+            CallSequence(even, odd, moving, self._interval) for even, odd in (turns, turns[::-1])
+        ]
 
     def _run(self, calls: Sequence[Call], noise: Any) -> None:
         self._run_calls(self._go_on(calls, noise))
@@ -291,7 +314,7 @@ class Stepper:
         if found is None:
             found = self._lists[calls] = CallSequence(calls)
         found.refresh()
-        found.run(1, self.width, self._threads)
+        found.run(self.width, self._threads)
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.
@@ -326,9 +349,9 @@ class Stepper:
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
-        sequence = CallSequence(turns[0], turns[1], moving)
+        sequence = CallSequence(turns[0], turns[1], moving, steps)
         sequence.expect(steps * self.width // 2, in_sequence=True)
-        sequence.run(steps, self.width, self._threads)
+        sequence.run(self.width, self._threads)
         self._now = (self._now + steps) % 2
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
@@ -358,6 +381,14 @@ class Stepper:
             for k in range(self._interval)
         ]
 
+    def first_reward(self, beside: "Stepper | None") -> float:
+        """Mean of these reports of the first lane, where each is one number, less those of what runs beside it."""
+        if self._interval == 1:
+            own: float = self._first_rewards.item(0)
+            return own if beside is None else own - beside._first_rewards.item(0)
+        rewards = self._first_rewards if beside is None else self._first_rewards - beside._first_rewards
+        return mean_of(rewards.tolist())
+
     @property
     def rewards(self) -> numpy.ndarray:
         """These reports where each is one number, ``(interval, width)``; more than one row changes with the next
@@ -376,9 +407,13 @@ class Stepper:
         self._given = True
         return self._shown[:count]
 
+    def observation_of_first(self) -> numpy.ndarray:
+        """Observation of the first lane; the caller may keep it."""
+        return self._first_shown.copy()
+
     def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
-        self._shown, self._given = memory, False
+        self._shown, self._first_shown, self._given = memory, memory[0], False
         for predict in (*(calls[-1] for calls in (*self._calls, *self._begin)), *self._shown_by):
             predict.replace(len(predict.arrays) - 1, memory)
 

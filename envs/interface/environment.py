@@ -1,6 +1,7 @@
 """One episode of a task as a Gymnasium environment; many are in :mod:`.vector_environment`."""
 
 import functools
+import math
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -80,6 +81,8 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
             self._picture_of(self._first_distribution.names[0])
         self.observation_space = self._observation_space()
         self.action_space = self.model.action_space
+        is_row = isinstance(self.action_space, gymnasium.spaces.Box) and len(self.action_space.shape) == 1
+        self._plain_action = self.action_space.shape if is_row else None
 
     def _picture_of(self, scenario: str) -> None:
         """Draw episodes of the present task, of a scenario of this name."""
@@ -131,6 +134,17 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
+        lanes = self.fleet.whole if self._plain and self._late is None else None
+        if lanes is not None and lanes.flies_alone:
+            if not (
+                action.__class__ is numpy.ndarray
+                and action.shape == self._plain_action
+                and action.dtype.kind == "f"
+                and all(map(math.isfinite, action.tolist()))
+            ):  # otherwise there is nothing to look at
+                action = check_action(self.action_space, action, None)
+            observation, reward, over = lanes.step_alone(action, self.reward_kind)
+            return observation, reward, False, over, {}
         if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         if self.fleet.done[0]:

@@ -13,9 +13,10 @@ from ..contract.model import Model
 from ..contract.observation import Array, Field
 from ..contract.task import Task
 from ..engine.catalogue import check_names, nearest, task_class
-from ..engine.lanes import Lanes, mean_of
+from ..engine.lanes import Lanes
 from ..engine.reward import REWARDS
 from ..engine.scenario_choice import find_mixture, find_scenario
+from ..engine.stepper import mean_of
 from .fleet import EpisodeDistribution, Fleet, check_alike
 from .privileged import context_shapes, in_sigmas
 from .requests import EnvOptions
@@ -59,6 +60,8 @@ class EnvBase:
         if self.reward_kind not in REWARDS:
             raise nearest("reward", self.reward_kind, REWARDS)
         self._rewards_only = not (options.detailed_info or options.privileged)
+        self._plain = self._rewards_only and not options.context and options.dtype == "float64"
+        """Whether a step gives nothing but an observation and a reward, as they are computed."""
         if self.privileged:
             self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
 

@@ -103,7 +103,7 @@ class Fleet:
         """Where in it."""
         self._names = [distribution.names[0]] * count
         self._parts: list[Lanes] = []
-        self._whole: Lanes | None = None
+        self.whole: Lanes | None = None
         """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
         self._sent = False
         """Whether lanes have courses that their episodes were not drawn from."""
@@ -120,8 +120,8 @@ class Fleet:
         Raises:
             ValueError: where they are of several.
         """
-        if self._whole is not None:
-            return self._whole
+        if self.whole is not None:
+            return self.whole
         if self.count > 1:
             raise ValueError("episodes of several tasks have no common state: use parts()")
         return self._parts[self._part[0]]
@@ -208,23 +208,23 @@ class Fleet:
             first += self._parts[i].count
         own_places = self._flying == [0] and numpy.array_equal(self._place, numpy.arange(self.count))
         alone = len(self._parts) == 1 and self._parts[0].count == self.count and not self.mixes_scenarios
-        self._whole = self._parts[0] if own_places and alone else None
+        self.whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
         """Give a lane the generator that its coming episodes are drawn from."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
-        if self._whole is not None:
-            self._whole.seed(lane, generator)
+        if self.whole is not None:
+            self.whole.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
         """Start new episodes in some lanes (default: all), each of a task that is drawn for it."""
-        if self._whole is not None and not self._sent:
-            self._whole.restart(lanes)
+        if self.whole is not None and not self._sent:
+            self.whole.restart(lanes)
             return
-        if self._whole is not None:
-            self._leave(self._whole)
+        if self.whole is not None:
+            self._leave(self.whole)
         self._sent = False
         chosen = list(range(self.count) if lanes is None else lanes)
         self._part[chosen] = -1
@@ -251,7 +251,7 @@ class Fleet:
 
     def _leave(self, whole: Lanes) -> None:
         """Make room for lanes of other tasks."""
-        self._whole = None
+        self.whole = None
         if whole.has_episodes:
             whole.grow(whole.width)
         else:
@@ -270,22 +270,22 @@ class Fleet:
         """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``, in a new array."""
         if isinstance(values[0], numpy.ndarray):
             return (
-                numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
+                numpy.array(values[0]) if self.whole is not None else numpy.concatenate(values)[self._where]
             )
-        if self._whole is not None:
-            return self._whole.model.task.xp.asarray(values[0], copy=True)
+        if self.whole is not None:
+            return self.whole.model.task.xp.asarray(values[0], copy=True)
         return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
     def step_reward(self, action: Array, kind: str) -> Array:
         """Apply one decision and return its reward, see :meth:`.lanes.Lanes.step_reward`."""
-        if self._whole is not None:
-            return self._whole.step_reward(action, kind)
+        if self.whole is not None:
+            return self.whole.step_reward(action, kind)
         return self.gather([part.step_reward(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
         """Observation of every lane, batch first."""
-        if self._whole is not None:
-            return self._whole.observe()
+        if self.whole is not None:
+            return self.whole.observe()
         return self.gather([part.observe() for (part,) in self.parts()])
 
     @property
@@ -296,8 +296,8 @@ class Fleet:
     @property
     def done(self) -> numpy.ndarray:
         """Lanes whose episode is over, ``(count,)`` booleans; episodes of different tasks may differ in length."""
-        if self._whole is not None:
-            return self._whole.done
+        if self.whole is not None:
+            return self.whole.done
         return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
@@ -308,7 +308,7 @@ class Fleet:
     @property
     def has_episodes(self) -> bool:
         """Whether every lane has an episode."""
-        return self._whole.has_episodes if self._whole is not None else bool((self._part >= 0).all())
+        return self.whole.has_episodes if self.whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
         """Cut the gradient (torch only)."""

@@ -278,9 +278,9 @@ class WindowLikelihood:
             for call in calls
             for place, arrays in (*enumerate(measurements, 1), (last, found))
         ]
-        sequence = CallSequence(calls[:1], calls[1:], moving)
+        sequence = CallSequence(calls[:1], calls[1:], moving, len(found))
         sequence.expect(len(found) * lanes // 2, in_sequence=True)
-        sequence.run(len(found), lanes)
+        sequence.run(lanes)
 
     def _measurement(self, measurements: Sequence[numpy.ndarray], k: int) -> Any:
         """Measurement k, put together from the arrays of all of them."""
