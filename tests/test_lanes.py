@@ -184,7 +184,8 @@ def test_copies_and_snapshots_go_on_as_the_original(either_way):
     noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
     for lane in range(3):
         noise.seed(lane, np.random.default_rng(lane))
-    noise.begin(noise.draw_identities(range(3)))
+    noise.put(noise.draw_identities(range(3)))
+    noise.start()
     noise.advance()
     first, other, snapshot = noise.row, pickle.loads(pickle.dumps(noise)), noise.snapshot()
     noise.advance()

@@ -105,7 +105,6 @@ class EpisodeNoise:
 
     def _forget(self) -> None:
         """Forget what follows from identities and measurements."""
-        self._start: Call | None = None
         self._next: Call | None = None
         self._address = 0
         self._due = False
@@ -128,28 +127,36 @@ class EpisodeNoise:
         generators = self.generators
         return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
-    def begin(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Begin episodes in the first lanes, and go on to their first measurement.
-
-        Args:
-            identities: ``(2, lanes)``; the other lanes are padding.
-
-        Returns:
-            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, in new memory.
+    def put(self, identities: numpy.ndarray) -> None:
+        """Let the first lanes have episodes of these identities, ``(2, lanes)``, before their start; the others are
+        padding.
         """
         self.identities[:, : identities.shape[1]] = identities
         self.identities[:, identities.shape[1] :] = 0
         self.measurement[:] = -1
-        self._ahead, self._row, self._due = None, None, True
+        self._ahead, self._row, self._due = None, None, False
+
+    def start_call(self, memory: numpy.ndarray) -> Call:
+        """Return what makes the numbers of the start after :meth:`put`.
+
+        Args:
+            memory: for normals and uniforms, ``(initial_normals + uniforms, width)``.
+        """
+        return bind_numbers(self.identities, self.measurement, memory, self._layout.initial_normals)
+
+    def start(self) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Return the numbers of the start after :meth:`put`, and go on to the first measurement.
+
+        Returns:
+            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)``, in new memory.
+        """
+        self._due = True
         if not AVAILABLE:
             self.measurement[:] = 0
             return start_numbers(self.identities, self._layout)
         normals = self._layout.initial_normals
         memory = empty_lanes((normals + self._layout.uniforms,), self.width)
-        if self._start is None:
-            self._start = bind_numbers(self.identities, self.measurement, memory, normals)
-        self._start.replace(2, memory)
-        self._start(0, self.width)
+        self.start_call(memory)(0, self.width)
         return memory[normals:], memory[:normals]
 
     def take(self, other: "EpisodeNoise", lanes: numpy.ndarray) -> None:

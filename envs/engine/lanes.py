@@ -68,22 +68,44 @@ class ModelStepper:
         self._report: Any = None
         self._reports: list[Any] = []
 
-    def begin(self, uniforms: Array, normals: Array, noise: EpisodeNoise) -> None:
-        """Start new episodes everywhere and let their first measurement arrive."""
-        self.load(self.model.measure(self.model.begin(uniforms, normals), noise.row))
+    def begin(
+        self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()
+    ) -> tuple[Array, Array]:
+        """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
+        noise.put(identities)
+        start = self._start(noise)
+        for each in (self, *others):
+            each.load(each.model.measure(each.model.begin(*start), noise.row))
+        return start
+
+    def _start(self, noise: EpisodeNoise) -> tuple[Array, Array]:
+        """Uniforms and normals of the start."""
+        task = self.model.task
+        uniforms, normals = (task.xp.asarray(numbers, device=task.device) for numbers in noise.start())
+        return uniforms, normals
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes; what they show is observed from them unless it is given."""
         self._episode, self._shown = episode, shown
 
-    def begin_some(self, lanes: numpy.ndarray, uniforms: Array, normals: Array, noise: EpisodeNoise) -> None:
-        """Start new episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
-        task = self.model.task
-        episode = self.model.measure(self.model.begin(uniforms, normals), noise.row)
-        where = lanes if task.xp is numpy else task.xp.asarray(lanes, device=task.device)
-        if self._shown is not None:
-            self._shown = _replace_lanes(self._shown, self.model.observe(episode), where)
-        self._episode = _replace_lanes(self._episode, episode, where)
+    def begin_some(
+        self,
+        lanes: numpy.ndarray,
+        identities: numpy.ndarray,
+        noise: EpisodeNoise,
+        others: "Sequence[ModelStepper]" = (),
+    ) -> tuple[Array, Array]:
+        """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+        noise.put(identities)
+        start = self._start(noise)
+        for each in (self, *others):
+            task = each.model.task
+            episode = each.model.measure(each.model.begin(*start), noise.row)
+            where = lanes if task.xp is numpy else task.xp.asarray(lanes, device=task.device)
+            if each._shown is not None:
+                each._shown = _replace_lanes(each._shown, each.model.observe(episode), where)
+            each._episode = _replace_lanes(each._episode, episode, where)
+        return start
 
     def episode(self) -> Episode:
         """Return the episodes."""
@@ -253,26 +275,23 @@ class Lanes:
         """
         task = self.task
         everyone = lanes is None or len(lanes) == self.count
-        index = numpy.arange(self.count) if lanes is None else numpy.asarray(lanes)
-        noise = self.noise if everyone else self._noise_of_some(len(index))
-        uniforms, normals = noise.begin(identities)
+        index = slice(None) if everyone else numpy.asarray(lanes)
+        if not self._moving and self._report is not None:
+            self._reporting(self._report)
+        self._moving = self._moving or self._by_functions()
+        own, *beside = self._moving
+        if everyone:
+            start = own.begin(identities, self.noise, beside)
+        else:
+            noise = self._noise_of_some(len(index))
+            start = own.begin_some(index, identities, noise, beside)
+            self.noise.take(noise, index)
         self.decisions[index] = 0
         if task.flights:
-            lengths = task.lengths(uniforms[:, : len(index)]) // task.decision_interval
+            lengths = task.lengths(start[0][:, : identities.shape[1]]) // task.decision_interval
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
-        start = tuple(task.xp.asarray(numbers, device=task.device) for numbers in (uniforms, normals))
         if self._on_start is not None:
             self._on_start(self.model.begin(*start))
-        if everyone:
-            if not self._moving and self._report is not None:
-                self._reporting(self._report)
-            self._moving = self._moving or self._by_functions()
-            for stepper in self._moving:
-                stepper.begin(*start, noise)
-            return
-        for stepper in self._moving:
-            stepper.begin_some(index, *start, noise)
-        self.noise.take(noise, index)
 
     def _noise_of_some(self, count: int) -> EpisodeNoise:
         """Noise of so many lanes that restart, in one of a few sizes."""

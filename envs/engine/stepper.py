@@ -99,7 +99,9 @@ class Stepper:
         """Whether it is not that of the last update, but one that was put in its place."""
         world, start = model.programs.start
         begun = model.programs.first
-        self._drawn = memory(world.inputs)
+        uniforms, normals = world.inputs
+        drawn = empty_lanes((normals.rows + uniforms.rows,), width)
+        self._start_numbers, self._drawn = drawn, (drawn[normals.rows :], drawn[: normals.rows])
         self._initial: list[numpy.ndarray] = (
             memory(world.outputs[truths:]) if world_of is None else world_of._initial
         )
@@ -149,8 +151,14 @@ class Stepper:
         self.reported: list[numpy.ndarray] = []
         """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
         self._first_rewards = numpy.empty(0)
-        self._stepped = 0
-        """Lanes that steps went over and that no code was told of."""
+        self._stepped = self._begun = 0
+        """Lanes that decisions and starts went over and that no code was told of."""
+        self._beginnings: list[CallSequence] = []
+        """The start and the first measurement, into either copy; bound at the first."""
+        self._draw_first: Call | None = None
+        """What makes its noise."""
+        self._shown_first: list[Call] = []
+        """Calls of beginnings that write what is shown."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
@@ -168,44 +176,84 @@ class Stepper:
         """Return the episodes, in arrays that stay as they are."""
         return _copy_numbers(self._template, self._copies[self._now], self._kinds)
 
-    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise) -> None:
-        """Start new episodes everywhere and let their first measurement arrive.
+    def begin(
+        self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
+    ) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Start episodes everywhere and let their first measurement arrive; others do so beside it.
 
         Args:
-            uniforms: of the scenario, ``(uniforms, width)``.
-            normals: of the start of the track, ``(initial_normals, width)``.
-            noise: of the measurements.
+            identities: of the episodes, ``(2, lanes)``, see :mod:`.episode_noise`; the other lanes are padding.
+            noise: that makes their numbers.
+            others: of the same task.
+
+        Returns:
+            Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, until the next.
         """
-        for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
-            memory[...] = values
-        for call in self._begin[self._now]:
-            call.expect(self.width)
-        self._run(self._begin[self._now], noise)
+        noise.put(identities)
+        draw = noise.call_of_each()
+        if self._given:
+            self._show_in(numpy.empty_like(self._shown))
+        if draw is not self._draw_first:
+            self._bind_beginnings(draw, noise, others)
+        self._begun += self.width
+        if self._begun > UNCOUNTED:
+            for sequence in self._beginnings:
+                sequence.expect(self._begun // 2)
+            self._begun = 0
+        self._beginnings[self._now].run(self.width, self._threads)
+        self._now = 1 - self._now
+        for each in others:
+            each._now = self._now
+        return self._drawn
+
+    def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
+        """Bind the start and the first measurement, of the task and of what runs beside it, to memory."""
+        self._draw_first, self._shown_first, self._beginnings = draw, [], []
+        for now in (0, 1):
+            turn = [noise.start_call(self._start_numbers), draw]
+            for each in (self, *others):
+                calls = [call.copy() for call in each._begin[now]]
+                if each._world_of is None:
+                    calls[-2].table[each._row_entry] = noise.address
+                    for place, numbers in enumerate(self._drawn):
+                        calls[0].replace(place, numbers)
+                if each is self:
+                    self._shown_first.append(calls[-1])
+                turn += calls
+            self._beginnings.append(CallSequence(turn))
 
     def begin_some(
-        self, lanes: numpy.ndarray, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise
-    ) -> None:
-        """Start new episodes in some lanes and let their first measurement arrive.
+        self,
+        lanes: numpy.ndarray,
+        identities: numpy.ndarray,
+        noise: EpisodeNoise,
+        others: "Sequence[Stepper]" = (),
+    ) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Start episodes in some lanes and let their first measurement arrive; others do so beside it.
 
         Args:
-            lanes: which.
-            uniforms: theirs, padded to the width of ``noise``, likewise what follows.
-            normals: as in :meth:`begin`.
-            noise: of these episodes.
+            lanes: which, ascending.
+            identities: of the episodes, likewise.
+            noise: of as many lanes, or more.
+            others: of the same task.
+
+        Returns:
+            As :meth:`begin`.
         """
-        small = self._small.get(noise.width)
-        if small is None:
-            beside = None if self._world_of is None else self._world_of._small[noise.width]
-            small = self._small[noise.width] = Stepper(self._model, self._report, noise.width, beside)
-        small.begin(uniforms, normals, noise)
-        for numbers, begun in (
-            (self._staying, small._staying),
-            (self._going[self._now], small._going[small._now]),
-        ):
-            numbers[:, lanes] = begun[:, : len(lanes)]
+        steppers = (self, *others)
+        for each in steppers:
+            if noise.width not in each._small:
+                beside = None if each._world_of is None else self._small[noise.width]
+                each._small[noise.width] = Stepper(each._model, each._report, noise.width, beside)
+        small, *smalls = [each._small[noise.width] for each in steppers]
+        start = small.begin(identities, noise, smalls)
+        for each, begun in zip(steppers, (small, *smalls), strict=True):
+            each._staying[:, lanes] = begun._staying[:, : len(lanes)]
+            each._going[each._now][:, lanes] = begun._going[begun._now][:, : len(lanes)]
         if self._given:
             self._show_in(self._shown.copy())
         self._shown[lanes] = small._shown[: len(lanes)]
+        return start
 
     def take(self, action: numpy.ndarray) -> None:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
@@ -414,7 +462,11 @@ class Stepper:
     def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
         self._shown, self._first_shown, self._given = memory, memory[0], False
-        for predict in (*(calls[-1] for calls in (*self._calls, *self._begin)), *self._shown_by):
+        for predict in (
+            *(calls[-1] for calls in (*self._calls, *self._begin)),
+            *self._shown_by,
+            *self._shown_first,
+        ):
             predict.replace(len(predict.arrays) - 1, memory)
 
 
