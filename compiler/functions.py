@@ -1,6 +1,7 @@
 """Functions of nested tuples of arrays, compiled for each structure of their arguments."""
 
 import functools
+import itertools
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -225,14 +226,25 @@ class Call:
         native(self.address, first, last)
 
 
-def run_over(call: Callable[[int, int], None], width: int, threads: int) -> None:
-    """Run over all lanes, shared by some threads; the numbers do not depend on how many."""
-    threads = min(threads, width // FEWEST)
+def run_over(call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST) -> None:
+    """Run over all lanes, shared by some threads; the numbers do not depend on how many.
+
+    Args:
+        call: runs from one lane to another.
+        width: lanes.
+        threads: how many share them, this one among them.
+        fewest: lanes that are worth a thread.
+    """
+    threads = min(threads, width // fewest)
     if threads <= 1:
         call(0, width)
         return
     cuts = [width * i // threads // LANES * LANES for i in range(threads)] + [width]
-    list(_pool(threads, os.getpid()).map(call, cuts[:-1], cuts[1:]))
+    pool = _pool(threads - 1, os.getpid())
+    others = [pool.submit(call, *cut) for cut in itertools.pairwise(cuts[1:])]
+    call(0, cuts[1])
+    for other in others:
+        other.result()
 
 
 @functools.cache

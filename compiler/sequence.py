@@ -8,17 +8,23 @@ A tile of lanes goes through all steps before the next one begins, and stays in 
 """
 
 import functools
+import math
+import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy
 
-from .functions import Call, address_of, run_over
+from .block import LANES
+from .functions import UNCOUNTED, Call, address_of, run_over
 from .native import Native, address_of_code, native_text
 
 TILE = 64
 """Lanes that go through all steps together: enough that a call costs little beside its numbers, few enough for the
 cache. Of programs of 300 to 80,000 operations all run within a tenth of their fastest tile, from 32 to 512 lanes."""
+
+TRIES = 12
+"""Runs in which one thread and several are compared."""
 
 TEXT = """
 define void @program(ptr %given, i64 %first, i64 %last) {
@@ -158,14 +164,17 @@ class CallSequence:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
         self._natives: list[Native | None] = []
+        self._uncounted = 0
+        """Lanes that it ran over and that no code was told of."""
+        self._tries, self._seconds = 0, [math.inf, math.inf]
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
-        self._moving = moving
         self._tables = numpy.array([call.address for call in self._calls], dtype=numpy.int64)
         self._entries = numpy.array(
             [each.call.address + 8 * each.entry for each in moving], dtype=numpy.int64
         )
         self._given = self._put_together(self._tables, self._entries)
         self._run = functools.partial(_driver(), address_of(self._given))
+        self._shares: dict[tuple[int, int], _Share] = {}
 
     def _put_together(self, tables: numpy.ndarray, entries: numpy.ndarray) -> numpy.ndarray:
         """What the driver is given."""
@@ -186,23 +195,59 @@ class CallSequence:
         natives = [call.native for call in self._calls]
         if natives != self._natives:
             self._natives = [call.native or call.expect(0) for call in self._calls]
+            self._tries, self._seconds = 0, [math.inf, math.inf]
             self._codes[:] = list(map(address_of_code, self._natives))
 
     def run(self, width: int, threads: int = 1) -> None:
-        """Run over all lanes, shared by some threads."""
-        if not self._natives:
+        """Run over all lanes, shared by so many threads where that has turned out to be faster."""
+        self._uncounted += width * self._form[1]
+        if self._uncounted > UNCOUNTED:
+            self.expect(self._uncounted // 2)
+            self._uncounted = 0
+        elif not self._natives:
             self.refresh()
-        if threads == 1:
+        if threads == 1 or width < 2 * LANES:
+            self._run(0, width)
+            return
+        # The first runs show it, one way and the other in turn; the shortest of each is least disturbed.
+        trial = self._tries < TRIES
+        alone = self._tries % 2 == 0 if trial else self._seconds[0] < self._seconds[1]
+        begin = time.perf_counter() if trial else 0.0
+        if alone:
             self._run(0, width)
         else:
-            run_over(self._share if self._moving else self._run, width, threads)
+            run_over(self._run_share if len(self._amounts) else self._run, width, threads, LANES)
+        if trial:
+            self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
+            self._tries += 1
 
-    def _share(self, first: int, last: int) -> None:
+    def _run_share(self, first: int, last: int) -> None:
         """Run from one lane to another with tables of its own, since entries move."""
-        tables = [call.table.copy() for call in self._calls]
-        places = {id(call): table for call, table in zip(self._calls, tables, strict=True)}
-        addresses = numpy.array(list(map(address_of, tables)), dtype=numpy.int64)
-        entries = numpy.array(
-            [address_of(places[id(each.call)]) + 8 * each.entry for each in self._moving], dtype=numpy.int64
-        )
-        _driver()(address_of(self._put_together(addresses, entries)), first, last)
+        share = self._shares.get((first, last))
+        if share is None:
+            tables = [call.table.copy() for call in self._calls]
+            addresses = numpy.array(list(map(address_of, tables)), dtype=numpy.int64)
+            # An entry is in one of these tables, as far from its begin as in the call's.
+            owners = [
+                int(numpy.flatnonzero((e >= self._tables) & (e < self._ends()))[0]) for e in self._entries
+            ]
+            entries = addresses[owners] + self._entries - self._tables[owners]
+            given = self._put_together(addresses, entries)
+            share = self._shares[first, last] = _Share(tables, addresses, entries, given, address_of(given))
+        for own, call in zip(share.tables, self._calls, strict=True):
+            own[:] = call.table
+        _driver()(share.address, first, last)
+
+    def _ends(self) -> numpy.ndarray:
+        """Addresses at which the calls' tables end."""
+        return self._tables + 8 * numpy.array([len(call.table) for call in self._calls])
+
+
+class _Share(NamedTuple):
+    """What a thread runs its lanes with."""
+
+    tables: list[numpy.ndarray]
+    addresses: numpy.ndarray
+    entries: numpy.ndarray
+    given: numpy.ndarray
+    address: int

@@ -275,7 +275,7 @@ class Lanes:
         """
         task = self.task
         everyone = lanes is None or len(lanes) == self.count
-        index = slice(None) if everyone else numpy.asarray(lanes)
+        index = numpy.arange(self.count) if lanes is None or everyone else numpy.asarray(lanes)
         if not self._moving and self._report is not None:
             self._reporting(self._report)
         self._moving = self._moving or self._by_functions()

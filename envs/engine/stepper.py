@@ -2,13 +2,12 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 
 from ...compiler.functions import (
     DTYPES,
-    UNCOUNTED,
     Call,
     Leaf,
     Specialised,
@@ -140,25 +139,13 @@ class Stepper:
             model.task.decision_interval,
             DecisionMeans(model.fields, model.task.decision_interval),
         )
-        self._decisions: list[CallSequence] = []
-        """All measurements of a decision, which begins with either copy; bound at the first."""
-        self._draw: Call | None = None
-        """What makes their noise."""
-        self._shown_by: list[Call] = []
-        """Calls of decisions that write what is shown."""
+        self._bound: dict[bool, _Bound] = {}
+        """Whole decisions (True) and beginnings (False), bound at the first of either."""
         self._passing: numpy.ndarray | None = None
         """What is shown at each measurement of a decision, ``(interval, width, fields)``, where means of it are."""
         self.reported: list[numpy.ndarray] = []
         """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
         self._first_rewards = numpy.empty(0)
-        self._stepped = self._begun = 0
-        """Lanes that decisions and starts went over and that no code was told of."""
-        self._beginnings: list[CallSequence] = []
-        """The start and the first measurement, into either copy; bound at the first."""
-        self._draw_first: Call | None = None
-        """What makes its noise."""
-        self._shown_first: list[Call] = []
-        """Calls of beginnings that write what is shown."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
@@ -190,37 +177,37 @@ class Stepper:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, until the next.
         """
         noise.put(identities)
-        draw = noise.call_of_each()
-        if self._given:
-            self._show_in(numpy.empty_like(self._shown))
-        if draw is not self._draw_first:
-            self._bind_beginnings(draw, noise, others)
-        self._begun += self.width
-        if self._begun > UNCOUNTED:
-            for sequence in self._beginnings:
-                sequence.expect(self._begun // 2)
-            self._begun = 0
-        self._beginnings[self._now].run(self.width, self._threads)
-        self._now = 1 - self._now
-        for each in others:
-            each._now = self._now
+        self._run_bound(False, noise, others)
         return self._drawn
 
-    def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
+    def _bind_beginnings(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
         """Bind the start and the first measurement, of the task and of what runs beside it, to memory."""
-        self._draw_first, self._shown_first, self._beginnings = draw, [], []
-        for now in (0, 1):
-            turn = [noise.start_call(self._start_numbers), draw]
-            for each in (self, *others):
-                calls = [call.copy() for call in each._begin[now]]
+        turns = [[noise.start_call(self._start_numbers), draw] for _ in (0, 1)]
+        for each in (self, *others):
+            for begin, turn in zip(each._begin, turns, strict=True):
+                calls = [call.copy() for call in begin]
                 if each._world_of is None:
                     calls[-2].table[each._row_entry] = noise.address
                     for place, numbers in enumerate(self._drawn):
                         calls[0].replace(place, numbers)
-                if each is self:
-                    self._shown_first.append(calls[-1])
                 turn += calls
-            self._beginnings.append(CallSequence(turn))
+        shown = [turn[1 + len(self._begin[0])] for turn in turns]
+        return _Bound(draw, [CallSequence(turn) for turn in turns], shown)
+
+    def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
+        """Run whole decisions, or beginnings, of the task and of what runs beside it, as one native call."""
+        draw = noise.call_of_each()
+        if self._given:
+            self._show_in(numpy.empty_like(self._shown))
+        bound = self._bound.get(whole)
+        if bound is None or bound.draw is not draw:
+            bind = self._bind_decisions if whole else self._bind_beginnings
+            bound = self._bound[whole] = bind(draw, noise, others)
+        bound.sequences[self._now].run(self.width, self._threads)
+        if not whole or self._interval % 2:
+            self._now = 1 - self._now
+            for each in others:
+                each._now = self._now
 
     def begin_some(
         self,
@@ -293,21 +280,7 @@ class Stepper:
 
         A tile of lanes goes through all of it, with the others, as one native call.
         """
-        draw = noise.call_of_each()
-        if self._given:
-            self._show_in(numpy.empty_like(self._shown))
-        if draw is not self._draw:
-            self._bind_decisions(draw, noise, others)
-        self._stepped += self.width * self._interval
-        if self._stepped > UNCOUNTED:
-            for sequence in self._decisions:
-                sequence.expect(self._stepped // 2)
-            self._stepped = 0
-        self._decisions[self._now].run(self.width, self._threads)
-        if self._interval % 2:
-            self._now = 1 - self._now
-            for each in others:
-                each._now = self._now
+        self._run_bound(True, noise, others)
         if self._passing is not None:
             self._shown[...] = self._passing[-1]
             # The first axis is added up row by row, whatever the width, as a sum of the rows would be.
@@ -315,35 +288,39 @@ class Stepper:
             total /= self._interval
             self._shown[:, self._means.columns] = total[:, self._averages]
 
-    def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
+    def _bind_decisions(self, draw: Call, noise: EpisodeNoise, others: "Sequence[Stepper]") -> "_Bound":
         """Bind all measurements of a decision, of the task and of what runs beside it, to memory."""
-        self._draw, self._shown_by = draw, []
-        if self._means.columns:
-            self._passing = numpy.empty((self._interval, *self._shown.shape))
-            first, last = min(self._means.columns), max(self._means.columns)
-            self._averaged = self._passing[..., first : last + 1]
-            self._averages = numpy.array(self._means.columns) - first
+        columns, interval = self._means.columns, self._interval
+        if columns:
+            self._passing = numpy.empty((interval, *self._shown.shape))
+            self._averaged = self._passing[..., min(columns) : max(columns) + 1]
+            self._averages = numpy.array(columns) - min(columns)
+        for each in (self, *others):
+            each.reported = [
+                empty_lanes((interval, *array.shape[:-1]), self.width) for array in each._reported
+            ]
+            each._first_rewards = each.reported[0].reshape(interval, -1)[:, 0]
         turns: list[list[Call]] = [[draw], [draw]]
         moving: list[Moving] = []
         for each in (self, *others):
-            each.reported = [
-                empty_lanes((self._interval, *array.shape[:-1]), self.width) for array in each._reported
-            ]
-            each._first_rewards = each.reported[0].reshape(self._interval, -1)[:, 0]
             for now, turn in enumerate(turns):
-                calls = [call.copy() for call in each._calls[now]]
-                tell, last = calls[1], calls[-1]
-                moving += [moving_array(tell, each._report_place + i, a) for i, a in enumerate(each.reported)]
-                if each._world_of is None:
-                    calls[-2].table[each._row_entry] = noise.address
-                if each is self and self._passing is not None:
-                    moving.append(moving_array(last, len(last.arrays) - 1, self._passing))
-                elif each is self:
-                    self._shown_by.append(last)
-                turn += calls
-        self._decisions = [
-            CallSequence(even, odd, moving, self._interval) for even, odd in (turns, turns[::-1])
-        ]
+                turn += each._bound_copies(now, noise, each.reported, moving)
+        shown = [turn[len(self._calls[0])] for turn in turns]
+        if self._passing is not None:
+            moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
+            shown = []
+        orders = turns, turns[::-1]
+        return _Bound(draw, [CallSequence(even, odd, moving, interval) for even, odd in orders], shown)
+
+    def _bound_copies(
+        self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
+    ) -> list[Call]:
+        """Calls of a step that begins with one of the copies, for tables of which entries move: reports are added."""
+        calls = [call.copy() for call in self._calls[now]]
+        if self._world_of is None:
+            calls[-2].table[self._row_entry] = noise.address
+        moving += [moving_array(calls[1], self._report_place + i, each) for i, each in enumerate(reported)]
+        return calls
 
     def _run(self, calls: Sequence[Call], noise: Any) -> None:
         self._run_calls(self._go_on(calls, noise))
@@ -387,10 +364,8 @@ class Stepper:
         turns: list[list[Call]] = []
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):
-            update, tell, advance, predict = (call.copy() for call in self._calls[now])
-            advance.table[self._row_entry] = noise.address
-            moving += [moving_array(tell, self._report_place + i, each) for i, each in enumerate(reported)]
-            turns.append([update, tell, draw, advance, predict])
+            update, tell, *others = self._bound_copies(now, noise, reported, moving)
+            turns.append([update, tell, draw, *others])
             if compiled_policy is not None and actions is not None:
                 steer = compiled_policy.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
                 turns[-1].insert(0, steer)
@@ -462,12 +437,19 @@ class Stepper:
     def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
         self._shown, self._first_shown, self._given = memory, memory[0], False
-        for predict in (
-            *(calls[-1] for calls in (*self._calls, *self._begin)),
-            *self._shown_by,
-            *self._shown_first,
-        ):
+        bound = (call for each in self._bound.values() for call in each.shown)
+        for predict in (*(calls[-1] for calls in (*self._calls, *self._begin)), *bound):
             predict.replace(len(predict.arrays) - 1, memory)
+
+
+class _Bound(NamedTuple):
+    """What is run as one native call, from either of the two copies of the episodes."""
+
+    draw: Call
+    """What makes the noise of a measurement."""
+    sequences: list[CallSequence]
+    shown: list[Call]
+    """Calls whose last array is what is shown."""
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
