@@ -81,7 +81,7 @@ def online(
     own = control_of(maker, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
     for watch_of in load_present(WATCHES):
-        watched = watch_of(model, maker, kind)
-        if watched is not None:
-            return OnlineFilter(model, watched[0], name, tracks, watched[1], lag)
+        watch = watch_of(model, maker, kind)
+        if watch is not None:
+            return OnlineFilter(model, maker, name, tracks, watch, lag)
     return OnlineFilter(model, maker, name, tracks, lag=lag)

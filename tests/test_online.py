@@ -141,9 +141,9 @@ def test_rows_that_come_one_by_one_make_the_measurements_of_their_log(case, tmp_
     filter.start(mean, covariance, rows["time"][begun - 1], **also)
     for k, row in enumerate(rows[begun:]):
         measurement, _ = filter.input.measure(
-            filter._running().input, np.array([row["time"]]), {name: row[name] for name in names}
+            filter._running().input, float(row["time"]), {name: row[name] for name in names}
         )
-        for name, array in named_arrays(measurement):
+        for name, array in named_arrays(filter._received_of(measurement, np.array([0]))):
             expected = recording.measurements[name][0, k]
             assert array[..., 0].dtype == expected.dtype or expected.dtype.kind in "fi"
             np.testing.assert_array_equal(array[..., 0], expected, err_msg=name)
@@ -588,8 +588,11 @@ def test_policies_and_agents_say_where_they_are_lost():
     filter.start(np.array([STATE, STATE]).T, np.stack([COVARIANCE, COVARIANCE], axis=2))
     estimate = filter.update(4.0, x=[1e4, 1e4], y=[2e4, 2e4])
     assert estimate.lost == estimate.departure == ["", ""]
-    broken = {"mean": estimate.mean, "covariance": estimate.covariance * np.array([1.0, -1.0])}
-    assert filter._estimate(np.zeros(2), broken).lost == ["", "the covariance is not positive definite"]
+    saved = filter.save()
+    signs = np.where(np.arange(saved.filter.covariance.shape[-1]) == 1, -1e3, 1.0)
+    filter.restore(saved._replace(filter=saved.filter._replace(covariance=signs * saved.filter.covariance)))
+    broken = filter.update(8.0, x=[1e4, 1e4], y=[2e4, 2e4])
+    assert broken.lost == ["", "the covariance is not positive definite"]
 
 
 def test_times_since_1970_are_of_the_unit_that_they_must_have():

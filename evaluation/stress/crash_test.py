@@ -107,17 +107,17 @@ class StreamFilter(OnlineFilter):
 
     def begin(self, initial: Any) -> None:
         """Start the tracks from the task's own initial estimate."""
-        state = self.model.start_filter(self._padded(initial))
-        policy = None if self._policy is None else self._policy.begin(range(self.tracks))
-        self._go_on(OnlineState(state, {}, policy, numpy.ones(self.tracks, dtype=bool)))
+        self._go_on(self._begin(initial, {}))
 
     def _check_input(self, memory: Any) -> None:
         """Measurements are given as they are: there is no memory of an input."""
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
         """Take a measurement in; return mean, covariance and what else is reported, arrays ``(..., N)``."""
-        found = self._advance(self._padded(measurement), {})
-        return {name: values[..., : self.tracks] for name, values in found.items()}
+        if self.tracks == 1:
+            measurement = select_lanes(measurement, 0)
+        found = self._advance(measurement, {})
+        return {name: numpy.reshape(values, (*numpy.shape(values)[: numpy.ndim(values) - (self.tracks > 1)], self.tracks)) for name, values in found.items()}
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
