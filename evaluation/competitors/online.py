@@ -87,13 +87,13 @@ class OnlineFilter:
         self.names = tuple(component.name for component in self.task.components)
         self.units = tuple(component.unit for component in self.task.components)
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        asked = self._policy is not None
+        self._is_asked = self._policy is not None or not is_compiled
+        self._no_action = numpy.zeros((len(self._pad), *(self.model.action_space.shape or ())))
         self._update: CompiledUpdate | ModelUpdate = (
-            CompiledUpdate(self.model, report_estimate, tracks, traced, asked, observe)
+            CompiledUpdate(self.model, report_estimate, tracks, traced, self._is_asked, observe)
             if is_compiled
             else ModelUpdate(self.model, report_estimate, tracks, world.measurement, observe)
         )
-        self._in_python = asked or self.model.filter.in_python
         usual = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
         self._usual = None if usual is None else float(usual)
         """Interval of measurements, s; None: any."""
@@ -336,10 +336,10 @@ class OnlineFilter:
         update.arrive(measurement)
         if self._policy is not None:
             after = self._decide(after, update.shown)
-            update.take(after.action[self._pad])
         elif self.watch is not None and before.measurements % self._interval == 0:
             after = self._look(after, update.observed[: self.tracks])
-        update.answer()
+        if self._is_asked:
+            update.answer(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
         return update.report()
 
@@ -374,7 +374,7 @@ class OnlineFilter:
     def _snapshot(self) -> OnlineState:
         state, update = self._running(), self._update
         state = state._replace(filter=update.state, watch=None if self.watch is None else self.watch.memory)
-        if not self._in_python:
+        if not self._is_asked:
             return state._replace(policy=update.policy_state)
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(state._replace(python=None if own is None else (own.memory, own.step_number)))
@@ -445,7 +445,7 @@ class OnlineFilter:
 
     def _resume(self, state: OnlineState) -> None:
         """Go on from a snapshot, which stays as it is."""
-        state = copy.deepcopy(state) if self._in_python else state
+        state = copy.deepcopy(state) if self._is_asked else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
         if self.watch is not None:
@@ -474,12 +474,17 @@ class OnlineFilter:
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:
-        lost, departure = found.pop("lost"), [""] * self.tracks if self.watch is None else self.watch.describe()
+        lost, departure = (
+            found.pop("lost"),
+            [""] * self.tracks if self.watch is None else self.watch.describe(),
+        )
         if self.tracks == 1:
             lost = FAULTS[int(lost) - 1] if lost else ""
         else:
             lost = [FAULTS[int(i) - 1] if i else "" for i in lost]
-        return Estimate(_plain(time), self.names, self.units, **found, lost=lost, departure=self._each(departure))
+        return Estimate(
+            _plain(time), self.names, self.units, **found, lost=lost, departure=self._each(departure)
+        )
 
     def _each(self, words: list[str]) -> Any:
         return words[0] if self.tracks == 1 else words

@@ -4,6 +4,7 @@ A filter of a compiled model takes in a measurement by one native call (:class:`
 functions of its model (:class:`ModelUpdate`). A policy is asked about any number of episodes (:class:`SteppingPolicy`).
 """
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from ...envs.engine.compiled import CompiledModel
 from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
 from .kinds import Policy
-from .steered_filter import compile_policy, trace_decision
+from .steered_filter import compile_policy, trace_policy
 
 MODEL_ROWS = 128
 """Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
@@ -64,8 +65,10 @@ class SteppingPolicy(Policy):
         self.policy = policy
         self.control = model.control  # type: ignore[misc]  # made for it
         self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
-        self._traced: Any = None
+        self._traced: Specialised | None = None
         self._is_traced = False
+        self._bound: dict[int, tuple[list[numpy.ndarray], list[numpy.ndarray], Call]] = {}
+        """What the traced policy reads and writes, and the call, by the number of observations."""
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -133,21 +136,30 @@ class SteppingPolicy(Policy):
     ) -> tuple[Any, Any]:
         """Ask the policy, in code of the processor where it can be traced."""
         if not self._is_traced:
-            self._traced, self._is_traced = compile_policy(self.model, self.policy, trace_decision), True
-        if self._traced is None:
+            trace = functools.partial(trace_policy, interval=1)
+            self._traced, self._is_traced = compile_policy(self.model, self.policy, trace), True
+        traced = self._traced
+        if traced is None:
             answer: tuple[Any, Any] = self.policy.predict(
                 observation, memory, start, deterministic=deterministic
             )
             return answer
-        decide, nothing = self._traced
         width = len(observation)
-        before = memory or map_arrays(lambda array: numpy.zeros((*array.shape[:-1], width)), nothing)
-        action, after = decide(observation.T, before._replace(count=numpy.where(start, 0.0, 1.0)))
+        if width not in self._bound:
+            read = [numpy.zeros(observation.shape), *memory_of(traced.inputs[1:], width)]
+            written = memory_of(traced.outputs, width)
+            self._bound[width] = read, written, traced.bound(read, written)
+        read, written, call = self._bound[width]
+        before = leaves(memory and memory._replace(count=numpy.where(start, 0.0, 1.0)))
+        for array, values in zip(read, [observation, *(before or [0.0] * (len(read) - 1))], strict=True):
+            array[...] = values
+        call(0, width)
+        action, after = copy_arrays(traced.template, written, [leaf.kind for leaf in traced.outputs])
         return action.T, after
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the code: a copy makes its own."""
-        return {**self.__dict__, "_traced": None, "_is_traced": False}
+        return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
         """Episodes that each call of the policy is shown."""
@@ -155,6 +167,16 @@ class SteppingPolicy(Policy):
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
         ]
+
+
+def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
+    """Memory for the arrays that a program reads or writes."""
+    return [empty_lanes(leaf.shape, width) for leaf in arrays]
+
+
+def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+    """Copies of arrays in their own types, in the places of a template of their numbers."""
+    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
 
 
 class MeasurementMemory:
@@ -172,19 +194,15 @@ class MeasurementMemory:
     def __init__(self, like: Any, tracks: int) -> None:
         width, self._like = round_up_lanes(tracks), like
         self.parts = [empty_lanes(array.shape[:-1], width) for array in leaves(like)]
-        self._is_nested = any(isinstance(part, tuple) for part in like)
+        self._is_flat = not any(isinstance(part, tuple) for part in like)
         self._pad = None if tracks == 1 else numpy.minimum(numpy.arange(width), tracks - 1)
-        self._lanes_first = [numpy.moveaxis(part, -1, 0) for part in self.parts]
+        self._places = self.parts if tracks > 1 else [numpy.moveaxis(part, -1, 0) for part in self.parts]
 
     def put(self, measurement: Any) -> None:
         """Write a measurement of tracks, ``(..., N)``, or of one track without this axis."""
-        found = leaves(measurement) if self._is_nested else [part for part in measurement if part is not None]
-        if self._pad is None:
-            for part, values in zip(self._lanes_first, found, strict=True):
-                part[...] = values
-        else:
-            for part, values in zip(self.parts, found, strict=True):
-                part[...] = values[..., self._pad]
+        found = [part for part in measurement if part is not None] if self._is_flat else leaves(measurement)
+        for place, values in zip(self._places, found, strict=True):
+            place[...] = values if self._pad is None else values[..., self._pad]
 
     def copy(self) -> Any:
         """Return the measurement in new arrays of its own types."""
@@ -193,24 +211,24 @@ class MeasurementMemory:
 
 
 class CompiledUpdate:
-    """The filter of a compiled model that takes in one measurement after another, bound to memory of its own: one native
-    call a measurement, or two with an answer in Python between them.
+    """The filter of a compiled model, which takes in one measurement after another in memory of its own: by one native
+    call each, or by two where a policy answers in Python between them.
 
-    What the update hands on as it is stays in the memory of the prediction and of the measurement, so there are two of
-    each by turns.
+    What the update hands on as it is stays where the prediction or the measurement was written, so there are two
+    memories of both, used by turns.
 
     Args:
         model: compiled, of a world that is live.
-        report: dictionary of arrays, made after the measurement was taken in.
+        report: dictionary of arrays, made after a measurement was taken in.
         tracks: how many are followed side by side.
-        policy: traced (:func:`.steered_filter.trace_policy`); None: actions are put by :meth:`take`.
-        is_asked: whether a policy answers in Python between :meth:`arrive` and :meth:`answer`.
-        observe: report on a measurement before it is taken in, by an array ``(fields, N)``; None: what is shown.
+        policy: traced, see :func:`.steered_filter.trace_policy`; None without.
+        is_asked: whether a policy answers in Python.
+        observe: report ``(fields, N)`` made before a measurement is taken in; None: what is shown to a policy.
 
     Attributes:
         shown: to a policy, ``(width, fields)``.
-        observed: by ``observe``, likewise.
-        blank_policy: memory of the traced policy before its first decision; None without.
+        observed: what ``observe`` reports, likewise.
+        blank_policy: memory of the traced policy before its first decision.
     """
 
     def __init__(
@@ -224,73 +242,73 @@ class CompiledUpdate:
     ) -> None:
         update, _, predict, episode = model.programs.later
         tell, first = model.programs.report_program(report), model.programs.first.predict
-        watch = None if observe is None else model.programs.function(observe).specialise(episode)
-        self._width, self._threads = round_up_lanes(tracks), model.threads
+        width = self._width = round_up_lanes(tracks)
+        self._threads = model.threads
+        self.shown = self.observed = numpy.zeros((width, predict.outputs[-1].shape[0]))
         count = itertools.count()
         self._template = map_arrays(lambda _: next(count), episode.filter)
         self._kinds = [array.dtype.kind for array in leaves(episode.filter)]
-        self.shown = self.observed = numpy.zeros((self._width, predict.outputs[-1].shape[0]))
-        fields = [] if watch is None else self._memory(watch.outputs)
+        self._written, reported = memory_of(update.outputs, width), memory_of(tell.outputs, width)
+        (self._action,) = memory_of(update.inputs[-1:], width)
+        self._action[...] = 0.0
+        self._policies = [memory_of(policy.outputs[1:] if policy else (), width) for _ in range(2)]
+        self._policy_template = map_arrays(lambda i: i - 1, policy and policy.template[1])
+        self.blank_policy = map_arrays(
+            lambda i: 0.0 * numpy.ones(self._policies[0][i].shape), self._policy_template
+        )
+        watch = None if observe is None else model.programs.function(observe).specialise(episode)
+        fields = memory_of(watch.outputs if watch else (), width)
         if fields:
             self.observed = fields[0].T
-        self._written, reported = self._memory(update.outputs), self._memory(tell.outputs)
-        self._action = empty_lanes(update.inputs[-1].shape, self._width)
-        self._action[...] = 0.0
-        self._policy = [self._memory(policy.outputs[1:] if policy else ()) for _ in range(2)]
-        self._policy_template = None if policy is None else map_arrays(lambda i: i - 1, policy.template[1])
-        self.blank_policy = map_arrays(lambda i: 0.0 * numpy.ones_like(self._policy[0][i]), self._policy_template)
         self._received = [MeasurementMemory(episode.measurement, tracks) for _ in range(2)]
-        predicted = [self._memory(predict.outputs[:-1]) for _ in range(2)]
+        predicted = [memory_of(predict.outputs[:-1], width) for _ in range(2)]
         self._states: list[list[numpy.ndarray]] = []
-        answers: list[list[Call]] = []
+        looks, answers = [], []
         for now, received in enumerate(self._received):
             given = [*predicted[now], *received.parts, self._action]
-            after = [own if i is None else given[i] for own, i in zip(self._written, update.same, strict=True)]
-            self._states.append(after[: len(self._kinds)])
-            steer = [] if policy is None else [
-                policy.bound([self.shown, *self._policy[1 - now]], [self._action, *self._policy[now]])
+            after = [
+                own if i is None else given[i] for own, i in zip(self._written, update.same, strict=True)
             ]
+            self._states.append(after[: len(self._kinds)])
+            looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
+            memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
             told = tell.bound([*received.parts, *self._states[now]], reported)
+            steer = [policy.bound(*memories)] if policy else []
             answers.append([*steer, update.bound(given, self._written), told])
         self._states.append(self._written[: len(self._kinds)])
-        self._calls: list[Call] = []
-        self._arrivals: list[CallList] = []
-        for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):
-            parts = self._received[now].parts
-            calls = [program.bound([*self._states[before], *parts], [*predicted[now], self.shown])]
-            if watch is not None:
-                calls.append(watch.bound([*parts, *predicted[now]], fields))
-            calls += [] if is_asked else answers[now]
-            self._arrivals.append(CallList(calls))
-            self._calls += calls
-        self._answers = [CallList(calls) for calls in answers] if is_asked else []
-        self._calls += [call for calls in answers if is_asked for call in calls]
+        arrivals = [
+            [
+                program.bound(
+                    [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
+                ),
+                *(looks[now] if is_asked else looks[now] + answers[now]),
+            ]
+            for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0))
+        ]
+        self._calls = [call for calls in (*arrivals, *answers) for call in calls]
+        self._arrivals, self._answers = [CallList(calls) for calls in arrivals], []
+        """From the states of both memories and from one that was put, and the answers."""
+        if is_asked:
+            self._answers = [CallList(calls) for calls in answers]
         self._now, self._stepped = 2, 0
         cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
-    def _memory(self, outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
-        return [empty_lanes(leaf.shape, self._width) for leaf in outputs]
-
     def arrive(self, measurement: Any) -> None:
         """Predict to a measurement, and take it in where nothing is asked in Python."""
         self._stepped += self._width
-        if self._stepped > UNCOUNTED:
+        if self._stepped > UNCOUNTED:  # better code, where that has become worth its time
             for call in self._calls:
                 call.expect(self._stepped // 2)
             self._stepped = 0
-        before, self._now = self._now, 1 if self._now == 0 else 0
+        before, self._now = self._now, int(self._now == 0)
         self._received[self._now].put(measurement)
         run_over(self._arrivals[before], self._width, self._threads)
 
-    def take(self, action: numpy.ndarray) -> None:
-        """Apply an action from now on, ``(width, ...)``."""
+    def answer(self, action: numpy.ndarray) -> None:
+        """Take the measurement in with an action that was chosen in Python, ``(width, ...)``."""
         self._action[...] = action.T
-
-    def answer(self) -> None:
-        """Take the measurement in, where that was not done."""
-        if self._answers:
-            run_over(self._answers[self._now], self._width, self._threads)
+        run_over(self._answers[self._now], self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
         """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
@@ -299,66 +317,61 @@ class CompiledUpdate:
     @property
     def state(self) -> Any:
         """State of the filter, in arrays of the caller's own."""
-        arrays = self._states[self._now]
-        return map_arrays(lambda i: arrays[i].astype(DTYPES[self._kinds[i]], order="C"), self._template)
+        return copy_arrays(self._template, self._states[self._now], self._kinds)
 
     @property
     def policy_state(self) -> Any:
         """Memory of the traced policy, likewise."""
-        return map_arrays(lambda i: self._policy[1 if self._now else 0][i].copy(), self._policy_template)
+        return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
     def go_on(self, state: Any, policy: Any) -> None:
         """Go on from a state of the filter, and from a memory of the traced policy."""
-        for memory, values in zip(self._written, leaves(state), strict=False):
-            memory[...] = values
-        if self._policy_template is not None:
-            for memory, values in zip(self._policy[1], leaves(policy), strict=True):
-                memory[...] = values
         self._now = 2
+        arrays = leaves(state) + (leaves(policy) if self._policy_template else [])
+        for memory, values in zip([*self._states[2], *self._policies[1]], arrays, strict=True):
+            memory[...] = values
 
 
 class ModelUpdate:
-    """The same by the functions of a model, whatever computes them; arguments as of :class:`CompiledUpdate`."""
+    """The same by the functions of a model, with an answer in Python or the action zero; arguments as of
+    :class:`CompiledUpdate`, and a measurement for its shapes and types.
+    """
 
     blank_policy = policy_state = None
 
     def __init__(self, model: Model, report: Report, tracks: int, like: Any, observe: Report | None) -> None:
-        self._model, self._make_report, self._tracks, self._observe = model, report, tracks, observe
+        self._model, self._make_report, self._observe = model, report, observe
+        self._cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._received = MeasurementMemory(like, tracks)
-        self._episode: Any = None
-        shape = model.action_space.shape or ()
-        self._is_box, self._action = bool(shape), numpy.zeros((*shape, round_up_lanes(tracks)))
-        self._reported: dict[str, numpy.ndarray] = {}
         self.state: Any = None
-        """Of the filter, arrays that never change."""
-        self.observed: Any = None
-
-    @property
-    def shown(self) -> numpy.ndarray:
-        """Shown to a policy, ``(width, fields)``."""
-        return numpy.asarray(self._model.observe(self._episode)).T
+        """Of the filter, in arrays that never change."""
 
     def arrive(self, measurement: Any) -> None:
         """Predict to a measurement."""
         self._received.put(measurement)
         measured = self._received.copy()
         self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))
-        if self._observe is not None:
-            self.observed = self._model.run(self._observe, self._episode).T
 
-    def take(self, action: numpy.ndarray) -> None:
-        """Apply an action from now on, ``(width, ...)``."""
-        self._action = numpy.asarray(action.T, dtype=float) if self._is_box else action.T
+    @property
+    def shown(self) -> numpy.ndarray:
+        """Shown to a policy, ``(width, fields)``."""
+        return numpy.asarray(self._model.observe(self._episode)).T
 
-    def answer(self) -> None:
-        """Take the measurement in."""
-        after = self._model.act(self._episode, self._action)
-        self.state, self._reported = after.filter, self._model.run(self._make_report, after)
+    @property
+    def observed(self) -> numpy.ndarray:
+        """What ``observe`` reports, likewise."""
+        return numpy.asarray(self._model.run(self._observe, self._episode)).T
+
+    def answer(self, action: numpy.ndarray) -> None:
+        """Take the measurement in with an action, ``(width, ...)``."""
+        turned = numpy.asarray(action.T, dtype=float if self._model.action_space.shape else None)
+        self._episode = self._model.act(self._episode, turned)
+        self.state = self._episode.filter
 
     def report(self) -> dict[str, Any]:
         """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
-        cut: Any = (..., 0) if self._tracks == 1 else (..., slice(self._tracks))
-        return {name: numpy.copy(array[cut])[()] for name, array in self._reported.items()}
+        reported = self._model.run(self._make_report, self._episode)
+        return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
 
     def go_on(self, state: Any, policy: Any) -> None:
         """Go on from a state of the filter."""

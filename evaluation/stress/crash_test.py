@@ -22,9 +22,9 @@ from ...envs.data.recorded_world import Feed
 from ...envs.engine.backend import make_model
 from ...envs.engine.scenario_choice import find_scenario
 from ...filters.gaussian import log_density
+from ..competitors.adapters import select_lanes
 from ..competitors.filters import find_fault
 from ..competitors.online import OnlineFilter
-from ..competitors.online_state import OnlineState
 from ..running.evaluate import Experiment, control_of
 from ..running.seeds import episode_seeds
 from ..statistics.bootstrap import Bootstrap, IntervalEstimate
@@ -114,10 +114,10 @@ class StreamFilter(OnlineFilter):
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
         """Take a measurement in; return mean, covariance and what else is reported, arrays ``(..., N)``."""
-        if self.tracks == 1:
-            measurement = select_lanes(measurement, 0)
-        found = self._advance(measurement, {})
-        return {name: numpy.reshape(values, (*numpy.shape(values)[: numpy.ndim(values) - (self.tracks > 1)], self.tracks)) for name, values in found.items()}
+        if self.tracks > 1:
+            return self._advance(measurement, {})
+        found = self._advance(select_lanes(measurement, 0), {})
+        return {name: numpy.asarray(values)[..., None] for name, values in found.items()}
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:
