@@ -19,18 +19,6 @@ Memory = dict[str, Any]
 """What an input remembers of the measurements before: values by name."""
 
 
-def choose(condition: Any, first: Any, second: Any) -> Any:
-    """One of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
-    if condition.__class__ is bool:
-        return first if condition else second
-    return numpy.where(condition, first, second)
-
-
-def is_finite(number: Any) -> Any:
-    """Whether a float, or every number of an array, is finite."""
-    return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
-
-
 class LiveInput:
     """Makes measurements of values as they come.
 
@@ -64,11 +52,7 @@ class LiveInput:
         self.lanes: tuple[int, ...] = () if tracks == 1 else (tracks,)
         self.parameters: Any = task.parameters
         self.initial, self.measurement = initial, measurement
-        self._fields = [
-            (name, array.shape[:-1], array.dtype)
-            for name, array in measurement._asdict().items()
-            if hasattr(array, "dtype")
-        ]
+        self._fields = {name: one for name, one in measurement._asdict().items() if hasattr(one, "dtype")}
         self.values, self.start_values = self.describe()
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
@@ -146,35 +130,29 @@ class LiveInput:
         found = {}
         for name, array in self.initial._asdict().items():
             if array is not None:
-                values = self._whole(given, name, array.shape[:-1], array.dtype, "at the start")
-                found[name] = numpy.reshape(values, (*array.shape[:-1], self.tracks))
+                values = self._read_finite(given, name, array, "at the start")
+                found[name] = numpy.reshape(values, (*array.shape[:-1], self.tracks)).astype(array.dtype)
         return type(self.initial)(**found), {"time": time, "count": self.same_of_all(0.0)}
 
     def same_of_all(self, number: float, shape: tuple[int, ...] = ()) -> Any:
         """One number in every place, ``(*shape, N)``, of one track ``shape``."""
         return numpy.full((*shape, *self.lanes), number) if shape or self.lanes else number
 
-    def _whole(
-        self, given: Mapping[str, Any], name: str, shape: tuple[int, ...], dtype: Any, what: str
-    ) -> Any:
-        """Return a value in the type of an array.
+    def _read_finite(self, given: Mapping[str, Any], name: str, like: numpy.ndarray, what: str) -> Any:
+        """Return a value as :meth:`read` does, rounded as the type of an array says.
 
         Raises:
             ValueError: for what is missing or not finite.
         """
-        values = self.read(given, name, shape)
-        is_float = values.__class__ is float
-        if not math.isfinite(values) if is_float else numpy.count_nonzero(~numpy.isfinite(values)):
+        values, dtype = self.read(given, name, like.shape[:-1]), like.dtype
+        if numpy.count_nonzero(numpy.isfinite(values)) < numpy.size(values):
             raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(given)}")
-        if dtype.kind == "b":
-            return values > 0.5
         if dtype.kind == "f":
             return values
-        return float(int(values)) if is_float else values.astype(dtype)
+        return values > 0.5 if dtype.kind == "b" else numpy.trunc(values)
 
     def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
-        """Make the measurement of the values that came at a time: a NamedTuple of values, which are floats also where
-        the task's are of another type.
+        """Make the measurement of the values that came at a time, floats also where the task's are of another type.
 
         Args:
             memory: of the measurements before.
@@ -185,11 +163,10 @@ class LiveInput:
             ValueError: for what is missing, unknown, or of another shape.
         """
         count = memory["count"] + 1.0
-        made = {self.counter: count} if hasattr(self.measurement, self.counter) else {}
+        made = {self.counter: count} if self.counter in self._fields else {}
         field = self.task.World.received_field
         if field:
-            like = self.measurement.available
-            shape = getattr(self.measurement, field).shape[:-1]
+            like, shape = self._fields["available"], self._fields[field].shape[:-1]
             received = self.read(values, field, shape)
             there = numpy.isfinite(received)
             if like.ndim == 1:
@@ -199,9 +176,9 @@ class LiveInput:
             whole = numpy.count_nonzero(there) == there.size
             made[field] = received if whole else self.replace_missing(memory, received, there)
             made["available"] = there
-        for name, shape, dtype in self._fields:
+        for name, array in self._fields.items():
             if name not in made:
-                made[name] = self._whole(values, name, shape, dtype, "at every measurement")
+                made[name] = self._read_finite(values, name, array, "at every measurement")
         return type(self.measurement)(**made), {**memory, "time": time, "count": count}
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:

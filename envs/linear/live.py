@@ -58,8 +58,8 @@ class StateSpaceInput(LiveInput):
         if numpy.count_nonzero(wrong):
             raise ValueError(
                 f"the model of {self.task.id} moves by {own:g} s from one measurement to the next, got "
-                f"{float(numpy.extract(wrong, interval)[0]):g} s: call update once in every interval, without values where nothing "
-                "came, or write f(x, dt) and Q(dt)"
+                f"{float(numpy.extract(wrong, interval)[0]):g} s: call "
+                "update once in every interval, without values where nothing came, or write f(x, dt) and Q(dt)"
             )
         return self._checked(super().measure(memory, time, values), interval)
 

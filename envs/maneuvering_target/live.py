@@ -1,12 +1,13 @@
 """Radar plots as they come, as measurements of ManeuveringTarget; columns as of :mod:`.logs`."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy
 
 from ...filters import polar
-from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory, choose, is_finite
+from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory
 from ..logs.plausibility import check_degrees
 from .logs import COLUMNS, FARTHEST_RANGE, east_north, two_plot_start
 from .world import Measurement, Odometry
@@ -14,6 +15,18 @@ from .world import Measurement, Odometry
 SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
 PLACE = ("latitude", "longitude", "altitude")
 VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "azimuth_sigma")
+
+
+def choose(condition: Any, first: Any, second: Any) -> Any:
+    """One of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
+    if condition.__class__ is bool:
+        return first if condition else second
+    return numpy.where(condition, first, second)
+
+
+def is_finite(number: Any) -> Any:
+    """Whether a float, or every number of an array, is finite."""
+    return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
 
 
 class PlotInput(LiveInput):

@@ -329,7 +329,7 @@ class OnlineFilter:
         return select_lanes(memory.copy(), track)
 
     def _advance(self, measurement: Any, memory: Any) -> dict[str, Any]:
-        """Take in a measurement of the task, and report on it in arrays ``(..., N)``, of one track without this axis."""
+        """Take in a measurement of the task, and report on it in arrays ``(..., N)``, of one track ``(...)``."""
         before, update = self._running(), self._update
         # As of _replace, which takes longer than the filter: other input, one more measurement.
         after = OnlineState(None, memory, *before[2:4], before.measurements + 1, *before[5:])
@@ -474,17 +474,11 @@ class OnlineFilter:
         return state
 
     def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:
-        lost, departure = (
-            found.pop("lost"),
-            [""] * self.tracks if self.watch is None else self.watch.describe(),
-        )
-        if self.tracks == 1:
-            lost = FAULTS[int(lost) - 1] if lost else ""
-        else:
-            lost = [FAULTS[int(i) - 1] if i else "" for i in lost]
-        return Estimate(
-            _plain(time), self.names, self.units, **found, lost=lost, departure=self._each(departure)
-        )
+        lost, count = found.pop("lost"), self.tracks
+        words = [FAULTS[int(i) - 1] if i else "" for i in (lost if count > 1 else (lost,))]
+        departure = self._each([""] * count if self.watch is None else self.watch.describe())
+        at = _plain(time)
+        return Estimate(at, self.names, self.units, **found, lost=self._each(words), departure=departure)
 
     def _each(self, words: list[str]) -> Any:
         return words[0] if self.tracks == 1 else words

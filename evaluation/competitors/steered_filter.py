@@ -182,8 +182,8 @@ def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredF
 
 
 def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
-    """Return what a policy decides: a function of what is shown, read lane by lane, and of :class:`Decisions`, which are
-    zero before the first one, to an action and :class:`Decisions`.
+    """Return what a policy decides: a function of what is shown, read lane by lane, and of :class:`Decisions`, zero
+    before the first one, to an action and :class:`Decisions`.
 
     Args:
         model: compiled, in which it acts.

@@ -242,52 +242,46 @@ class CompiledUpdate:
     ) -> None:
         update, _, predict, episode = model.programs.later
         tell, first = model.programs.report_program(report), model.programs.first.predict
-        width = self._width = round_up_lanes(tracks)
-        self._threads = model.threads
-        self.shown = self.observed = numpy.zeros((width, predict.outputs[-1].shape[0]))
-        count = itertools.count()
+        watch = observe and model.programs.function(observe).specialise(episode)
+        self._width = width = round_up_lanes(tracks)
+        self._threads, count = model.threads, itertools.count()
         self._template = map_arrays(lambda _: next(count), episode.filter)
         self._kinds = [array.dtype.kind for array in leaves(episode.filter)]
-        self._written, reported = memory_of(update.outputs, width), memory_of(tell.outputs, width)
-        (self._action,) = memory_of(update.inputs[-1:], width)
-        self._action[...] = 0.0
-        self._policies = [memory_of(policy.outputs[1:] if policy else (), width) for _ in range(2)]
         self._policy_template = map_arrays(lambda i: i - 1, policy and policy.template[1])
+        self._policies = [memory_of(policy.outputs[1:] if policy else (), width) for _ in range(2)]
         self.blank_policy = map_arrays(
-            lambda i: 0.0 * numpy.ones(self._policies[0][i].shape), self._policy_template
+            lambda i: numpy.zeros_like(self._policies[0][i]), self._policy_template
         )
-        watch = None if observe is None else model.programs.function(observe).specialise(episode)
-        fields = memory_of(watch.outputs if watch else (), width)
-        if fields:
-            self.observed = fields[0].T
         self._received = [MeasurementMemory(episode.measurement, tracks) for _ in range(2)]
         predicted = [memory_of(predict.outputs[:-1], width) for _ in range(2)]
+        written, reported = memory_of(update.outputs, width), memory_of(tell.outputs, width)
+        (self._action,), fields = (
+            memory_of(update.inputs[-1:], width),
+            memory_of(watch.outputs if watch else (), width),
+        )
+        self._action[...] = 0.0
+        self.shown = numpy.zeros((width, predict.outputs[-1].shape[0]))
+        self.observed = fields[0].T if fields else self.shown
         self._states: list[list[numpy.ndarray]] = []
+        """After the update in each memory, and one that was put."""
         looks, answers = [], []
         for now, received in enumerate(self._received):
             given = [*predicted[now], *received.parts, self._action]
-            after = [
-                own if i is None else given[i] for own, i in zip(self._written, update.same, strict=True)
-            ]
+            after = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
             self._states.append(after[: len(self._kinds)])
-            looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
             memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
+            looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
             told = tell.bound([*received.parts, *self._states[now]], reported)
             steer = [policy.bound(*memories)] if policy else []
-            answers.append([*steer, update.bound(given, self._written), told])
-        self._states.append(self._written[: len(self._kinds)])
-        arrivals = [
-            [
-                program.bound(
-                    [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
-                ),
-                *(looks[now] if is_asked else looks[now] + answers[now]),
-            ]
-            for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0))
-        ]
-        self._calls = [call for calls in (*arrivals, *answers) for call in calls]
+            answers.append([*steer, update.bound(given, written), told])
+        self._states.append(written[: len(self._kinds)])
+        arrivals = []
+        for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):
+            read, ahead = [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
+            answered = [] if is_asked else answers[now]
+            arrivals.append([program.bound(read, ahead), *looks[now], *answered])
+        self._calls = list(itertools.chain(*arrivals, *answers))
         self._arrivals, self._answers = [CallList(calls) for calls in arrivals], []
-        """From the states of both memories and from one that was put, and the answers."""
         if is_asked:
             self._answers = [CallList(calls) for calls in answers]
         self._now, self._stepped = 2, 0
@@ -301,8 +295,9 @@ class CompiledUpdate:
             for call in self._calls:
                 call.expect(self._stepped // 2)
             self._stepped = 0
-        before, self._now = self._now, int(self._now == 0)
-        self._received[self._now].put(measurement)
+        before, now = self._now, int(self._now == 0)
+        self._received[now].put(measurement)
+        self._now = now
         run_over(self._arrivals[before], self._width, self._threads)
 
     def answer(self, action: numpy.ndarray) -> None:
