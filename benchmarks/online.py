@@ -47,7 +47,7 @@ def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
         rows.append(numpy.column_stack([numpy.full(plots, track), seconds, position]))
     table = numpy.round(numpy.concatenate(rows), 6)
     lines = [",".join("" if numpy.isnan(v) else repr(float(v)) for v in row) for row in table]
-    path.write_text("recording,time,x,y\n" + "\n".join(lines) + "\n")
+    path.write_text("recording,time,x,y,sigma_x,sigma_y\n" + f",{SIGMA},{SIGMA}\n".join([*lines, ""]))
     return table
 
 
@@ -56,7 +56,8 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
     replayed = filtergym.evaluate(
         ID, name, recording, episodes=len(recording.names), tracks=True, sampling_interval=T
     )
-    filter = filtergym.online(ID, name, sampling_interval=T)
+    parameters = {**recording.typical, **recording.parameters}
+    filter = filtergym.online(ID, name, **parameters)
     count = differing = 0
     for episode, track in enumerate(numpy.unique(table[:, 0])):
         rows = table[table[:, 0] == track]
@@ -65,12 +66,12 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
             0, list(replayed["flight"].values).index(recording.names[episode])
         ]
         for k, (_, seconds, x, y) in enumerate(rows[2:]):
-            estimate = filter.update(seconds, x=x, y=y, **recording.deviations)  # as the log's reader assumes
+            estimate = filter.update(seconds, x=x, y=y, sigma_x=SIGMA, sigma_y=SIGMA)
             if k < len(wanted) and numpy.isfinite(wanted[k]).all():
                 count, differing = count + 1, differing + (not numpy.array_equal(estimate.mean, wanted[k]))
             if k % SAVED_EVERY == SAVED_EVERY - 1:
                 state = pickle.dumps(filter.save())
-                filter = filtergym.online(ID, name, sampling_interval=T)
+                filter = filtergym.online(ID, name, **parameters)
                 filter.restore(pickle.loads(state))
     return count, differing
 
