@@ -174,7 +174,7 @@ def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
     return [empty_lanes(leaf.shape, width) for leaf in arrays]
 
 
-def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Any) -> Any:
     """Copies of arrays in their own types, in the places of a template of their numbers."""
     return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
 
@@ -335,7 +335,8 @@ class ModelUpdate:
     blank_policy = policy_state = None
 
     def __init__(self, model: Model, report: Report, tracks: int, like: Any, observe: Report | None) -> None:
-        self._model, self._make_report, self._observe = model, report, observe
+        self._model, self._make_report = model, report
+        self._observe: Any = observe
         self._cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._received = MeasurementMemory(like, tracks)
         self.state: Any = None
