@@ -4,6 +4,7 @@ One object an episode, each asked in turn: honest, and slow. An estimator in a p
 (:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -31,6 +32,28 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
         parts = [select_lanes(item, lanes) for item in part]
         return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
     return part[..., lanes]
+
+
+def takes_problem(maker: Any) -> bool:
+    """Whether a class or function is given the problem: its first argument has no default, or is called so."""
+    try:
+        first = next(iter(inspect.signature(maker).parameters.values()), None)
+    except ValueError:  # of a class that is compiled
+        return True
+    return first is not None and (first.default is first.empty or first.name in ("task", "model"))
+
+
+def check_update_order(found: Any) -> None:
+    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement."""
+    try:
+        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
+    except (AttributeError, TypeError, ValueError):  # without one, or compiled
+        return
+    if "memory" in names[1:]:
+        raise ValueError(
+            f"update takes the memory first, as update({', '.join(['memory', *(n for n in names if n != 'memory')])}), "
+            f"but this one is update({', '.join(names)}): change the order of its arguments"
+        )
 
 
 class SingleTrackEstimator(ABC):
