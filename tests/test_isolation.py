@@ -128,61 +128,6 @@ def test_a_cheat_is_worth_everything_beside_the_truth_and_nothing_apart(cheats):
     np.testing.assert_allclose(found[3:], honest, rtol=1e-12)  # a sum in another order
 
 
-PROBE = '''
-import ctypes, importlib, os, signal, socket, subprocess, sys
-import numpy as np
-
-ATTEMPTS = {
-    "the package": lambda: importlib.import_module("filtergym.envs"),
-    "its files": lambda: open(PACKAGE).read(),
-    "what runs it": lambda: open(f"/proc/{os.getppid()}/cmdline").read(),
-    "its memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
-    "another folder": lambda: os.listdir(FOLDER),
-    "a file of one's own": lambda: open("written", "w"),
-    "another program": lambda: subprocess.run(["/bin/true"], check=True),
-    "a connection": lambda: socket.create_connection(("127.0.0.1", PORT), timeout=1.0),
-}
-
-
-class Probe:
-    """Answers which of its attempts succeed."""
-
-    def start(self, initial, N):
-        return 0
-
-    def update(self, memory, measurement):
-        found = np.zeros(len(ATTEMPTS))
-        for i, attempt in enumerate(ATTEMPTS.values()):
-            try:
-                attempt()
-                found[i] = 1.0
-            except (OSError, ImportError):
-                pass
-        N = measurement.position.shape[-1]
-        mean = np.tile(found.reshape(2, 4)[memory % 2][:, None], (1, N))
-        return mean, np.tile(np.eye(4)[:, :, None], (1, 1, N)), memory + 1
-'''
-
-
-@pytest.mark.skipif(landlock_version() < 4, reason="this system has no Landlock that knows of connections")
-def test_nothing_can_be_reached_from_inside(tmp_path):
-    import socket
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        head = (
-            f"PACKAGE, FOLDER, PORT = {filtergym.__file__!r}, {str(tmp_path)!r}, {server.getsockname()[1]}\n"
-        )
-        apart = isolate_source(head + PROBE, "Probe", "probe")
-        model = make_model(ID, horizon=2)
-        reached = [e.filter.mean[:, 0].copy() for e, _ in rollout(model, apart, [0])]
-        space = {}
-        exec(head + PROBE, space)
-        here = [attempt() for name, attempt in space["ATTEMPTS"].items() if name != "a file of one's own"]
-    assert len(here) == 7  # outside each of them succeeds
-    names = np.array(list(space["ATTEMPTS"]))
-    assert names[np.concatenate(reached) > 0.0].tolist() == []
-
-
 BESIDE = """
 import beside
 import linked

@@ -15,11 +15,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from models import make_model
+from test_wall import without
 
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.task import Component, named_arrays
-from filtergym.evaluation.competitors import isolated_estimator, program_process
+from filtergym.evaluation.competitors import program_process
 from filtergym.evaluation.competitors.program_process import ENDED, LATE, WRONG, Limits, ProgramProcess
 from filtergym.evaluation.competitors.programs import (
     LIMITS,
@@ -259,15 +260,6 @@ def test_a_lost_program_is_a_row_of_the_table(hold):
 # --- pipes and processes
 
 
-def without(folder, *layers):
-    """Write what starts a process on a system that has not these layers of the wall; returns its path."""
-    text = Path(isolated_estimator.__file__).read_text()
-    for layer in layers:
-        text = text.replace(f"def {layer}(", f"{layer} = lambda *_: False\n\n\ndef _{layer}(")
-    (folder / "launcher.py").write_text(text)
-    return str(folder / "launcher.py")
-
-
 def test_neither_side_waits_for_the_other_with_a_full_pipe(tmp_path):
     """An answer is begun when its question is, and both are larger than any pipe."""
     N = 200_000
@@ -305,7 +297,7 @@ def test_nothing_is_left_of_a_process_that_hangs(apart, monkeypatch, tmp_path):
         monkeypatch.setattr(program_process, "LAUNCHER", without(tmp_path, "enter_namespaces"))
     os.mkfifo(tmp_path / "alive")
     alive = os.open(tmp_path / "alive", os.O_RDONLY | os.O_NONBLOCK)
-    words = f"read question; exec 3> {tmp_path}/alive; sleep 100 & setsid sh -c 'sleep 100 & sleep 100' & echo; sleep 100"
+    words = f"read question; exec 3> {tmp_path}/alive; sleep 99 & setsid sh -c 'sleep 99 & sleep 99' & echo; sleep 99"
     process = ProgramProcess(["sh", "-c", words], Limits())
     process.exchange(b"?\n", None, 100)
     own = process._process.pid

@@ -8,13 +8,12 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy
 
 if TYPE_CHECKING:
     from ...envs.contract.task import Task
-    from .kinds import Kind
 
 Array = Any
 """A NumPy array."""
@@ -69,7 +68,7 @@ class SingleTrackEstimator(ABC):
         ValueError: if ``state`` lacks a component of the task.
     """
 
-    kind: ClassVar["Kind"] = "estimator"
+    kind: ClassVar[Literal["estimator"]] = "estimator"
     state: Sequence[str] = ()
     """Names of the numbers of the estimator's state, in its order: the task's components in any order, and whatever
     else there is. Default: the task's components in theirs."""

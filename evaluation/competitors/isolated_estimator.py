@@ -76,7 +76,11 @@ def enter_namespaces(libc: Any, wanted: int) -> bool:
         return True
     if libc.unshare(NEW_USER | wanted):
         return False
-    for name, words in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
+    for name, words in (
+        ("setgroups", "deny"),
+        ("uid_map", f"{user} {user} 1"),
+        ("gid_map", f"{group} {group} 1"),
+    ):
         try:
             with open(f"/proc/self/{name}", "w") as file:
                 file.write(words)
@@ -115,10 +119,9 @@ def limit_own(name: str, most: int) -> None:
     """Limit a resource of this process, unless a lower limit is in force."""
     import resource
 
-    try:
-        resource.setrlimit(getattr(resource, name), (most, most))
-    except ValueError:
-        pass
+    kind = getattr(resource, name)
+    lowest = min([most, *(own for own in resource.getrlimit(kind) if own != resource.RLIM_INFINITY)])
+    resource.setrlimit(kind, (lowest, lowest))
 
 
 def end_children() -> int:
@@ -235,7 +238,9 @@ def wall(readable: list[str], listable: list[str], apart: bool) -> str:
         "leave notes in shared memory, connect, and end or slow this process": filtered or apart,
     }
     without, could = ([name for name, closed in own.items() if not closed] for own in (missing, gaps))
-    return could and f"no whole wall here, without {' and '.join(without)}: it could {', '.join(could)}" or ""
+    return (
+        f"no whole wall here, without {' and '.join(without)}: it could {', '.join(could)}" if could else ""
+    )
 
 
 class SharedModules:
@@ -248,7 +253,8 @@ class SharedModules:
     def __init__(self, texts: dict[str, str]) -> None:
         from importlib.machinery import ModuleSpec
 
-        self.texts, self.new = texts, ModuleSpec
+        self.texts = texts
+        self.new: Any = ModuleSpec
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """Find a module that is shared, or a package around one."""

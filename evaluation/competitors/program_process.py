@@ -20,7 +20,9 @@ from typing import NamedTuple
 from . import isolated_estimator
 
 LAUNCHER = isolated_estimator.__file__
-if (compiled := cache_from_source(LAUNCHER)) and os.path.exists(compiled):  # which takes half the time to start
+if (compiled := cache_from_source(LAUNCHER)) and os.path.exists(
+    compiled
+):  # which takes half the time to start
     LAUNCHER = compiled
 ENDED, LATE, WRONG = 6, 7, 8
 """Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
@@ -215,7 +217,9 @@ class ProgramProcess:
     def apart(self) -> bool:
         """Whether it is in a PID namespace of its own, once it has answered; True where only Linux could say."""
         try:
-            return os.readlink(f"/proc/{self._process.pid}/ns/pid_for_children") != os.readlink("/proc/self/ns/pid")
+            return os.readlink(f"/proc/{self._process.pid}/ns/pid_for_children") != os.readlink(
+                "/proc/self/ns/pid"
+            )
         except OSError:
             return sys.platform != "linux"
 
@@ -224,19 +228,21 @@ class ProgramProcess:
         """Processor time of the process and of all that it has begun, s; NaN where the system does not say."""
         if sys.platform != "linux":
             return float("nan")
-        children: dict[int, list[tuple[int, int]]] = {}
+        children: dict[int, list[int]] = {}
+        ended = {}
         for name in filter(str.isdigit, os.listdir("/proc")):
             with suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
                 state = file.read().rpartition(b")")[2].split()
-                children.setdefault(int(state[1]), []).append((int(name), int(state[13]) + int(state[14])))
-        seconds, waiting = 0.0, [(self._process.pid, 0)]
-        for process, ended in waiting:  # grows: each with those of its children that have ended
-            waiting += children.get(process, [])
+                children.setdefault(int(state[1]), []).append(int(name))
+                ended[int(name)] = int(state[13]) + int(state[14])
+        seconds, processes = 0.0, [self._process.pid]
+        for process in processes:  # which grow, each with those of its children that have ended
+            processes += children.get(process, [])
             try:
                 seconds += time.clock_gettime((~process << 3) | 2)  # clock_getcpuclockid(3)
             except OSError:  # it has ended meanwhile
                 seconds += float("nan") if process == self._process.pid else 0.0
-            seconds += ended / os.sysconf("SC_CLK_TCK")
+            seconds += ended.get(process, 0) / os.sysconf("SC_CLK_TCK")
         return seconds
 
 
