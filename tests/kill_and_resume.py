@@ -4,8 +4,8 @@
 until the seconds are over from the start, interrupted by SIGINT, SIGTERM and SIGKILL until it has ended. What it writes
 must be equal, but for lines that tell times, and nothing unfinished be left.
 
-``python tests/kill_and_resume.py --moments COUNT [COMMAND ...]`` kills each by SIGKILL at so many moments of its writing
-instead, spread over all: before a file is opened, moved or removed, and when half of it is written. Each time the
+``python tests/kill_and_resume.py --moments COUNT [COMMAND ...]`` kills each by SIGKILL at so many moments of its
+writing instead, spread over all: before a file is opened, moved or removed, and when half is written. Each time the
 same command is run again to its end.
 """
 

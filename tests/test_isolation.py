@@ -265,6 +265,28 @@ def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command):
     assert "leave one of them out" in command(*words, "--trust")[2]
 
 
+@pytest.mark.parametrize("isolated", [(), ("--isolated",)])
+def test_a_competitor_that_fails_costs_its_own_row(isolated, tmp_path, monkeypatch, command):
+    """Of one that raises, or cannot be made, or ends itself; what the others have done is written."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    words = "def start(self, initial, N): raise SystemExit(3)\n    def update(self, memory, m): pass\n"
+    unmade = "def __init__(self): raise OSError('full')\n    "
+    (tmp_path / "wretched.py").write_text(f"class Ends:\n    {words}\nclass Unmade:\n    {unmade}{words}")
+    mine = ("--policy", "wretched:Ends", "--policy", "wretched:Unmade", "--policy", "imm")
+    options = ("--episodes", 2, "--set", "horizon=5", "--json", "records.json", *isolated)
+    code, shown, errors = command("evaluate", ID, *mine, *options)
+    sys.modules.pop("wretched", None)
+    prefix = "isolated:" if isolated else ""
+    assert {own["policy"] for own in json.loads((tmp_path / "records.json").read_text())} >= {"imm"}
+    assert "imm" in shown
+    assert code == 2
+    assert f"'{prefix}wretched:Unmade'" in errors
+    assert "OSError: full" in errors
+    assert errors.rstrip().endswith("the others are in the table")
+    assert isolated or "SystemExit: 3" in errors  # a process that ends is a row of lost episodes
+
+
 def test_a_wrong_shape_is_no_answer():
     """Also one that has as many numbers."""
     text = ECHO.replace("memory.mean, memory.cov", "memory.mean.T, memory.cov")
