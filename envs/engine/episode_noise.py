@@ -11,7 +11,6 @@ With llvmlite compiled code makes the numbers, otherwise NumPy, for many measure
 
 import copy
 import functools
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy
 
 from ...compiler.counter_code import bind_numbers
 from ...compiler.counter_numbers import numbers
-from ...compiler.functions import Call, address_of, empty_lanes, leaves, round_up_lanes
+from ...compiler.functions import Call, address_of, empty_lanes, round_up_lanes
 from ...compiler.native import AVAILABLE
 from ..contract.observation import Array
 from ..contract.task import Task
@@ -262,36 +261,3 @@ class EpisodeNoise:
 
 _STATE_ATTRIBUTES = ("width", "identities", "measurement", "generators")
 """Attributes that numbers depend on."""
-
-
-class MeasurementRow:
-    """A measurement that came from outside, in the place of its noise, see :class:`.recorded_world.LiveWorld`.
-
-    Args:
-        like: a measurement, for its shapes.
-        width: lanes, a multiple of eight.
-    """
-
-    def __init__(self, like: Any, width: int) -> None:
-        shapes = [array.shape[:-1] for array in leaves(like)]
-        ends = numpy.cumsum([0, *(math.prod(shape) for shape in shapes)]).tolist()
-        self._row = empty_lanes((ends[-1],), width)
-        self._parts = [
-            self._row[first:last].reshape(*shape, width)
-            for first, last, shape in zip(ends, ends[1:], shapes, strict=False)
-        ]
-        self.address = address_of(self._row)
-
-    def put(self, measurement: Any) -> None:
-        """Let another measurement come."""
-        for part, values in zip(self._parts, leaves(measurement), strict=True):
-            part[...] = values
-
-    @property
-    def row(self) -> numpy.ndarray:
-        """Its numbers, in memory that stays as it is."""
-        return self._row.copy()
-
-    def calls(self) -> tuple[Call, ...]:
-        """Nothing has to be computed."""
-        return ()

@@ -12,7 +12,7 @@ environment with the same seed bit for bit.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 import numpy
@@ -50,8 +50,59 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     return merged
 
 
+class EpisodeStepper(Protocol):
+    """What steps the episodes of a model: :class:`.Stepper` or :class:`ModelStepper`.
+
+    ``others`` are steppers of the same kind, width and task. What is done with the first one is done with them beside
+    it, on the same noise.
+    """
+
+    def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
+        """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
+
+    def begin_some(
+        self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
+    ) -> tuple[Array, Array]:
+        """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+
+    def load(self, episode: Episode, shown: Array = None) -> None:
+        """Go on from other episodes; what they show, ``(fields, width)``, is observed from them unless it is given."""
+
+    def episode(self) -> Episode:
+        """Return the episodes, in arrays that stay as they are."""
+
+    def take(self, action: Array) -> None:
+        """Apply an action from the next decision on, batch first, of all lanes or of the first."""
+
+    def decide(self, noise: EpisodeNoise, others: Any) -> None:
+        """Answer all measurements of a decision by the action, and report on each."""
+
+    def reports(self) -> list[Any]:
+        """Return these reports, each of arrays ``(..., width)`` that stay as they are."""
+
+    @property
+    def rewards(self) -> Any:
+        """These reports where each is one number, ``(interval, width)``."""
+
+    def observation_by_field(self) -> Array:
+        """What is shown, ``(fields, width)``, until the next decision."""
+
+    def observation(self, count: int) -> Array:
+        """Observation of the first lanes, batch first; the caller may keep it."""
+
+    def take_alone(self, action: Array) -> None:
+        """Apply an action of the first lane from the next decision on."""
+
+    def first_reward(self, beside: Any) -> float:
+        """Mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
+
+    def observation_of_first(self) -> Array:
+        """Observation of the first lane; the caller may keep it."""
+
+
 class ModelStepper:
-    """Episodes stepped by the functions of their model, in arrays that never change.
+    """Episodes stepped by the functions of their model, in arrays that never change; calls as of
+    :class:`EpisodeStepper`.
 
     Args:
         model: whose episodes they are.
@@ -62,10 +113,9 @@ class ModelStepper:
     def __init__(self, model: Model, width: int, report: Report | None = None) -> None:
         self.model, self.width, self.report_function = model, width, report
         self._episode: Any = None
-        self._shown: Array = None
+        self.shown: Array = None
         """What is shown, ``(fields, width)``; None until it is computed."""
         self._action: Array = None
-        self._report: Any = None
         self._reports: list[Any] = []
 
     def begin(
@@ -86,7 +136,7 @@ class ModelStepper:
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes; what they show is observed from them unless it is given."""
-        self._episode, self._shown = episode, shown
+        self._episode, self.shown = episode, shown
 
     def begin_some(
         self,
@@ -102,8 +152,8 @@ class ModelStepper:
             task = each.model.task
             episode = each.model.measure(each.model.begin(*start), noise.row)
             where = lanes if task.xp is numpy else task.xp.asarray(lanes, device=task.device)
-            if each._shown is not None:
-                each._shown = _replace_lanes(each._shown, each.model.observe(episode), where)
+            if each.shown is not None:
+                each.shown = _replace_lanes(each.shown, each.model.observe(episode), where)
             each._episode = _replace_lanes(each._episode, episode, where)
         return start
 
@@ -128,16 +178,6 @@ class ModelStepper:
         """Apply an action of the first lane from the next step on."""
         self.take(action[None])
 
-    def answer(self) -> None:
-        """Apply the action to the measurement at hand, and report on it."""
-        self._episode = self.model.act(self._episode, self._action)
-        if self.report_function is not None:
-            self._report = self.model.run(self.report_function, self._episode)
-
-    def arrive(self, noise: Any) -> None:
-        """Go on to the next measurement, see :meth:`.Stepper.arrive`."""
-        self.load(self.model.measure(self._episode, noise.row))
-
     def decide(self, noise: EpisodeNoise, others: "Sequence[ModelStepper]" = ()) -> None:
         """Answer all measurements of a decision by the action, see :meth:`.Stepper.decide`."""
         means = DecisionMeans(self.model.fields, self.model.task.decision_interval)
@@ -147,13 +187,14 @@ class ModelStepper:
         for _ in range(means.interval):
             noise.advance()
             for each in (self, *others):
-                each.answer()
-                each._reports.append(each._report)
-                each.arrive(noise)
+                after = each.model.act(each._episode, each._action)
+                if each.report_function is not None:
+                    each._reports.append(each.model.run(each.report_function, after))
+                each.load(each.model.measure(after, noise.row))
             if means.columns:
                 total = means.add(total, self.observation_by_field())
         if means.columns:
-            self._shown = means.show(self.observation_by_field(), total, self.model.task.xp)
+            self.shown = means.show(self.observation_by_field(), total, self.model.task.xp)
 
     def reports(self) -> list[Any]:
         """Return the reports on the measurements of the last :meth:`decide`, in arrays ``(..., width)``."""
@@ -173,40 +214,17 @@ class ModelStepper:
         """Observation of the first lane; the caller may keep it."""
         return self.observation(1)[0]
 
-    @property
-    def filter_state(self) -> Any:
-        """State of the filter."""
-        return self._episode.filter
-
-    @filter_state.setter
-    def filter_state(self, state: Any) -> None:
-        before = self._episode or Episode((), None, None)
-        self._episode = before._replace(filter=state)
-
-    def report(self) -> Any:
-        """Return the last report, in arrays ``(..., width)``."""
-        return self._report
-
     def observation_by_field(self) -> Array:
         """What is shown, ``(fields, width)``."""
-        if self._shown is None:
-            self._shown = self.model.observe(self._episode)
-        return self._shown
-
-    def observation_if_computed(self) -> Array:
-        """What is shown where it was computed, else None."""
-        return self._shown
+        if self.shown is None:
+            self.shown = self.model.observe(self._episode)
+        return self.shown
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
         shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
-
-
-def make_stepper(model: Model, report: Report, width: int) -> Stepper | ModelStepper:
-    """Return what steps episodes of a model in its fastest way; arguments as of :class:`ModelStepper`."""
-    return Stepper(model, report, width) if can_step(model, report) else ModelStepper(model, width, report)
 
 
 class Lanes:
@@ -243,7 +261,7 @@ class Lanes:
         self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
-        self._moving: list[Any] = []
+        self._moving: Sequence[EpisodeStepper] = []
         """Steppers that hold the episodes, of the task and of what runs beside it; none before the first episode."""
         self.noise = EpisodeNoise(task, count)
         self._some: dict[int, EpisodeNoise] = {}
@@ -334,7 +352,7 @@ class Lanes:
         reward = own.first_reward(beside[0] if beside else None)
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
-    def _take_and_decide(self, action: Array, report: Report) -> list[Any]:
+    def _take_and_decide(self, action: Array, report: Report) -> Sequence[EpisodeStepper]:
         """Apply one decision to all its measurements; returns the steppers that have the reports."""
         steppers = self._reporting(report)
         steppers[0].take(action)
@@ -403,7 +421,7 @@ class Lanes:
             else self.task.constant(actions)
         )
 
-    def _reporting(self, report: Report) -> list[Any]:
+    def _reporting(self, report: Report) -> Sequence[EpisodeStepper]:
         """Steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving
@@ -415,22 +433,23 @@ class Lanes:
                 steppers[1].take(self._beside_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:
-            self._settle()
-            for stepper in self._moving:
+            settled = self._settle()
+            for stepper in settled:
                 stepper.report_function = report
-            return self._moving
+            return settled
         for i, (old, new) in enumerate(zip(before, after, strict=bool(before))):
             new.load(old.episode(), old.observation_by_field() if i == 0 else None)
         self._moving = after
         return after
 
-    def _settle(self) -> None:
-        """Let the models' functions step the episodes, in arrays of their own."""
+    def _settle(self) -> list[ModelStepper]:
+        """Let the models' functions step the episodes, in arrays of their own; returns what does."""
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for i, (old, new) in enumerate(zip(before, self._moving, strict=True)):
                 averaged = i == 0 and self._means.columns
                 new.load(old.episode(), old.observation_by_field().copy() if averaged else None)
+        return [stepper for stepper in self._moving if isinstance(stepper, ModelStepper)]
 
     @property
     def flies_alone(self) -> bool:
@@ -479,7 +498,7 @@ class Lanes:
 
     def _episodes(self) -> tuple[Any, ...]:
         """Episodes of every task with what is shown of them; the arrays never change."""
-        return tuple((stepper.episode(), stepper.observation_if_computed()) for stepper in self._moving)
+        return tuple((stepper.episode(), stepper.shown) for stepper in self._settle())
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
         for stepper, (episode, shown) in zip(self._moving, episodes, strict=True):

@@ -28,8 +28,6 @@ def mean_of(rewards: Sequence[Any]) -> Any:
     return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
-ANSWERING = 2
-"""Of the four parts of a step the first ones: update and report; the others let a measurement arrive."""
 MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
 
@@ -94,8 +92,6 @@ class Stepper:
         self._calls, self._begin = [], []
         self._updated: list[list[numpy.ndarray]] = []
         """State of the filter after the update, of each copy."""
-        self._is_put = False
-        """Whether it is not that of the last update, but one that was put in its place."""
         world, start = model.programs.start
         begun = model.programs.first
         uniforms, normals = world.inputs
@@ -134,7 +130,6 @@ class Stepper:
             self._calls.append(step)
             self._begin.append(begin)
         self._now = 0
-        self._lists: dict[tuple[Call, ...], CallSequence] = {}
         self._interval, self._means = (
             model.task.decision_interval,
             DecisionMeans(model.fields, model.task.decision_interval),
@@ -250,31 +245,6 @@ class Stepper:
         """Apply an action of the first lane from the next step on."""
         self._first_action[...] = action
 
-    def answer(self) -> None:
-        """Apply the action to the measurement at hand, and report on it."""
-        for call in self._calls[self._now][:ANSWERING]:
-            call(0, self.width)
-
-    def arrive(self, noise: Any) -> None:
-        """Go on to the next measurement, whose numbers are those of an :class:`EpisodeNoise`, or a
-        :class:`.MeasurementRow`.
-        """
-        calls = self._begin if self._is_put else self._calls
-        self._is_put = False
-        self._run(calls[self._now][ANSWERING:], noise)
-
-    @property
-    def filter_state(self) -> Any:
-        """State of the filter after the last :meth:`answer`, in arrays that stay as they are."""
-        arrays = self._written if self._is_put else self._updated[self._now]
-        return _copy_numbers(self._filter_template, arrays, self._filter_kinds)
-
-    @filter_state.setter
-    def filter_state(self, state: Any) -> None:
-        for memory, values in zip(self._written, leaves(state), strict=False):
-            memory[...] = values
-        self._is_put = True
-
     def decide(self, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()) -> None:
         """Answer all measurements of a decision by the action, and report on each; others do so beside it.
 
@@ -321,25 +291,6 @@ class Stepper:
             calls[-2].table[self._row_entry] = noise.address
         moving += [moving_array(calls[1], self._report_place + i, each) for i, each in enumerate(reported)]
         return calls
-
-    def _run(self, calls: Sequence[Call], noise: Any) -> None:
-        self._run_calls(self._go_on(calls, noise))
-
-    def _go_on(self, calls: Sequence[Call], noise: Any) -> tuple[Call, ...]:
-        """What is to be called for the next measurement, whose numbers come first; the other copy is then of now."""
-        if self._given:
-            self._show_in(numpy.empty_like(self._shown))
-        if self._world_of is None:
-            calls[-2].table[self._row_entry] = noise.address
-        self._now = 1 - self._now
-        return (*noise.calls(), *calls)
-
-    def _run_calls(self, calls: tuple[Call, ...]) -> None:
-        found = self._lists.get(calls)
-        if found is None:
-            found = self._lists[calls] = CallSequence(calls)
-        found.refresh()
-        found.run(self.width, self._threads)
 
     def run(self, noise: EpisodeNoise, steps: int, compiled_policy: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.
@@ -392,10 +343,6 @@ class Stepper:
         for array in blank:
             array[...] = 0.0
         return blank
-
-    def report(self) -> Any:
-        """Return the report of the last :meth:`answer`, in arrays ``(..., width)`` that stay as they are."""
-        return _copy_numbers(self._report_template, self._reported, self._report_kinds)
 
     def reports(self) -> list[Any]:
         """Return the reports on the measurements of the last :meth:`decide`, each as of :meth:`report`."""

@@ -13,7 +13,6 @@ import numpy
 
 from ...compiler.functions import (
     DTYPES,
-    UNCOUNTED,
     Call,
     Leaf,
     Specialised,
@@ -21,9 +20,8 @@ from ...compiler.functions import (
     leaves,
     map_arrays,
     round_up_lanes,
-    run_over,
 )
-from ...compiler.sequence import CallList
+from ...compiler.sequence import CallSequence
 from ...envs.contract.model import Episode, Model
 from ...envs.engine.compiled import CompiledModel
 from ...envs.engine.programs import Report
@@ -280,30 +278,24 @@ class CompiledUpdate:
             read, ahead = [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
             answered = [] if is_asked else answers[now]
             arrivals.append([program.bound(read, ahead), *looks[now], *answered])
-        self._calls = list(itertools.chain(*arrivals, *answers))
-        self._arrivals, self._answers = [CallList(calls) for calls in arrivals], []
+        self._arrivals, self._answers = [CallSequence(calls) for calls in arrivals], []
         if is_asked:
-            self._answers = [CallList(calls) for calls in answers]
-        self._now, self._stepped = 2, 0
+            self._answers = [CallSequence(calls) for calls in answers]
+        self._now = 2
         cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
         self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
 
     def arrive(self, measurement: Any) -> None:
         """Predict to a measurement, and take it in where nothing is asked in Python."""
-        self._stepped += self._width
-        if self._stepped > UNCOUNTED:  # better code, where that has become worth its time
-            for call in self._calls:
-                call.expect(self._stepped // 2)
-            self._stepped = 0
         before, now = self._now, int(self._now == 0)
         self._received[now].put(measurement)
         self._now = now
-        run_over(self._arrivals[before], self._width, self._threads)
+        self._arrivals[before].run(self._width, self._threads)
 
     def answer(self, action: numpy.ndarray) -> None:
         """Take the measurement in with an action that was chosen in Python, ``(width, ...)``."""
         self._action[...] = action.T
-        run_over(self._answers[self._now], self._width, self._threads)
+        self._answers[self._now].run(self._width, self._threads)
 
     def report(self) -> dict[str, Any]:
         """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
