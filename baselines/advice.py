@@ -28,7 +28,6 @@ from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
 from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.statistics.bootstrap import IntervalEstimate
-from ..evaluation.statistics.predictions import Predictions
 from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
@@ -44,7 +43,8 @@ from .fitting import (
     with_noise_scale,
     with_outliers,
 )
-from .judgement import FEWEST, JudgedFilter, Judgement, Share, likeliest_of, share_out
+from .judgement import FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
+from .log_scores import replay_log, score_log
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -185,8 +185,8 @@ class Advice(NamedTuple):
     """Judged error of the advised one over that of ``best_shipped``, less one."""
     diverging: tuple[str, ...]
     """Fitted filters that lose the track in the whole recording: no competitors."""
-    replay: xarray.Dataset
-    """The whole recording as the fitted one, its rival and the best in hindsight estimate it, with tracks."""
+    replay: Callable[[], xarray.Dataset]
+    """Runs the fitted one, its rival and the best in hindsight over the whole recording, with tracks."""
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
@@ -238,14 +238,18 @@ def advise(
     prices = Prices(makers, price_of)
     counts = {name: len(found.values) for name, found in fits.found.items()}
 
-    def judge(makers: Mapping[str, Any]) -> Judgement:
-        with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
-            dataset = problem.evaluate(makers, recording, tracks=True, **log.keywords)
-        predictions = Predictions(dataset, log.task)
-        return Judgement(predictions, log.share, counts, problem.baselines.score_paper, fits.anchored)
+    experiment = problem.experiment(recording, keywords=log.keywords)
+    roles = roles_of(log.share, recording.seconds.shape)
+
+    def judge(makers: Mapping[str, Any], first: float, last: float) -> Judgement:
+        def tick(share: float) -> None:
+            progress("", first + (last - first) * share)
+
+        scores = score_log(experiment, makers, roles, tick)
+        return Judgement(scores, log.share, counts, problem.baselines.score_paper, fits.anchored)
 
     progress(_first_verdict(fits, len(shipped)), 0.6)
-    judgement = all_judged = judge(makers)
+    judgement = all_judged = judge(makers, 0.6, 0.9)
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.found.items() if name not in fits.anchored}
     )
@@ -257,7 +261,7 @@ def advise(
     takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
     profiles = _fit_again(log, fits, name)
     if log.share.apart:
-        judgement = judge({name: fits.make(name), rival: shipped[rival], best: shipped[best]})
+        judgement = judge({name: fits.make(name), rival: shipped[rival], best: shipped[best]}, 0.98, 1.0)
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
@@ -268,6 +272,7 @@ def advise(
     if not tunable.anchored and likeliest.name != advised.name:
         brought = likeliest.name, all_judged.difference(likeliest.name, advised.name)
     progress("done", 1.0)
+    drawn = {each: fits.make(each) if each in fits.found else shipped[each] for each in (name, rival, best)}
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
@@ -281,7 +286,7 @@ def advise(
         best,
         judgement.relative_error(advised.name, best),
         diverging,
-        judgement.predictions.dataset.sel(policy=list(dict.fromkeys([name, rival, best]))),
+        lambda: replay_log(experiment, drawn),
         fits.found,
         fits.tunables,
         {name: profiles},

@@ -128,6 +128,8 @@ class Stepper:
         self._lists: dict[tuple[Call, ...], CallList] = {}
         self._stepped = 0
         """Lanes that steps went over and that no code was told of."""
+        self._policy_memory: list[numpy.ndarray] | None = None
+        """Of a policy after the last :meth:`run`; None: before its first action."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
@@ -138,6 +140,7 @@ class Stepper:
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values
+        self._policy_memory = None
         if shown is not None:
             self._shown[...] = shown.T
 
@@ -153,6 +156,7 @@ class Stepper:
             normals: of the start of the track, ``(initial_normals, width)``.
             noise: of the measurements.
         """
+        self._policy_memory = None
         for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
             memory[...] = values
         for call in self._begin[self._now]:
@@ -255,7 +259,7 @@ class Stepper:
             noise: of the measurements.
             steps: how many.
             compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros, to
-                an action and the memory. None: the action stays as it is.
+                an action and the memory; a second run of the same episodes goes on. None: the action stays as it is.
 
         Returns:
             The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
@@ -265,6 +269,7 @@ class Stepper:
             self._show_in(self._shown.copy())
         reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
         actions, memories = None, [self._blank_memory(compiled_policy), self._blank_memory(compiled_policy)]
+        memories[0] = self._policy_memory or memories[0]
         if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
         draw = noise.call_of_each()
@@ -282,7 +287,7 @@ class Stepper:
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
         CallSequence(turns[0], turns[1], moving).run(steps, self.width, self._threads)
-        self._now = (self._now + steps) % 2
+        self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)
