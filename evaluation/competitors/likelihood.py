@@ -7,6 +7,7 @@ differences costs one run. A long run goes through its measurements stretch by s
 with them.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -55,6 +56,8 @@ class Windows(NamedTuple):
     """The task's ``Measurement`` of arrays ``(T, ..., W)``."""
     counts: numpy.ndarray
     """Whether a measurement's likelihood counts, ``(T, W)``."""
+    tiles: dict[int, tuple[Any, Any]]
+    """Initial estimates and measurements of so many candidates, of the last number that was run at once."""
 
     def measurement(self, k: int) -> Any:
         """Measurement k of each, the task's ``Measurement`` of arrays ``(..., W)``."""
@@ -98,7 +101,7 @@ def cut_windows(
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
     measurements = fill_arrays(like, arrays.__getitem__, numpy)
-    return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts)
+    return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts, {})
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
@@ -183,8 +186,9 @@ class WindowLikelihood:
     def __init__(
         self, task: Task, windows: Windows, start: Mapping[str, float], apply: Apply, in_lanes: bool = True
     ) -> None:
-        self.task, self.windows, self.apply, self.in_lanes = task, windows, apply, in_lanes
+        self.task, self.apply, self.in_lanes = task, apply, in_lanes
         self.names = tuple(start)
+        self._start = numpy.array([[value] for value in start.values()], dtype=float)
         self._compiled: CompiledFunction | None = None
         if in_lanes and AVAILABLE:
             graph = Graph()
@@ -192,16 +196,24 @@ class WindowLikelihood:
                 traced = type(task)(task.parameters, namespace)
             update = functools.partial(_update, traced, self.names, apply)
             self._compiled = CompiledFunction(update, graph, unchanged=0)
-        self._counts = windows.counts
-        self._tiles: dict[int, tuple[Any, Any]] = {}
-        first = numpy.array([[value] for value in start.values()], dtype=float)
-        known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(first)])
+        self._take(windows)
+
+    def _take(self, windows: Windows) -> None:
+        """Compute it of other windows from now on."""
+        self.windows, self._counts = windows, windows.counts
+        known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])
         if not known.any():
             raise ValueError("the estimator does not say how likely measurements were: return it from update")
         self._counts = windows.counts & known
         self.count = int(self._counts.sum())
         if not self.count:
             raise ValueError("the recording has no measurement that counts")
+
+    def on(self, windows: Windows) -> "WindowLikelihood":
+        """Return the same of other windows, without tracing and compiling it anew; errors as of the class."""
+        other = copy.copy(self)
+        other._take(windows)
+        return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
         """Log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not finite.
@@ -218,18 +230,21 @@ class WindowLikelihood:
             first += len(found)
         return numpy.where(numpy.isfinite(total), total, -numpy.inf)
 
-    def gradient(self, values: numpy.ndarray, step: float = 1e-4) -> tuple[float, numpy.ndarray]:
+    def gradient(
+        self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | None = None
+    ) -> tuple[float, numpy.ndarray]:
         """Log-likelihood of a candidate, and its gradient by central differences, in one run.
 
         Args:
             values: ``(P,)``.
             step: of every parameter; its rounding error is 1e-12 of the log-likelihood over the step.
+            of: numbers of the parameters in the gradient; default: all.
         """
-        moves = step * numpy.eye(len(values))
+        moves = step * numpy.eye(len(values))[:, slice(None) if of is None else of]
         found = self(
             numpy.concatenate([values[:, None], values[:, None] + moves, values[:, None] - moves], axis=1)
         )
-        count = len(values)
+        count = moves.shape[1]
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 
     def _stretches(self, values: numpy.ndarray) -> Iterator[numpy.ndarray]:
@@ -304,8 +319,9 @@ class WindowLikelihood:
         """Initial estimates of so many candidates, one after another, and so many of their measurements from the first
         on, arrays ``(rows, ..., lanes)``.
         """
-        if count in self._tiles:
-            return self._tiles[count]
+        tiles = self.windows.tiles
+        if count in tiles:
+            return tiles[count]
         windows = numpy.arange(round_up_lanes(count * self._counts.shape[1])) % self._counts.shape[1]
 
         def tile(array: numpy.ndarray) -> numpy.ndarray:
@@ -314,5 +330,6 @@ class WindowLikelihood:
         part = map_arrays(lambda array: tile(array[first : first + rows]), self.windows.measurements)
         tiled = map_arrays(tile, self.windows.initial), part
         if rows >= len(self._counts):  # all of them: kept for the next call
-            self._tiles = {count: tiled}
+            tiles.clear()
+            tiles[count] = tiled
         return tiled
