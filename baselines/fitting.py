@@ -365,7 +365,7 @@ def _search_profiles(
     best = numpy.array([found.values[name] for name in tunable.limits])
     information = _information(likelihood, best, limits)
     deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(information)))
-    around = _Maximum(best, found.log_likelihood, likelihood.gradient(best)[1], information, limits)
+    around = _Maximum(best, found.log_likelihood, information, limits)
     profiles, count = {}, 2 * len(best)
     for i, name in enumerate(tunable.limits):
         ways = []
@@ -393,8 +393,6 @@ class _Maximum(NamedTuple):
 
     at: numpy.ndarray
     log_likelihood: float
-    gradient: numpy.ndarray
-    """Not zero at limits."""
     information: numpy.ndarray
     """Of :func:`_information`."""
     limits: numpy.ndarray
@@ -423,7 +421,7 @@ def _walk_profile(
         start = before.copy()
         start[others] = numpy.clip(start[others] + (distance - reached) * slope, low[others], high[others])
         after, log_likelihood = _maximise_others(likelihood, maximum, start, others)
-        expected = distance * abs(maximum.gradient[parameter]) + 0.5 * (distance / deviation) ** 2
+        expected = 0.5 * (distance / deviation) ** 2
         if maximum.log_likelihood - log_likelihood > STEEP * expected:  # not quadratic: the others may stay behind
             other, value = _maximise_others(likelihood, maximum, before, others)
             if value > log_likelihood:

@@ -21,6 +21,7 @@ from ..evaluation.running.rollout import run_stretches
 from ..evaluation.running.threads import one_thread
 from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
 from ..evaluation.statistics.predictions import interval_of_sums, stretches_of
+from ..filters.angles import unwrap
 
 if TYPE_CHECKING:
     import xarray
@@ -30,12 +31,10 @@ ROWS = 1 << 13
 
 
 def report_scores(model: Model, episode: Episode) -> dict[str, Any]:
-    """Report what sums are made of, arrays ``(..., N)``."""
+    """Report what sums are made of, arrays ``(..., N)``: nothing that the log itself holds."""
     records = model.records(episode)
     found = {name: records[name] for name in LIKELIHOOD if name in records}
-    if model.task.has_truth:
-        found["error"] = model.error(episode)
-    return {**found, "estimate": model.track(episode)["estimate"]}
+    return {**found, "estimate": model.mean(episode)}
 
 
 def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
@@ -163,6 +162,7 @@ class LogScores:
 
     def __init__(self, plan: Plan, roles: Roles) -> None:
         self._plan, task = plan, next(iter(plan.models.values())).task
+        self._recording: Any = plan.scenario.recording
         self._task, self.names, n = task, list(plan.competitors), len(plan.competitors)
         chosen, self._judged = (stretches_of(mask[:, : task.horizon]) for mask in roles)
         self.chosen_measurements = int((chosen >= 0).sum())
@@ -201,22 +201,28 @@ class LogScores:
         known = (self._judged[:, first : first + rows] >= 0) & (degrees > 0.0) & numpy.isfinite(nis)
         for i, each in enumerate((nis, degrees)):
             self._nis[:, i] += numpy.where(known, each, 0.0).sum(axis=(1, 2))
+        estimates = [each["estimate"] for each in found]
         if self.squared is not None:
-            errors = [(each["error"][self._components] ** 2).sum(axis=0) for each in found]
-            self.squared.add(numpy.stack(errors), first)
+            truth = self._of_log(self._recording.truth, first, rows)
+            errors = [self._task.subtract(each, truth)[self._components] for each in estimates]
+            self.squared.add(numpy.stack([(each**2).sum(axis=0) for each in errors]), first)
+            estimates = [unwrap(each, truth, self._task.periods) for each in estimates]
         if self.predicted is not None:
-            squares = numpy.stack([self._predict(i, each["estimate"], first) for i, each in enumerate(found)])
+            names = self._recording.measurements
+            measured = {name: self._of_log(values, first, rows) for name, values in names.items()}
+            squares = numpy.stack(
+                [self._predict(i, each, SimpleNamespace(**measured), first) for i, each in enumerate(estimates)]
+            )
             for sums in self.predicted:
                 sums.add(squares, first)
 
-    def _predict(self, i: int, estimate: numpy.ndarray, first: int) -> numpy.ndarray:
+    def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
         """Squared prediction error of the first group, ``(E, rows)``, of what competitor i estimates, ``(C, E, rows)``;
         its products are added up.
         """
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
         assert self._format is not None and self._format.predict is not None
-        measurement = self._measurements(first, estimate.shape[2])
         predicted, measured = self._format.predict(before, measurement, self._task.parameters)
         errors = measured - predicted
         groups = [each.group for each in self._format.predicted[: len(errors)]]
@@ -224,17 +230,17 @@ class LogScores:
         if len(self._whiteness) == i:
             self._whiteness.append(_Whiteness(self._judged, main))
         self._whiteness[i].add(errors, first)
-        return (errors[main] ** 2).sum(axis=0)
+        squares: numpy.ndarray = (errors[main] ** 2).sum(axis=0)
+        return squares
 
-    def _measurements(self, first: int, rows: int) -> SimpleNamespace:
-        """What was measured from a measurement on, arrays ``(..., E, rows)`` by attribute; NaN beyond an episode."""
-        recording, flown = self._plan.scenario.recording, self._plan.flown
-        there = self._there[:, first : first + rows]
-        arrays = {}
-        for name, values in recording.measurements.items():
-            some = values[flown, first : first + rows].astype(float)
-            arrays[name] = numpy.where(there, numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some, math.nan)
-        return SimpleNamespace(**arrays)
+    def _of_log(self, values: Any, first: int, rows: int) -> numpy.ndarray:
+        """What the log holds from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
+        some = values[self._plan.flown, first : first + rows].astype(float)
+        return numpy.where(
+            self._there[:, first : first + rows],
+            numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some,
+            math.nan,
+        )
 
     def nis(self, i: int) -> float:
         """Mean judged normalised innovation squared over its dimension; NaN where it is not known."""

@@ -4,7 +4,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -236,8 +236,7 @@ def run_stretches(
     if can_step(looped, report) and (policy is not None or not is_policy):
         lanes = start_lanes(looped, seeds, report=report)
         for first in range(0, length, rows):
-            found, _ = lanes.run(report, policy, min(rows, length - first))
-            yield {key: values[..., : len(seeds)] for key, values in found.items()}
+            yield _without_padding(lanes.run(report, policy, min(rows, length - first))[0], len(seeds))
         return
     steps = (
         _steer_by_python(model, competitor, seeds, report, name)
@@ -245,7 +244,13 @@ def run_stretches(
         else _step_filter(looped, seeds, report)
     )
     while some := [found for found, _ in itertools.islice(steps, rows)]:
-        yield {key: numpy.stack([each[key] for each in some])[..., : len(seeds)] for key in some[0]}
+        together = {key: numpy.stack([each[key] for each in some]) for key in some[0]}
+        yield _without_padding(together, len(seeds))
+
+
+def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[str, numpy.ndarray]:
+    """Return the first lanes of a report in memory of their own: a view would keep the padding."""
+    return {name: values[..., :count].copy() for name, values in report.items()}
 
 
 def _run_compiled(
