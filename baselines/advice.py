@@ -302,7 +302,9 @@ def advise(
     takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
     profiles = _fit_again(log, fits, name, between(RUN, REFITTED))
     if log.share.apart:
-        judgement = judge({name: fits.make(name), rival: shipped[rival], best: shipped[best]}, between(REFITTED, 1.0))
+        judgement = judge(
+            {name: fits.make(name), rival: shipped[rival], best: shipped[best]}, between(REFITTED, 1.0)
+        )
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
@@ -366,7 +368,7 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
 
 
 def _fit_finalists(log: FittedLog, fits: Fits) -> None:
-    """Fit those to all blocks that fit which may be chosen by what they are worth there with the values of stretches."""
+    """Fit those to all blocks that fit which are near the best there with the values of stretches."""
     means = {name: found.log_likelihood / found.measurements for name, found in fits.found.items()}
     known = {name: mean for name, mean in means.items() if name not in fits.anchored}
     for name, mean in known.items():

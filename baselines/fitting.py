@@ -422,7 +422,8 @@ def _walk_profile(
         start[others] = numpy.clip(start[others] + (distance - reached) * slope, low[others], high[others])
         after, log_likelihood = _maximise_others(likelihood, maximum, start, others)
         expected = 0.5 * (distance / deviation) ** 2
-        if maximum.log_likelihood - log_likelihood > STEEP * expected:  # not quadratic: the others may stay behind
+        if maximum.log_likelihood - log_likelihood > STEEP * expected:
+            # Not quadratic: the others may have stayed behind.
             other, value = _maximise_others(likelihood, maximum, before, others)
             if value > log_likelihood:
                 after, log_likelihood = other, value

@@ -211,7 +211,10 @@ class LogScores:
             names = self._recording.measurements
             measured = {name: self._of_log(values, first, rows) for name, values in names.items()}
             squares = numpy.stack(
-                [self._predict(i, each, SimpleNamespace(**measured), first) for i, each in enumerate(estimates)]
+                [
+                    self._predict(i, each, SimpleNamespace(**measured), first)
+                    for i, each in enumerate(estimates)
+                ]
             )
             for sums in self.predicted:
                 sums.add(squares, first)
@@ -222,7 +225,8 @@ class LogScores:
         """
         before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
         self._estimates[i] = estimate[..., -1:].copy()
-        assert self._format is not None and self._format.predict is not None
+        assert self._format is not None
+        assert self._format.predict is not None
         predicted, measured = self._format.predict(before, measurement, self._task.parameters)
         errors = measured - predicted
         groups = [each.group for each in self._format.predicted[: len(errors)]]

@@ -204,7 +204,7 @@ class Graph:
 
     def _table(self, table: numpy.ndarray) -> int:
         # A digest: of a long recording there are tables of its length.
-        key = ("table", hashlib.blake2b(numpy.ascontiguousarray(table), digest_size=32).digest())
+        key = ("table", hashlib.blake2b(numpy.ascontiguousarray(table).data, digest_size=32).digest())
         if key not in self._found:
             self._found[key] = len(self.tables)
             self.tables.append(table)

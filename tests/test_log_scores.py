@@ -133,7 +133,7 @@ def test_memory_does_not_grow_with_rows_times_competitors(tmp_path, monkeypatch)
         found(values)
         likely.append(peak(lambda f=found, v=values: f(v)))
     more = rows[1] - rows[0]
-    assert scored[1] - scored[0] < 200 * more
+    assert scored[1] - scored[0] < 40 * more
     assert likely[1] - likely[0] < 8 * more
 
 

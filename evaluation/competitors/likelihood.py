@@ -231,7 +231,7 @@ class WindowLikelihood:
         return numpy.where(numpy.isfinite(total), total, -numpy.inf)
 
     def gradient(
-        self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | None = None
+        self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | numpy.ndarray | None = None
     ) -> tuple[float, numpy.ndarray]:
         """Log-likelihood of a candidate, and its gradient by central differences, in one run.
 
