@@ -26,9 +26,8 @@ from ..envs.contract.task import Task
 from ..envs.data.recorded_world import fill_arrays, measure_once
 from ..envs.data.recording import Recording
 from ..envs.engine.scenario_choice import make_task
-from ..evaluation.competitors.likelihood import Span, WindowLikelihood, cut_windows
+from ..evaluation.competitors.likelihood import Span, WindowLikelihood, Windows, cut_windows
 from ..evaluation.statistics.bootstrap import IntervalEstimate
-from ..evaluation.statistics.predictions import Predictions
 from ..filters.array_namespace import select_nested
 from .fitted_filters import families_of
 from .fitting import (
@@ -41,17 +40,25 @@ from .fitting import (
     ScaledNoise,
     fit,
     fit_profiles,
+    fit_stretches,
     with_noise_scale,
     with_outliers,
 )
-from .judgement import FEWEST, JudgedFilter, Judgement, Share, likeliest_of, share_out
+from .judgement import AS_GOOD, FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
+from .log_scores import replay_log, score_log
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
 
+FITTED, RUN, REFITTED = 0.35, 0.7, 0.97
+"""Share of an advice that is done when all families are fitted, all competitors have run over the log, and the chosen
+one is fitted again; of logs of some ten thousand measurements."""
 APART = 10.0
 """s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own
 filter makes of them, and one-step predictions say much of that and little of errors that last."""
+COARSE = 4096
+"""Measurements, of stretches of all blocks, to which families are fitted first where the blocks hold twice as many: a
+parameter is known to 2 % by then, and who is far behind need not be fitted to the rest."""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
@@ -98,16 +105,50 @@ class FittedLog:
             family = with_outliers(family, log_format.scale_noise)
         return with_noise_scale(family, log_format.scale_noise) if self.noise else family
 
+    @cached_property
+    def stretches(self) -> list[Span] | None:
+        """Beginnings of the blocks that fit, of ``COARSE`` measurements in all; None of a recording that is short."""
+        total = sum(span.last - span.first for span in self.share.fitted)
+        if total < 2 * COARSE:
+            return None
+        return [
+            span._replace(last=span.first + -(-COARSE * (span.last - span.first) // total))
+            for span in self.share.fitted
+        ]
+
+    @cached_property
+    def _cut(self) -> dict[Any, Windows]:
+        """Windows that were cut, by what they are of: filters share them."""
+        return {}
+
+    def windows(self, spans: Sequence[Span], anchored: bool = False) -> Windows:
+        """Cut the recording into windows; where they are for ``anchored`` filters, of measurements ``APART``."""
+        every, warm_up = 1, self.share.warm_up
+        if anchored:
+            warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
+            every = max(1, round(APART / self.interval))
+        key = tuple(spans), warm_up, every
+        if key not in self._cut:
+            self._cut[key] = cut_windows(self.recording, self.task, spans, warm_up, every)
+        return self._cut[key]
+
     def likelihood(self, spans: Sequence[Span], tunable: Tunable, thinned: bool = False) -> WindowLikelihood:
         """Likelihood of a tunable's parameters on spans of the recording; of an anchored one, or where that is asked
         for, of measurements that are ``APART``.
         """
-        every, warm_up = 1, self.share.warm_up
-        if tunable.anchored or thinned:
-            warm_up = max(warm_up, int(self.recording.rows.sum()) // MEMORY)
-            every = max(1, round(APART / self.interval))
-        windows = cut_windows(self.recording, self.task, spans, warm_up, every)
+        windows = self.windows(spans, tunable.anchored or thinned)
         return WindowLikelihood(self.task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+
+    def fit(self, tunable: Tunable) -> tuple[Fit, WindowLikelihood]:
+        """Fit a tunable to the blocks that fit, and return their likelihood; of a long recording to stretches of them
+        alone.
+        """
+        if self.stretches is None or tunable.anchored:
+            likelihood = self.likelihood(self.share.fitted, tunable)
+            return fit(likelihood, tunable, self.seed), likelihood
+        coarse = self.likelihood(self.stretches, tunable)
+        likelihood = coarse.on(self.windows(self.share.fitted))
+        return fit_stretches(coarse, tunable, likelihood, self.seed), likelihood
 
 
 class Fits(NamedTuple):
@@ -185,8 +226,8 @@ class Advice(NamedTuple):
     """Judged error of the advised one over that of ``best_shipped``, less one."""
     diverging: tuple[str, ...]
     """Fitted filters that lose the track in the whole recording: no competitors."""
-    replay: xarray.Dataset
-    """The whole recording as the fitted one, its rival and the best in hindsight estimate it, with tracks."""
+    replay: Callable[[], xarray.Dataset]
+    """Runs the fitted one, its rival and the best in hindsight over the whole recording, with tracks."""
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
@@ -225,7 +266,7 @@ def advise(
         log: the recording, and how filters are fitted to it.
         shipped: competitors that are not fitted, by name.
         own: further families, such as an estimator of a user's with limits of its parameters.
-        progress: told what is done, and which share of all.
+        progress: told what is done, or nothing new, and which share of all.
         price_of: says what an update of a competitor costs, of its name and what makes it: ``operations`` and
             whatever else counts; None where that is not known, and then it is taken for dearer than all others.
 
@@ -238,26 +279,32 @@ def advise(
     prices = Prices(makers, price_of)
     counts = {name: len(found.values) for name, found in fits.found.items()}
 
-    def judge(makers: Mapping[str, Any]) -> Judgement:
-        with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
-            dataset = problem.evaluate(makers, recording, tracks=True, **log.keywords)
-        predictions = Predictions(dataset, log.task)
-        return Judgement(predictions, log.share, counts, problem.baselines.score_paper, fits.anchored)
+    experiment = problem.experiment(recording, keywords=log.keywords)
+    roles = roles_of(log.share, recording.seconds.shape)
 
-    progress(_first_verdict(fits, len(shipped)), 0.6)
-    judgement = all_judged = judge(makers)
+    def between(first: float, last: float) -> Callable[[float], None]:
+        return lambda share: progress("", first + (last - first) * share)
+
+    def judge(makers: Mapping[str, Any], tick: Callable[[float], None]) -> Judgement:
+        scores = score_log(experiment, makers, roles, tick)
+        return Judgement(scores, log.share, counts, problem.baselines.score_paper, fits.anchored)
+
+    progress(_first_verdict(fits, len(shipped)), FITTED)
+    judgement = all_judged = judge(makers, between(FITTED, RUN))
     diverging = judgement.find_diverging(
         {name: found for name, found in fits.found.items() if name not in fits.anchored}
     )
-    progress("computing intervals", 0.9)
+    progress("computing intervals", RUN)
     rival, best = judgement.rival(prices.operations), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     chosen, anchor = _choose(log, fits, judgement, competitors)
     name, tunable = chosen.name, fits.tunables[chosen.name]
     takes_fitted = tunable.anchored or judgement.is_worth(chosen, rival, prices.operations)
-    profiles = _fit_again(log, fits, name)
+    profiles = _fit_again(log, fits, name, between(RUN, REFITTED))
     if log.share.apart:
-        judgement = judge({name: fits.make(name), rival: shipped[rival], best: shipped[best]})
+        judgement = judge(
+            {name: fits.make(name), rival: shipped[rival], best: shipped[best]}, between(REFITTED, 1.0)
+        )
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
@@ -268,6 +315,7 @@ def advise(
     if not tunable.anchored and likeliest.name != advised.name:
         brought = likeliest.name, all_judged.difference(likeliest.name, advised.name)
     progress("done", 1.0)
+    drawn = {each: fits.make(each) if each in fits.found else shipped[each] for each in (name, rival, best)}
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
@@ -281,7 +329,7 @@ def advise(
         best,
         judgement.relative_error(advised.name, best),
         diverging,
-        judgement.predictions.dataset.sel(policy=list(dict.fromkeys([name, rival, best]))),
+        lambda: replay_log(experiment, drawn),
         fits.found,
         fits.tunables,
         {name: profiles},
@@ -307,15 +355,30 @@ def _fit_families(log: FittedLog, own: Mapping[str, Tunable], progress: Callable
             begin = tunable
             if name in fits.found:
                 begin = dataclasses.replace(tunable, start={**tunable.start, **fits.found[name].values})
-            likelihood = log.likelihood(log.share.fitted, begin)
-            found = fit(likelihood, begin, log.seed)
+            found, likelihood = log.fit(begin)
             if name not in fits.found or found.log_likelihood > fits.found[name].log_likelihood + DROP:
                 fits.found[name], fits.tunables[name], fits.likelihoods[name] = found, tunable, likelihood
         mean = fits.found[name].log_likelihood / fits.found[name].measurements
-        progress(f"fitted {name}: {mean:.3f} nats per measurement", 0.6 * (i + 1) / len(families))
+        progress(f"fitted {name}: {mean:.3f} nats per measurement", FITTED * (i + 1) / len(families))
         if i == 0:  # where the simplest family sees no outliers, the others have fewer reasons to
             outliers = OUTLIER_SHARE in fits.found[name].values
+    if log.stretches is not None:
+        _fit_finalists(log, fits)
     return fits
+
+
+def _fit_finalists(log: FittedLog, fits: Fits) -> None:
+    """Fit those to all blocks that fit which are near the best there with the values of stretches."""
+    means = {name: found.log_likelihood / found.measurements for name, found in fits.found.items()}
+    known = {name: mean for name, mean in means.items() if name not in fits.anchored}
+    for name, mean in known.items():
+        if mean > max(known.values()) - AS_GOOD:
+            found, tunable = fits.found[name], fits.tunables[name]
+            begin = dataclasses.replace(tunable, start=found.values)
+            whole = fit(fits.likelihoods[name], begin, log.seed, starts=1)
+            if whole.log_likelihood > found.log_likelihood:
+                gain = whole.log_likelihood - found.log_likelihood
+                fits.found[name] = whole._replace(spread=found.spread + gain)
 
 
 def _choose(
@@ -334,7 +397,9 @@ def _choose(
     return chosen, anchor
 
 
-def _fit_again(log: FittedLog, fits: Fits, name: str) -> dict[str, Profile]:
+def _fit_again(
+    log: FittedLog, fits: Fits, name: str, tick: Callable[[float], None] = lambda share: None
+) -> dict[str, Profile]:
     """Fit the chosen family to all that does not judge, where there is such, and return the profiles of its likelihood
     there.
     """
@@ -343,7 +408,7 @@ def _fit_again(log: FittedLog, fits: Fits, name: str) -> dict[str, Profile]:
         begin = dataclasses.replace(tunable, start=found.values)
         fits.likelihoods[name] = log.likelihood([*log.share.fitted, *log.share.chosen], begin)
         found = fit(fits.likelihoods[name], begin, log.seed, starts=1)._replace(spread=found.spread)
-    fits.found[name], profiles = fit_profiles(fits.likelihoods[name], tunable, found)
+    fits.found[name], profiles = fit_profiles(fits.likelihoods[name], tunable, found, tick)
     return profiles
 
 

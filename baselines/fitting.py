@@ -12,7 +12,7 @@ Measurements may come from a mixture: most have the stated deviations, a fitted 
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -44,6 +44,12 @@ HIGHER = 0.1
 MOST_RESTARTS = 6
 STEPS = 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0, 12.0
 """Distances from the maximum at which a profile is computed, in units of the parameter's deviation at the maximum."""
+NEWTON_STEPS = 8
+"""Of a search for the other parameters at a step of a profile, at most."""
+LEAST_GAIN = 1e-4
+"""Nats that are worth another step of it."""
+STEEP = 1.5
+"""Times that a likelihood may fall as a quadratic one would; where it falls more a second search begins elsewhere."""
 IDENTIFIABLE = 100.0
 """Largest ratio of the ends of an interval of a size; what is wider says nothing."""
 
@@ -227,6 +233,48 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
         seed: of the starts.
         starts: how many.
     """
+    ends = _find_maxima(likelihood, tunable, seed, starts)
+    values = [-likelihood.count * float(end.fun) for end in ends]
+    best = int(numpy.argmax(values))
+    return _as_fit(tunable, ends[best].x, likelihood.count, values)
+
+
+def fit_stretches(
+    likelihood: WindowLikelihood, tunable: Tunable, whole: WindowLikelihood, seed: int = 0
+) -> Fit:
+    """Maximise the likelihood of stretches of a long recording, and return the likeliest end of the whole of it, which
+    is no maximum there yet.
+
+    Args:
+        likelihood: of stretches.
+        tunable: the estimator, with limits.
+        whole: the likelihood of the whole.
+        seed: of the starts.
+    """
+    ends = _find_maxima(likelihood, tunable, seed, STARTS)
+    values = whole(numpy.array([end.x for end in ends]).T).tolist()
+    losses = [float(end.fun) for end in ends]
+    # Ends that stretches hold for one maximum may be some nats apart on the whole, where the search has not been yet.
+    spread = whole.count * (max(losses) - min(losses))
+    best = int(numpy.argmax(values))
+    return _as_fit(tunable, ends[best].x, whole.count, values)._replace(spread=spread)
+
+
+def _as_fit(tunable: Tunable, best: numpy.ndarray, count: int, values: Sequence[float]) -> Fit:
+    """Return a fit at one of several ends, whose log-likelihoods are given: the best."""
+    low, high = numpy.array(list(tunable.limits.values())).T
+    edge = 1e-3 * (high - low)
+    at_limit = tuple(
+        name
+        for name, value, a, b, margin in zip(tunable.limits, best, low, high, edge, strict=True)
+        if value - a < margin or b - value < margin
+    )
+    found = dict(zip(tunable.limits, map(float, best), strict=True))
+    return Fit(found, max(values), count, max(values) - min(values), at_limit)
+
+
+def _find_maxima(likelihood: WindowLikelihood, tunable: Tunable, seed: int, starts: int) -> list[Any]:
+    """Return where searches from several starts end, SciPy's results of least mean loss, nats per measurement."""
     from scipy.optimize import minimize
 
     limits = list(tunable.limits.values())
@@ -244,7 +292,7 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
     if starts > 1:
         inside = low + (high - low) * generator.uniform(0.05, 0.95, (SCREENED, len(low)))
         begins += list(inside[numpy.argsort(-likelihood(inside.T))[: starts - 1]])
-    ends = [
+    return [
         minimize(
             objective,
             begin,
@@ -255,16 +303,6 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
         )
         for begin in begins
     ]
-    best = min(ends, key=lambda end: float(end.fun))
-    edge = 1e-3 * (high - low)
-    at_limit = tuple(
-        name
-        for name, value, a, b, margin in zip(tunable.limits, best.x, low, high, edge, strict=True)
-        if value - a < margin or b - value < margin
-    )
-    spread = likelihood.count * (max(float(end.fun) for end in ends) - float(best.fun))
-    values = dict(zip(tunable.limits, map(float, best.x), strict=True))
-    return Fit(values, -likelihood.count * float(best.fun), likelihood.count, spread, at_limit)
 
 
 def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarray) -> numpy.ndarray:
@@ -290,7 +328,10 @@ class _Way(NamedTuple):
 
 
 def fit_profiles(
-    likelihood: WindowLikelihood, tunable: Tunable, found: Fit
+    likelihood: WindowLikelihood,
+    tunable: Tunable,
+    found: Fit,
+    tick: Callable[[float], None] = lambda share: None,
 ) -> tuple[Fit, dict[str, Profile]]:
     """Profile likelihood of all parameters, the others searched anew at every step; and the fit at its maximum.
 
@@ -300,32 +341,40 @@ def fit_profiles(
         likelihood: of the tunable's parameters.
         tunable: the estimator, with limits.
         found: of :func:`fit`.
+        tick: called with the share that is done, less where the fit starts again.
     """
     for _ in range(MOST_RESTARTS):
-        profiles, higher = _search_profiles(likelihood, tunable, found)
+        profiles, higher = _search_profiles(likelihood, tunable, found, tick)
         if higher is None:
             return found, profiles
         start = dict(zip(tunable.limits, map(float, higher), strict=True))
         again = fit(likelihood, dataclasses.replace(tunable, start=start), starts=1)
         found = again._replace(spread=found.spread + again.log_likelihood - found.log_likelihood)
-    return found, _search_profiles(likelihood, tunable, found, stop=False)[0]
+    return found, _search_profiles(likelihood, tunable, found, tick, stop=False)[0]
 
 
 def _search_profiles(
-    likelihood: WindowLikelihood, tunable: Tunable, found: Fit, stop: bool = True
+    likelihood: WindowLikelihood,
+    tunable: Tunable,
+    found: Fit,
+    tick: Callable[[float], None],
+    stop: bool = True,
 ) -> tuple[dict[str, Profile], numpy.ndarray | None]:
     """Profiles, and a point that is likelier than the fit, at which the search ends if it is to ``stop``."""
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
-    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
-    profiles = {}
+    information = _information(likelihood, best, limits)
+    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(information)))
+    around = _Maximum(best, found.log_likelihood, information, limits)
+    profiles, count = {}, 2 * len(best)
     for i, name in enumerate(tunable.limits):
         ways = []
-        for sign in (-1.0, 1.0):
-            way, point = _walk_profile(likelihood, limits, found, best, (i, sign * float(deviation[i])), stop)
+        for j, sign in enumerate((-1.0, 1.0)):
+            way, point = _walk_profile(likelihood, around, (i, sign * float(deviation[i])), stop)
             if stop and way.drops and way.drops[-1] < -HIGHER:
                 return {}, point
             ways.append(way)
+            tick((2 * i + j + 1) / count)
         profiles[name] = _profile(best[i], *ways)
     return profiles, None
 
@@ -339,51 +388,109 @@ def _profile(best: float, below: _Way, above: _Way) -> Profile:
     return Profile(values[order], drops[order], interval)
 
 
+class _Maximum(NamedTuple):
+    """Maximum of a likelihood, and what is known of its surroundings."""
+
+    at: numpy.ndarray
+    log_likelihood: float
+    information: numpy.ndarray
+    """Of :func:`_information`."""
+    limits: numpy.ndarray
+    """Lower and upper ones, ``(2, P)``."""
+
+
 def _walk_profile(
-    likelihood: WindowLikelihood,
-    limits: numpy.ndarray,
-    found: Fit,
-    best: numpy.ndarray,
-    first: tuple[int, float],
-    stop: bool,
+    likelihood: WindowLikelihood, maximum: _Maximum, first: tuple[int, float], stop: bool
 ) -> tuple[_Way, numpy.ndarray]:
     """The way to a limit, up to where the likelihood has fallen far enough, and its last point; with ``stop`` no
     further than a point that is likelier than the fit. It goes past ``first``, the number of the parameter and a
     standard deviation of it up or down.
     """
-    from scipy.optimize import minimize
-
     parameter, deviation = first
+    best, (low, high) = maximum.at, maximum.limits
     sign = math.copysign(1.0, deviation)
-    room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
+    room = float(sign * (maximum.limits[int(sign > 0.0), parameter] - best[parameter]))
     others = numpy.delete(numpy.arange(len(best)), parameter)
-    way, point = _Way([], []), best.copy()
+    # Where the likelihood is quadratic, the others follow this one on a straight line.
+    inside = maximum.information[numpy.ix_(others, others)]
+    slope = -sign * numpy.linalg.solve(inside, maximum.information[others, parameter])
+    way, point, reached = _Way([], []), best.copy(), 0.0
     for distance in [*(d for d in numpy.array(STEPS) * abs(deviation) if d < room), room]:
-        point[parameter] = best[parameter] + sign * distance
-
-        def objective(values: numpy.ndarray) -> tuple[float, numpy.ndarray]:
-            whole = point.copy()
-            whole[others] = values
-            value, gradient = likelihood.gradient(whole)
-            if not (math.isfinite(value) and numpy.isfinite(gradient).all()):
-                return 1e6, numpy.zeros(len(others))
-            return -value, -gradient[others]
-
-        bounds = list(limits[:, others].T)
-        end = minimize(
-            objective,
-            point[others],
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": 20, "ftol": 1e-7},
-        )
-        point[others] = end.x
+        before = point.copy()
+        before[parameter] = best[parameter] + sign * distance
+        start = before.copy()
+        start[others] = numpy.clip(start[others] + (distance - reached) * slope, low[others], high[others])
+        after, log_likelihood = _maximise_others(likelihood, maximum, start, others)
+        expected = 0.5 * (distance / deviation) ** 2
+        if maximum.log_likelihood - log_likelihood > STEEP * expected:
+            # Not quadratic: the others may have stayed behind.
+            other, value = _maximise_others(likelihood, maximum, before, others)
+            if value > log_likelihood:
+                after, log_likelihood = other, value
+        if distance > reached:
+            slope, reached = (after[others] - point[others]) / (distance - reached), float(distance)
+        point = after
         way.distances.append(float(distance))
-        way.drops.append(found.log_likelihood + float(end.fun))
+        way.drops.append(maximum.log_likelihood - log_likelihood)
         if way.drops[-1] > DROP or (stop and way.drops[-1] < -HIGHER):
             break
     return way, point
+
+
+def _maximise_others(
+    likelihood: WindowLikelihood, maximum: _Maximum, point: numpy.ndarray, others: numpy.ndarray
+) -> tuple[numpy.ndarray, float]:
+    """Maximise the likelihood over all parameters but one, and return where and how large it is.
+
+    Steps are Newton's with the curvature at the maximum as long as each gains; where one does not, L-BFGS-B goes on.
+    """
+    from scipy.optimize import minimize
+
+    low, high = maximum.limits[:, others]
+
+    def objective(values: numpy.ndarray) -> tuple[float, numpy.ndarray]:
+        whole = point.copy()
+        whole[others] = values
+        value, gradient = likelihood.gradient(whole, of=others)
+        if not (math.isfinite(value) and numpy.isfinite(gradient).all()):
+            return 1e6 * likelihood.count, numpy.zeros(len(others))
+        return -value, -gradient
+
+    at, (loss, gradient) = point[others], objective(point[others])
+    curvature = maximum.information[numpy.ix_(others, others)]
+    for _ in range(NEWTON_STEPS):
+        step, gain = _newton_step(curvature, gradient, low - at, high - at)
+        if 0.0 <= gain < LEAST_GAIN:
+            break
+        less, slope = objective(at + step)
+        if not less < loss - LEAST_GAIN:  # the likelihood is not quadratic here
+            options = {"maxiter": 20, "ftol": 1e-7}
+            bounds = list(zip(low, high, strict=True))
+            end = minimize(objective, at, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            at, loss = end.x, float(end.fun)
+            break
+        at, loss, gradient = numpy.clip(at + step, low, high), less, slope
+    found = point.copy()
+    found[others] = at
+    return found, -loss
+
+
+def _newton_step(
+    curvature: numpy.ndarray, gradient: numpy.ndarray, low: numpy.ndarray, high: numpy.ndarray
+) -> tuple[numpy.ndarray, float]:
+    """Step to the minimum of a quadratic loss within limits of the step, and what it gains; what would go beyond a
+    limit goes as far, and the others adapt.
+    """
+    step, free = numpy.zeros(len(gradient)), numpy.ones(len(gradient), dtype=bool)
+    while free.any():
+        inside = curvature[numpy.ix_(free, free)]
+        step[free] = -numpy.linalg.solve(inside, gradient[free] + curvature[free][:, ~free] @ step[~free])
+        beyond = free & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        step[beyond] = numpy.clip(step, low, high)[beyond]
+        free &= ~beyond
+    return step, -float(gradient @ step + 0.5 * step @ curvature @ step)
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:

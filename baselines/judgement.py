@@ -13,8 +13,9 @@ import numpy
 from ..envs.data.recording import Recording
 from ..evaluation.competitors.likelihood import Span
 from ..evaluation.statistics.bootstrap import IntervalEstimate
-from ..evaluation.statistics.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
+from ..evaluation.statistics.predictions import UNKNOWN
 from .fitting import Fit
+from .log_scores import LogScores, PairSums, Roles
 
 LEAST = 5
 """Measurements after the start of the track that anything can be fitted to."""
@@ -101,11 +102,23 @@ class JudgedFilter(NamedTuple):
     """Likewise of each number that is measured, by its name; empty where all are of one kind."""
 
 
+def roles_of(share: Share, shape: tuple[int, int]) -> Roles:
+    """Return which measurements of a recording choose and which judge, ``(episodes, time)``."""
+    choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
+    masks = []
+    for spans in (choosing, share.judged):
+        mask = numpy.zeros(shape, dtype=bool)
+        for span in spans:
+            mask[span.episode, span.first : span.last] = True
+        masks.append(mask)
+    return Roles(*masks)
+
+
 class Judgement:
     """What all competitors did on the measurements that chose and on those that judge.
 
     Args:
-        predictions: of all.
+        scores: of all.
         share: which measurements they are.
         parameters: how many were fitted, by the name of who was fitted; all others are shipped.
         default: shipped filter that stands unless another is likelier beyond chance; empty: none.
@@ -114,35 +127,23 @@ class Judgement:
 
     def __init__(
         self,
-        predictions: Predictions,
+        scores: LogScores,
         share: Share,
         parameters: Mapping[str, int],
         default: str,
         anchored: Container[str] = (),
     ) -> None:
-        self.predictions, self.parameters, self.default = predictions, parameters, default
-        choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
-        self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
-        self.shipped = [name for name in predictions.names if name not in parameters]
-        alone = [name for name in predictions.names if name not in anchored]
-        errors = {name: predictions.prediction_error(name) for name in alone}
-        self._errors = {name: each for name, each in errors.items() if each is not None}
-        self._predicted = {name: (each**2).sum(axis=0) for name, each in self._errors.items()}
-        names = predictions.names if predictions.has_truth else []
-        self._squares = {name: predictions.squared_error(name) for name in names}
+        self.scores, self.parameters, self.default, self._share = scores, parameters, default, share
+        self.shipped = [name for name in scores.names if name not in parameters]
+        self._numbers = {name: i for i, name in enumerate(scores.names)}
+        self._predicting = [n for n in scores.names if scores.predicted is not None and n not in anchored]
+        self._chosen, self._judged = scores.log_likelihood
 
-    def _mask(self, spans: Sequence[Span]) -> numpy.ndarray:
-        """Measurements, ``(episodes, time)``."""
-        mask = numpy.zeros(self.predictions.shape, dtype=bool)
-        for span in spans:
-            mask[span.episode, span.first : span.last] = True
-        return mask
-
-    def _least(self, squares: Mapping[str, numpy.ndarray], mask: numpy.ndarray) -> str:
+    def _least(self, squares: PairSums | None, log_likelihood: PairSums) -> str:
         """Shipped filter of smallest mean square; by log-likelihood where there are no squares."""
-        found = self.predictions
+        numbers = self._numbers
         means = {
-            name: mean_of(squares[name] if squares else -found.log_likelihood(name), mask)
+            name: -log_likelihood.mean(numbers[name]) if squares is None else squares.mean(numbers[name])
             for name in self.shipped
         }
         return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
@@ -154,13 +155,14 @@ class Judgement:
         Args:
             operations: of an update of a competitor.
         """
-        found, default = self.predictions, self.default
-        means = {name: mean_of(found.log_likelihood(name), self.chosen) for name in self.shipped}
+        chosen, default, numbers = self._chosen, self.default, self._numbers
+        means = {name: chosen.mean(numbers[name]) for name in self.shipped}
         known = [name for name, mean in means.items() if not math.isnan(mean)]
         if not known:
-            return self._least(self._predicted, self.chosen)
+            predicted = self.scores.predicted
+            return self._least(None if predicted is None else predicted[0], chosen)
         likeliest = max(known, key=means.__getitem__)
-        gains = {name: found.difference(likeliest, name, self.chosen) for name in known}
+        gains = {name: chosen.difference(numbers[likeliest], numbers[name]) for name in known}
         if default in known and not gains[default].low > 0.0:
             return default
         as_good = (name for name in known if gains[name].high < AS_GOOD or name == likeliest)
@@ -179,21 +181,31 @@ class Judgement:
         low = fitted.gain.low
         return low > 0.0 or (low > -AS_GOOD and operations(fitted.name) < operations(rival))
 
+    def _judged_squares(self) -> PairSums | None:
+        """Squares of judged errors; without truth of the prediction errors."""
+        predicted = self.scores.predicted
+        return self.scores.squared or (None if predicted is None else predicted[1])
+
     def best_shipped(self) -> str:
         """Shipped filter that is best on the measurements that judge."""
-        return self._least(self._squares or self._predicted, self.judged)
+        return self._least(self._judged_squares(), self._judged)
 
     def relative_error(self, name: str, other: str) -> IntervalEstimate:
         """Judged error over that of another, less one; without truth of the prediction errors."""
-        squares = self._squares or self._predicted
-        known = name in squares and other in squares
-        return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
+        squares, known = self._judged_squares(), self._numbers if self.scores.squared else self._predicting
+        if squares is None or name not in known or other not in known:
+            return UNKNOWN
+        return squares.relative_root(self._numbers[name], self._numbers[other])
 
     def difference(self, name: str, other: str) -> IntervalEstimate:
         """Chosen log-likelihood of a filter less that of another, their fitted parameters paid for, nats."""
-        found = self.predictions.difference(name, other, self.chosen)
-        penalty = (self.parameters.get(name, 0) - self.parameters.get(other, 0)) / self.chosen.sum()
+        found = self._chosen.difference(self._numbers[name], self._numbers[other])
+        penalty = self._penalty(name) - self._penalty(other)
         return IntervalEstimate(*(value - penalty for value in found))
+
+    def _penalty(self, name: str) -> float:
+        """One nat for each fitted parameter, shared by the measurements that chose."""
+        return self.parameters.get(name, 0) / self.scores.chosen_measurements
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.
@@ -201,35 +213,37 @@ class Judgement:
         Args:
             fits: what their likelihood is in windows.
         """
-        found = self.predictions
-        values = {name: found.log_likelihood(name)[self.chosen | self.judged] for name in fits}
-        most = max(int(numpy.isfinite(each).sum()) for each in values.values())
+        parts = self.scores.log_likelihood if self._share.apart else [self._chosen]
+        totals = {name: [part.total(self._numbers[name]) for part in parts] for name in fits}
+        sums = {name: sum(total for total, _ in each) for name, each in totals.items()}
+        counts = {name: sum(count for _, count in each) for name, each in totals.items()}
+        most = max(counts.values())
         diverging = [
             name
-            for name, each in values.items()
-            if (there := numpy.isfinite(each)).sum() < 0.99 * most
-            or each[there].mean() < fits[name].log_likelihood / fits[name].measurements - LARGEST_LOSS
+            for name, found in fits.items()
+            if counts[name] < 0.99 * most
+            or sums[name] / counts[name] < found.log_likelihood / found.measurements - LARGEST_LOSS
         ]
         return tuple(diverging) if len(diverging) < len(fits) else ()
 
     def competitor(self, name: str, rival: str) -> JudgedFilter:
         """Judge somebody, paired with another."""
-        found, judged = self.predictions, self.judged
-        penalty = self.parameters.get(name, 0) / self.chosen.sum()
-        gain = found.difference(name, rival, self.chosen)
+        scores, i, other = self.scores, self._numbers[name], self._numbers[rival]
+        penalty, predicts = self._penalty(name), name in self._predicting
+        gain = self._chosen.difference(i, other)
         return JudgedFilter(
             name,
             name in self.parameters,
             self.parameters.get(name, 0),
-            mean_of(found.log_likelihood(name), self.chosen) - penalty,
+            self._chosen.mean(i) - penalty,
             IntervalEstimate(*(value - penalty for value in gain)),
-            found.difference(name, rival, judged),
-            math.sqrt(mean_of(self._predicted[name], judged)) if name in self._predicted else math.nan,
-            math.sqrt(mean_of(self._squares[name], judged)) if self._squares else math.nan,
+            self._judged.difference(i, other),
+            math.sqrt(scores.predicted[1].mean(i)) if predicts and scores.predicted else math.nan,
+            math.sqrt(scores.squared.mean(i)) if scores.squared else math.nan,
             self.relative_error(name, rival),
-            found.nis(name, judged),
-            correlation(self._errors[name], judged) if name in self._errors else UNKNOWN,
-            found.correlations(name, judged) if name in self._errors else {},
+            scores.nis(i),
+            scores.correlation(i) if predicts else UNKNOWN,
+            scores.correlations(i) if predicts else {},
         )
 
 

@@ -148,8 +148,8 @@ def errors(task: Any, recording: Any, factors: dict[str, np.ndarray]) -> np.ndar
     own = Extended(task, **{name: np.repeat(values, episodes) for name, values in factors.items()})
     state, total = own.start(tile(windows.initial)), 0.0
     counts = [i for i, weight in enumerate(task.definition.weights) if weight]
-    for k, measurement in enumerate(windows.measurements):
-        state = own.update(state, FilterInput(tile(measurement)))
+    for k in range(len(windows.counts)):
+        state = own.update(state, FilterInput(tile(windows.measurement(k))))
         truth = recording.truth[:, min(k, recording.truth.shape[1] - 1), counts].T
         squares = ((own.mean(state)[counts] - lanes(truth)) ** 2).sum(axis=0)
         total = total + np.where(k < np.tile(recording.rows, count), squares, 0.0)

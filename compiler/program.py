@@ -6,11 +6,13 @@ subexpressions), one of constants is computed at once, and what no result needs 
 
 import functools
 import gc
+import hashlib
 import itertools
 import os
 import sys
 import threading
 import types
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,6 +64,8 @@ if hasattr(os, "register_at_fork"):
     # A child has none of the other threads, and what one of them holds it would wait for without end.
     os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 _COMPUTE = OPERATIONS | FUNCTIONS
+_CONSTANTS: "weakref.WeakValueDictionary[tuple[bytes, ...], numpy.ndarray]" = weakref.WeakValueDictionary()
+"""Constants of programs with tables, by scalars and digests: programs of many competitors read one log."""
 _EXACT = frozenset(("add", "subtract", "multiply", "divide", "negative", "absolute", "sqrt"))
 """Operations that have the same bits on arrays as on numbers, whatever NumPy does them with."""
 FEW = 16
@@ -122,6 +126,8 @@ class Graph:
         self.groups: list[int] = []
         self.group = 0
         self.tables: list[numpy.ndarray] = []
+        self.digests: list[bytes] = []
+        """Of the tables."""
         self._found: dict[Any, int] = {}
         self._numbers, self._known = numpy.empty(0), numpy.empty(0, dtype=bool)
         self._counted = 0
@@ -197,10 +203,12 @@ class Graph:
         return unband(self.tables[table], rows, len(vector))
 
     def _table(self, table: numpy.ndarray) -> int:
-        key = ("table", table.tobytes())
+        # A digest: of a long recording there are tables of its length.
+        key = ("table", hashlib.blake2b(numpy.ascontiguousarray(table).data, digest_size=32).digest())
         if key not in self._found:
             self._found[key] = len(self.tables)
             self.tables.append(table)
+            self.digests.append(key[1])
         return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
@@ -541,9 +549,12 @@ def program(graph: Graph, wanted: Sequence[ProgramResult]) -> StraightLineProgra
     arguments[of_steps] = place[arguments[of_steps]]
 
     values: list[Any] = [graph.values[order[step]] for step in scalars]
-    constants = numpy.concatenate(
-        [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
-    )
+    first = numpy.array(values, dtype=float)
+    content = first.tobytes(), *(graph.digests[table] for table in tables)
+    constants = _CONSTANTS.get(content) if tables else first
+    if constants is None:
+        constants = numpy.concatenate([first, *(graph.tables[table] for table in tables)])
+        _CONSTANTS[content] = constants
     results = [ProgramResult(r.argument, r.row, int(place[r.node])) for r in wanted]
     logical = numpy.array(list(map(graph.logical.__getitem__, order)), dtype=bool)
     steps = ProgramSteps(names, kinds, begins, arguments, logical)

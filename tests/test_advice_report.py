@@ -92,7 +92,7 @@ def test_pictures_are_of_the_replay_in_seconds(advice, page):
     (episode,) = data["episodes"]
     seconds = np.array(episode["seconds"])
     np.testing.assert_allclose(seconds, np.arange(2, COUNT), rtol=1e-5)  # the track starts from two plots
-    run = advice.replay.sel(policy=data["names"][0]).isel(episode=0)
+    run = advice.replay().sel(policy=data["names"][0]).isel(episode=0)
     scaled = np.array(episode["innovations"], dtype=float)
     there = np.isfinite(scaled).all(axis=0)
     np.testing.assert_allclose((scaled**2).sum(axis=0)[there], run["nis"].values[there], rtol=1e-4)
@@ -114,7 +114,7 @@ def test_outliers_are_drawn_where_they_were_measured(advice):
 def test_mean_nis_is_of_windows_and_its_band_that_of_their_degrees(advice, page):
     data = figures(page)
     nis = data["episodes"][0]["nis"][0]
-    values = advice.replay["nis"].sel(policy=data["names"][0]).values[0]
+    values = advice.replay()["nis"].sel(policy=data["names"][0]).values[0]
     there = np.flatnonzero(np.isfinite(values))
     assert nis["mean"][0] == pytest.approx(values[there[: nis["size"]]].sum() / (2.0 * nis["size"]), rel=1e-5)
     low, high = chi_square_band(np.array([2.0 * nis["size"]]))

@@ -389,6 +389,7 @@ class Lanes:
             Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of the policy.
         """
         (stepper,) = self._reporting(report)
+        assert isinstance(stepper, Stepper)
         stepper.take(numpy.zeros((self.width, *(self.model.action_space.shape or ()))))
         interval = self.task.decision_interval
         steps = self.decisions_per_episode * interval if measurements is None else measurements

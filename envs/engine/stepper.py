@@ -141,6 +141,8 @@ class Stepper:
         self.reported: list[numpy.ndarray] = []
         """What the reports of a decision are written to, ``(interval, ..., width)`` each."""
         self._first_rewards = numpy.empty(0)
+        self._policy_memory: list[numpy.ndarray] | None = None
+        """Of a policy after the last :meth:`run`; None: before its first action."""
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
@@ -151,6 +153,7 @@ class Stepper:
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
             memory[...] = values
+        self._policy_memory = None
         if shown is not None:
             self._shown[...] = shown.T
 
@@ -171,6 +174,7 @@ class Stepper:
         Returns:
             Uniforms ``(uniforms, width)`` and normals ``(initial_normals, width)`` of the start, until the next.
         """
+        self._policy_memory = None
         noise.put(identities)
         self._run_bound(False, noise, others)
         return self._drawn
@@ -299,7 +303,7 @@ class Stepper:
             noise: of the measurements.
             steps: how many.
             compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros, to
-                an action and the memory. None: the action stays as it is.
+                an action and the memory; a second run of the same episodes goes on. None: the action stays as it is.
 
         Returns:
             The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
@@ -309,6 +313,7 @@ class Stepper:
             self._show_in(self._shown.copy())
         reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
         actions, memories = None, [self._blank_memory(compiled_policy), self._blank_memory(compiled_policy)]
+        memories[0] = self._policy_memory or memories[0]
         if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
         draw = noise.call_of_each()
@@ -326,7 +331,7 @@ class Stepper:
         sequence = CallSequence(turns[0], turns[1], moving, steps)
         sequence.expect(steps * self.width // 2, in_sequence=True)
         sequence.run(self.width, self._threads)
-        self._now = (self._now + steps) % 2
+        self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)

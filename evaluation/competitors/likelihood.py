@@ -3,11 +3,13 @@
 A recording is cut into windows, which run side by side: a window begins some measurements before those that count, so
 that the start of its track no longer matters. Lanes are windows times candidates: an estimator that takes its
 parameters as arrays ``(N,)`` runs all candidates at once, compiled where it can be traced. So a gradient by finite
-differences costs one run.
+differences costs one run. A long run goes through its measurements stretch by stretch, so that its memory does not grow
+with them.
 """
 
+import copy
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -31,6 +33,10 @@ Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any
 """From parameters to keywords of the task and what makes the estimator, see :class:`~..baselines.table.Tunable`."""
 
 
+STRETCH_NUMBERS = 1 << 19
+"""Lanes times measurements that are run at once: 4 MB of each number of a measurement."""
+
+
 class Span(NamedTuple):
     """Measurements of a recording whose likelihood counts."""
 
@@ -46,10 +52,16 @@ class Windows(NamedTuple):
 
     initial: Any
     """The initial estimate of each, the task's NamedTuple of arrays ``(..., W)``."""
-    measurements: Sequence[Any]
-    """T of the task's ``Measurement``, arrays ``(..., W)``."""
+    measurements: Any
+    """The task's ``Measurement`` of arrays ``(T, ..., W)``."""
     counts: numpy.ndarray
     """Whether a measurement's likelihood counts, ``(T, W)``."""
+    tiles: dict[int, tuple[Any, Any]]
+    """Initial estimates and measurements of so many candidates, of the last number that was run at once."""
+
+    def measurement(self, k: int) -> Any:
+        """Measurement k of each, the task's ``Measurement`` of arrays ``(..., W)``."""
+        return map_arrays(lambda array: array[k], self.measurements)
 
 
 def cut_windows(
@@ -88,9 +100,8 @@ def cut_windows(
     initial_arrays = {
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
-    rows = [{name: values[k] for name, values in arrays.items()} for k in range(longest)]
-    measurements = [fill_arrays(like, row.__getitem__, numpy) for row in rows]
-    return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts)
+    measurements = fill_arrays(like, arrays.__getitem__, numpy)
+    return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts, {})
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
@@ -175,8 +186,9 @@ class WindowLikelihood:
     def __init__(
         self, task: Task, windows: Windows, start: Mapping[str, float], apply: Apply, in_lanes: bool = True
     ) -> None:
-        self.task, self.windows, self.apply, self.in_lanes = task, windows, apply, in_lanes
+        self.task, self.apply, self.in_lanes = task, apply, in_lanes
         self.names = tuple(start)
+        self._start = numpy.array([[value] for value in start.values()], dtype=float)
         self._compiled: CompiledFunction | None = None
         if in_lanes and AVAILABLE:
             graph = Graph()
@@ -184,15 +196,24 @@ class WindowLikelihood:
                 traced = type(task)(task.parameters, namespace)
             update = functools.partial(_update, traced, self.names, apply)
             self._compiled = CompiledFunction(update, graph, unchanged=0)
-        self._counts = windows.counts
-        self._tiles: dict[int, tuple[Any, list[numpy.ndarray]]] = {}
-        first = self._by_measurement(numpy.array([[value] for value in start.values()], dtype=float))[:, :, 0]
-        if numpy.isnan(first).all():
+        self._take(windows)
+
+    def _take(self, windows: Windows) -> None:
+        """Compute it of other windows from now on."""
+        self.windows, self._counts = windows, windows.counts
+        known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])
+        if not known.any():
             raise ValueError("the estimator does not say how likely measurements were: return it from update")
-        self._counts = windows.counts & ~numpy.isnan(first)
+        self._counts = windows.counts & known
         self.count = int(self._counts.sum())
         if not self.count:
             raise ValueError("the recording has no measurement that counts")
+
+    def on(self, windows: Windows) -> "WindowLikelihood":
+        """Return the same of other windows, without tracing and compiling it anew; errors as of the class."""
+        other = copy.copy(self)
+        other._take(windows)
+        return other
 
     def __call__(self, values: numpy.ndarray) -> numpy.ndarray:
         """Log-likelihood of all measurements that count, nats, ``(C,)``; minus infinity where it is not finite.
@@ -200,105 +221,117 @@ class WindowLikelihood:
         Args:
             values: of the parameters, candidates last, ``(P, C)``.
         """
-        each = self._by_measurement(values)
-        total = numpy.where(self._counts[:, :, None], each, 0.0).sum(axis=(0, 1))
+        if not self.in_lanes and values.shape[1] > 1:
+            return numpy.concatenate([self(values[:, [i]]) for i in range(values.shape[1])])
+        total, first = numpy.zeros(values.shape[1]), 0
+        for found in self._stretches(values):
+            counts = self._counts[first : first + len(found), :, None]
+            total = total + numpy.where(counts, found, 0.0).sum(axis=(0, 1))
+            first += len(found)
         return numpy.where(numpy.isfinite(total), total, -numpy.inf)
 
-    def gradient(self, values: numpy.ndarray, step: float = 1e-4) -> tuple[float, numpy.ndarray]:
+    def gradient(
+        self, values: numpy.ndarray, step: float = 1e-4, of: Sequence[int] | numpy.ndarray | None = None
+    ) -> tuple[float, numpy.ndarray]:
         """Log-likelihood of a candidate, and its gradient by central differences, in one run.
 
         Args:
             values: ``(P,)``.
             step: of every parameter; its rounding error is 1e-12 of the log-likelihood over the step.
+            of: numbers of the parameters in the gradient; default: all.
         """
-        moves = step * numpy.eye(len(values))
+        moves = step * numpy.eye(len(values))[:, slice(None) if of is None else of]
         found = self(
             numpy.concatenate([values[:, None], values[:, None] + moves, values[:, None] - moves], axis=1)
         )
-        count = len(values)
+        count = moves.shape[1]
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 
-    def _by_measurement(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Log-likelihood of every measurement, ``(T, W, C)``."""
-        count = values.shape[1]
-        if not self.in_lanes and count > 1:
-            return numpy.concatenate([self._by_measurement(values[:, [i]]) for i in range(count)], axis=2)
-        W = self._counts.shape[1]
-        initial, measurements = self._tile_windows(count)
-        lanes = numpy.minimum(numpy.arange(round_up_lanes(count * W)) // W, count - 1)
-        with numpy.errstate(all="ignore"):
-            found = self._run(numpy.ascontiguousarray(values[:, lanes]), initial, measurements)
-        return numpy.moveaxis(found[:, : count * W].reshape(len(found), count, W), 1, 2)
+    def _stretches(self, values: numpy.ndarray) -> Iterator[numpy.ndarray]:
+        """Yield the log-likelihood of every measurement, ``(rows, W, C)``, some rows of the T after the others."""
+        count, W = values.shape[1], self._counts.shape[1]
+        width = round_up_lanes(count * W)
+        given = numpy.ascontiguousarray(values[:, numpy.minimum(numpy.arange(width) // W, count - 1)])
+        rows = max(STRETCH_NUMBERS // width, 1)
+        memory: Any = None
+        for first in range(0, len(self._counts), rows):
+            initial, measurements = self._tile_windows(count, first, rows)
+            with numpy.errstate(all="ignore"):
+                found, memory = self._run(given, initial, measurements, memory)
+            yield numpy.moveaxis(found[:, : count * W].reshape(len(found), count, W), 1, 2)
 
     def _run(
-        self, values: numpy.ndarray, initial: Any, measurements: Sequence[numpy.ndarray]
-    ) -> numpy.ndarray:
-        """Run all lanes, ``(T, lanes)``."""
-        lanes, length = initial.mean.shape[-1], len(self._counts)
-        found = numpy.empty((length, lanes))
+        self, values: numpy.ndarray, initial: Any, measurements: Any, memory: Any
+    ) -> tuple[numpy.ndarray, Any]:
+        """Run all lanes through some measurements, ``(rows, lanes)``, and return the memory after them; None: from the
+        start on.
+        """
+        found = numpy.empty((len(leaves(measurements)[0]), initial.mean.shape[-1]))
         given = values if self.in_lanes else values[:, 0]
         own = as_filter(
             self.task, self.apply({name: given[i] for i, name in enumerate(self.names)})[1](self.task)
         )
-        memory = own.start(initial)
+        memory = own.start(initial) if memory is None else memory
         if self._compiled is not None:
             try:
-                self._run_compiled(self._compiled, values, measurements, memory, found)
-                return found
+                return found, self._run_compiled(self._compiled, values, measurements, memory, found)
             except NotTraceable as error:
                 warn_of(type(own).__name__, error)
-                self._compiled, memory = None, own.start(initial)
-        for k in range(length):
-            memory, told = _step(own, self._measurement(measurements, k), memory)
+                self._compiled = None
+        for k in range(len(found)):
+            memory, told = _step(own, map_arrays(lambda array: array[k], measurements), memory)  # noqa: B023
             found[k] = numpy.nan if told is None else told
-        return found
+        return found, memory
 
     def _run_compiled(
         self,
         function: CompiledFunction,
         values: numpy.ndarray,
-        measurements: Sequence[numpy.ndarray],
+        measurements: Any,
         memory: Any,
         found: numpy.ndarray,
-    ) -> None:
-        """Run all lanes through code that is bound to two memories, to and fro, and write what was found."""
-        program = function.specialise(values, self._measurement(measurements, 0), memory)
+    ) -> Any:
+        """Run all lanes through code that is bound to two memories, to and fro, write what was found, and return the
+        memory after it.
+        """
+        program = function.specialise(values, map_arrays(lambda array: array[0], measurements), memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
         memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
         for place, array in zip(memories[0], leaves(memory), strict=True):
             place[...] = array
-        first = [array[0] for array in measurements]
+        arrays = leaves(measurements)
+        first = [array[0] for array in arrays]
         calls = [
             program.bound([values, *first, *before], [*after, found[0]])
             for before, after in (memories, memories[::-1])
         ]
         last = len(calls[0].arrays) - 1
         moving = [
-            moving_array(call, place, arrays)
+            moving_array(call, place, series)
             for call in calls
-            for place, arrays in (*enumerate(measurements, 1), (last, found))
+            for place, series in (*enumerate(arrays, 1), (last, found))
         ]
         sequence = CallSequence(calls[:1], calls[1:], moving, len(found))
         sequence.expect(len(found) * lanes // 2, in_sequence=True)
         sequence.run(lanes)
+        after = iter(memories[len(found) % 2])
+        return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
-    def _measurement(self, measurements: Sequence[numpy.ndarray], k: int) -> Any:
-        """Measurement k, put together from the arrays of all of them."""
-        arrays = iter(measurements)
-        return map_arrays(lambda _: next(arrays)[k], self.windows.measurements[0])
-
-    def _tile_windows(self, count: int) -> tuple[Any, list[numpy.ndarray]]:
-        """Initial estimates of so many candidates, one after another, and of each array of a measurement those of all
-        T measurements, ``(T, ..., lanes)``.
+    def _tile_windows(self, count: int, first: int, rows: int) -> tuple[Any, Any]:
+        """Initial estimates of so many candidates, one after another, and so many of their measurements from the first
+        on, arrays ``(rows, ..., lanes)``.
         """
-        if count not in self._tiles:
-            W = self._counts.shape[1]
-            windows = numpy.arange(round_up_lanes(count * W)) % W
+        tiles = self.windows.tiles
+        if count in tiles:
+            return tiles[count]
+        windows = numpy.arange(round_up_lanes(count * self._counts.shape[1])) % self._counts.shape[1]
 
-            def tile(array: numpy.ndarray) -> numpy.ndarray:
-                return numpy.ascontiguousarray(array[..., windows])
+        def tile(array: numpy.ndarray) -> numpy.ndarray:
+            return numpy.ascontiguousarray(array[..., windows])
 
-            arrays = zip(*(leaves(measurement) for measurement in self.windows.measurements), strict=True)
-            stacked = [tile(numpy.stack(each)) for each in arrays]
-            self._tiles = {count: (map_arrays(tile, self.windows.initial), stacked)}
-        return self._tiles[count]
+        part = map_arrays(lambda array: tile(array[first : first + rows]), self.windows.measurements)
+        tiled = map_arrays(tile, self.windows.initial), part
+        if rows >= len(self._counts):  # all of them: kept for the next call
+            tiles.clear()
+            tiles[count] = tiled
+        return tiled

@@ -4,7 +4,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -208,6 +208,49 @@ def run_episodes(
         else _step_filter(looped, seeds, report if more is None else more.report)
     )
     return _step_episodes(steps, count, is_policy, tick, more)
+
+
+def run_stretches(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report, rows: int, name: str
+) -> Iterator[dict[str, numpy.ndarray]]:
+    """Run whatever competes as :func:`run_episodes` does, in a memory that does not grow with the episodes' length.
+
+    Args:
+        model: as in :func:`run_episodes`, likewise the others that it has.
+        competitor: likewise.
+        kind: likewise.
+        seeds: likewise.
+        report: likewise.
+        rows: measurements that are reported at once, in whole decisions.
+        name: likewise.
+
+    Yields:
+        What is reported of some measurements after the others, arrays ``(rows, ..., episodes)`` by name.
+    """
+    interval, is_policy, policy = model.task.decision_interval, kind == "policy", None
+    looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
+    if is_policy:
+        policy = _compiled_policy_of(model, competitor, name)
+    length = model.task.horizon // interval * interval
+    rows = max(rows // interval, 1) * interval
+    if can_step(looped, report) and (policy is not None or not is_policy):
+        lanes = start_lanes(looped, seeds, report=report)
+        for first in range(0, length, rows):
+            yield _without_padding(lanes.run(report, policy, min(rows, length - first))[0], len(seeds))
+        return
+    steps = (
+        _steer_by_python(model, competitor, seeds, report, name)
+        if is_policy
+        else _step_filter(looped, seeds, report)
+    )
+    while some := [found for found, _ in itertools.islice(steps, rows)]:
+        together = {key: numpy.stack([each[key] for each in some]) for key in some[0]}
+        yield _without_padding(together, len(seeds))
+
+
+def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[str, numpy.ndarray]:
+    """Return the first lanes of a report in memory of their own: a view would keep the padding."""
+    return {name: values[..., :count].copy() for name, values in report.items()}
 
 
 def _run_compiled(

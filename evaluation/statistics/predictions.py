@@ -151,16 +151,35 @@ def stretch_interval(
         function: of means ``(n, 2)``.
     """
     there = mask & numpy.isfinite(values).all(axis=-1)
-    if not there.any():
-        return UNKNOWN
-    total = int(mask.sum())
-    stretch = numpy.zeros(mask.shape, dtype=int)
-    stretch[mask] = numpy.arange(total) // max(SHORTEST_STRETCH, -(-total // STRETCHES))
+    stretch = stretches_of(mask)
     number, count = stretch[there], int(stretch.max()) + 1
     sums = numpy.stack(
         [numpy.bincount(number, values[there][:, i], minlength=count) for i in range(2)], axis=1
     )
-    sums = sums[numpy.bincount(number, minlength=count) > 0]
+    return interval_of_sums(sums, numpy.bincount(number, minlength=count), function)
+
+
+def stretches_of(mask: numpy.ndarray) -> numpy.ndarray:
+    """Return the number of the stretch of each measurement of a mask, and -1 of the others, ``(episodes, time)``."""
+    total = int(mask.sum())
+    stretch = numpy.full(mask.shape, -1, dtype=numpy.int16)
+    stretch[mask] = numpy.arange(total) // max(SHORTEST_STRETCH, -(-total // STRETCHES))
+    return stretch
+
+
+def interval_of_sums(
+    sums: numpy.ndarray, counts: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
+) -> IntervalEstimate:
+    """Value and 95 % interval of a function of two means, by resampling stretches.
+
+    Args:
+        sums: over each stretch, ``(stretches, 2)``.
+        counts: measurements that were added up in each; a stretch without any is left out.
+        function: of means ``(n, 2)``.
+    """
+    sums = sums[counts > 0]
+    if not len(sums):
+        return UNKNOWN
     if len(sums) < 2:
         return IntervalEstimate(float(function(sums)[0]), math.nan, math.nan)
     bootstrap = Bootstrap(len(sums))

@@ -170,7 +170,8 @@ def advise_on_log(
 
         def progress(what: str, share: float) -> None:
             bar.update(fits, completed=share)
-            bar.say(what)
+            if what:
+                bar.say(what)
 
         prices = update_prices(problem, found)
         advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)

@@ -56,6 +56,7 @@ def advice_html(
         learned: names of shipped agents.
         settings: how it was made.
     """
+    replay = advice.replay()
     return render_page(
         "advice.html.jinja",
         "advice.js",
@@ -81,14 +82,14 @@ def advice_html(
         figures=pack(
             {
                 "names": _shown(advice),
-                "episodes": list(_episodes(advice, task)),
+                "episodes": list(_episodes(advice, replay, task)),
                 "profiles": list(_profiles(advice)),
                 "drop": DROP,
             }
         ),
-        has_track=received(advice.replay.isel(policy=0), task) is not None,
-        has_innovations="prediction_error" in advice.replay,
-        has_nis="nis" in advice.replay,
+        has_track=received(replay.isel(policy=0), task) is not None,
+        has_innovations="prediction_error" in replay,
+        has_nis="nis" in replay,
     )
 
 
@@ -122,9 +123,9 @@ def _log_lines(advice: Advice) -> Iterator[str]:
 # --- pictures
 
 
-def _episodes(advice: Advice, task: Task) -> Iterator[dict[str, Any]]:
+def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[dict[str, Any]]:
     """What is drawn of each track of the recording."""
-    replay, recording = advice.replay, advice.recording
+    recording = advice.recording
     for episode in range(min(replay.sizes["episode"], MOST_EPISODES)):
         rows = min(int(recording.rows[episode]), replay.sizes["time"])
         run = replay.isel(episode=[episode], time=slice(0, rows))

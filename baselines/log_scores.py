@@ -1,0 +1,320 @@
+"""What competitors did on a log, summed over stretches of its measurements.
+
+All competitors go through the log side by side, some measurements after the others. Of each measurement only its part
+of sums over a stretch is kept: of one competitor, and of each pair over what both have. So memory grows neither with
+the log nor with how many they are. Intervals are those of :mod:`.evaluation.statistics.predictions`.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+from ..envs.contract.companions import find_companion
+from ..envs.contract.log_format import LogFormat
+from ..envs.contract.model import Episode, Model
+from ..envs.engine.programs import Report
+from ..evaluation.running.evaluate import LIKELIHOOD, Experiment, Plan, plan_of
+from ..evaluation.running.rollout import run_stretches
+from ..evaluation.running.threads import one_thread
+from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
+from ..evaluation.statistics.predictions import interval_of_sums, stretches_of
+from ..filters.angles import unwrap
+
+if TYPE_CHECKING:
+    import xarray
+
+ROWS = 1 << 13
+"""Measurements of all episodes together that a competitor is run over at once."""
+
+
+def report_scores(model: Model, episode: Episode) -> dict[str, Any]:
+    """Report what sums are made of, arrays ``(..., N)``: nothing that the log itself holds."""
+    records = model.records(episode)
+    found = {name: records[name] for name in LIKELIHOOD if name in records}
+    return {**found, "estimate": model.mean(episode)}
+
+
+def report_picture(model: Model, episode: Episode) -> dict[str, Any]:
+    """Report what pictures of a log show, arrays ``(..., N)``."""
+    found = {**model.records(episode), **model.track(episode)}
+    shown = ("estimate", "truth", *LIKELIHOOD)
+    return {name: found[name] for name in found if name in shown or name.startswith("measurement_")}
+
+
+class PairSums:
+    """Sums over stretches of what competitors have at a measurement, of each over what it shares with each other.
+
+    Args:
+        competitors: how many, n.
+        stretch: number of the stretch of each measurement, ``(E, T)``; -1: it does not count.
+
+    Attributes:
+        sums: of stretch, competitor and other: sum of the competitor where both are finite, ``(S, n, n)``.
+        counts: measurements at which both are, likewise.
+    """
+
+    def __init__(self, competitors: int, stretch: numpy.ndarray) -> None:
+        self._stretch = stretch
+        shape = int(stretch.max()) + 1, competitors, competitors
+        self.sums, self.counts = numpy.zeros(shape), numpy.zeros(shape)
+
+    def add(self, values: numpy.ndarray, first: int) -> None:
+        """Add values of all competitors from a measurement on, ``(n, E, rows)``."""
+        stretch = self._stretch[:, first : first + values.shape[2]]
+        for number in numpy.unique(stretch[stretch >= 0]).tolist():
+            some = values[:, stretch == number]
+            finite = numpy.isfinite(some)
+            there = finite.astype(float)
+            self.sums[number] += numpy.where(finite, some, 0.0) @ there.T
+            self.counts[number] += there @ there.T
+
+    def total(self, i: int) -> tuple[float, int]:
+        """Sum of a competitor over all stretches, and how many measurements it is of."""
+        return float(self.sums[:, i, i].sum()), int(self.counts[:, i, i].sum())
+
+    def mean(self, i: int) -> float:
+        """Mean of a competitor; NaN where nothing is finite."""
+        total, count = self.total(i)
+        return total / count if count else math.nan
+
+    def difference(self, i: int, j: int) -> IntervalEstimate:
+        """Mean of competitor i less that of j, paired."""
+        counts = self.counts[:, i, j]
+        sums = numpy.stack([self.sums[:, i, j] - self.sums[:, j, i], counts], axis=1)
+        return interval_of_sums(sums, counts, ratio)
+
+    def relative_root(self, i: int, j: int) -> IntervalEstimate:
+        """Root mean square of competitor i over that of j, less one, paired; of values that are squares."""
+        sums = numpy.stack([self.sums[:, i, j], self.sums[:, j, i]], axis=1)
+        return interval_of_sums(sums, self.counts[:, i, j], lambda means: numpy.sqrt(ratio(means)) - 1.0)
+
+
+class _Whiteness:
+    """Products of the successive prediction errors of a competitor, summed over stretches.
+
+    Args:
+        stretch: as of :class:`PairSums`.
+        main: which of the numbers that are measured belong to the first group, ``(m,)``.
+    """
+
+    def __init__(self, stretch: numpy.ndarray, main: numpy.ndarray) -> None:
+        self._stretch, self._main = stretch, main
+        m, episodes = len(main), len(stretch)
+        self._last = self._received = numpy.full((m, episodes, 1), math.nan)
+        # The first series is of the first group together, the others of one number each.
+        self._sums = numpy.zeros((1 + m, int(stretch.max()) + 1, 2))
+        self._counts = numpy.zeros(self._sums.shape[:2], dtype=int)
+
+    def add(self, errors: numpy.ndarray, first: int) -> None:
+        """Add errors from a measurement on, ``(m, E, rows)``."""
+        before = numpy.concatenate([self._last, errors[..., :-1]], axis=2)
+        whole = numpy.concatenate([self._received, errors], axis=2)
+        places = numpy.where(numpy.isfinite(whole), numpy.arange(whole.shape[2]), 0)
+        received = numpy.take_along_axis(whole, numpy.maximum.accumulate(places, axis=2), axis=2)
+        self._last, self._received = errors[..., -1:].copy(), received[..., -1:].copy()
+        together = [part[self._main].sum(axis=0) for part in _products(errors, before)]
+        alone = numpy.stack(_products(errors, received[..., :-1]), axis=1)
+        stretch = self._stretch[:, first : first + errors.shape[2]]
+        for i, pair in enumerate((numpy.stack(together), *alone)):
+            there = (stretch >= 0) & numpy.isfinite(pair).all(axis=0)
+            count = self._counts.shape[1]
+            self._counts[i] += numpy.bincount(stretch[there], minlength=count)
+            for j in range(2):
+                self._sums[i, :, j] += numpy.bincount(stretch[there], pair[j][there], count)
+
+    def correlations(self) -> list[IntervalEstimate]:
+        """Correlation of successive errors of the first group together, and of each number that is measured: of each
+        received one with the last received before.
+        """
+        pairs = zip(self._sums, self._counts, strict=True)
+        return [interval_of_sums(sums, counts, ratio) for sums, counts in pairs]
+
+
+def _products(errors: numpy.ndarray, before: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Of errors and those before: what their correlation is the ratio of."""
+    return errors * before, 0.5 * (errors**2 + before**2)
+
+
+class Roles(NamedTuple):
+    """Which measurements choose among competitors, and which judge them, booleans ``(E, T)``."""
+
+    chosen: numpy.ndarray
+    judged: numpy.ndarray
+
+
+class LogScores:
+    """Sums of what competitors did on the measurements of a log that choose, and on those that judge.
+
+    Args:
+        plan: of their evaluation on the log.
+        roles: of its measurements.
+
+    Attributes:
+        names: of the competitors, whose numbers in the sums are their places here.
+        log_likelihood: of the measurements that choose, and of those that judge; likewise ``predicted``.
+        predicted: of squared prediction errors, the first group of what is measured added up; None where no log format
+            says what an estimate predicts.
+        squared: of squared errors of the main components, judged; None without truth.
+    """
+
+    def __init__(self, plan: Plan, roles: Roles) -> None:
+        self._plan, task = plan, next(iter(plan.models.values())).task
+        self._recording: Any = plan.scenario.recording
+        self._task, self.names, n = task, list(plan.competitors), len(plan.competitors)
+        chosen, self._judged = (stretches_of(mask[:, : task.horizon]) for mask in roles)
+        self.chosen_measurements = int((chosen >= 0).sum())
+        lengths = [task.horizon] * len(chosen) if plan.lengths is None else plan.lengths
+        self._there = numpy.arange(task.horizon) < numpy.asarray(lengths)[:, None]
+        self.log_likelihood = PairSums(n, chosen), PairSums(n, self._judged)
+        self.squared = PairSums(n, self._judged) if task.has_truth else None
+        groups = task.groups
+        main = list(next(iter(groups.values()))) if groups else [task.components[0].name]
+        self._components = [i for i, each in enumerate(task.components) if each.name in main]
+        self._nis = numpy.zeros((n, 2))
+        self._format = find_companion(task, LogFormat)
+        self.predicted: tuple[PairSums, PairSums] | None = None
+        self._whiteness: list[_Whiteness] = []
+        self._estimates: list[numpy.ndarray] = []
+        """Last of each competitor, ``(C, E, 1)``."""
+        if self._format is not None and self._format.predict is not None:
+            self.predicted = PairSums(n, chosen), PairSums(n, self._judged)
+            nothing = numpy.full((len(task.components), len(chosen), 1), math.nan)
+            self._estimates = [nothing] * n
+
+    def add(self, first: int, reports: Sequence[Mapping[str, numpy.ndarray]]) -> None:
+        """Add what :func:`report_scores` of each competitor reports from a measurement on, ``(rows, ..., E)``."""
+        rows = len(reports[0]["estimate"])
+        there = self._there[:, first : first + rows]
+        found = [
+            {name: numpy.where(there, numpy.moveaxis(each, 0, -1), math.nan) for name, each in report.items()}
+            for report in reports
+        ]
+        unknown = numpy.full(there.shape, math.nan)
+        likely, nis, degrees = (
+            numpy.stack([each.get(name, unknown) for each in found]) for name in LIKELIHOOD
+        )
+        for sums in self.log_likelihood:
+            sums.add(likely, first)
+        known = (self._judged[:, first : first + rows] >= 0) & (degrees > 0.0) & numpy.isfinite(nis)
+        for i, each in enumerate((nis, degrees)):
+            self._nis[:, i] += numpy.where(known, each, 0.0).sum(axis=(1, 2))
+        estimates = [each["estimate"] for each in found]
+        if self.squared is not None:
+            truth = self._of_log(self._recording.truth, first, rows)
+            errors = [self._task.subtract(each, truth)[self._components] for each in estimates]
+            self.squared.add(numpy.stack([(each**2).sum(axis=0) for each in errors]), first)
+            estimates = [unwrap(each, truth, self._task.periods) for each in estimates]
+        if self.predicted is not None:
+            names = self._recording.measurements
+            measured = {name: self._of_log(values, first, rows) for name, values in names.items()}
+            squares = numpy.stack(
+                [
+                    self._predict(i, each, SimpleNamespace(**measured), first)
+                    for i, each in enumerate(estimates)
+                ]
+            )
+            for sums in self.predicted:
+                sums.add(squares, first)
+
+    def _predict(self, i: int, estimate: numpy.ndarray, measurement: Any, first: int) -> numpy.ndarray:
+        """Squared prediction error of the first group, ``(E, rows)``, of what competitor i estimates, ``(C, E, rows)``;
+        its products are added up.
+        """
+        before = numpy.concatenate([self._estimates[i], estimate[..., :-1]], axis=2)
+        self._estimates[i] = estimate[..., -1:].copy()
+        assert self._format is not None
+        assert self._format.predict is not None
+        predicted, measured = self._format.predict(before, measurement, self._task.parameters)
+        errors = measured - predicted
+        groups = [each.group for each in self._format.predicted[: len(errors)]]
+        main = numpy.array([group == groups[0] for group in groups])
+        if len(self._whiteness) == i:
+            self._whiteness.append(_Whiteness(self._judged, main))
+        self._whiteness[i].add(errors, first)
+        squares: numpy.ndarray = (errors[main] ** 2).sum(axis=0)
+        return squares
+
+    def _of_log(self, values: Any, first: int, rows: int) -> numpy.ndarray:
+        """What the log holds from a measurement on, ``(..., E, rows)``; NaN beyond the end of an episode."""
+        some = values[self._plan.flown, first : first + rows].astype(float)
+        return numpy.where(
+            self._there[:, first : first + rows],
+            numpy.moveaxis(some, -1, 0) if some.ndim > 2 else some,
+            math.nan,
+        )
+
+    def nis(self, i: int) -> float:
+        """Mean judged normalised innovation squared over its dimension; NaN where it is not known."""
+        squares, degrees = self._nis[i].tolist()
+        return squares / degrees if degrees else math.nan
+
+    def correlation(self, i: int) -> IntervalEstimate:
+        """Correlation of the successive judged prediction errors of competitor i; zero where they are white."""
+        return self._whiteness[i].correlations()[0]
+
+    def correlations(self, i: int) -> dict[str, IntervalEstimate]:
+        """The same of each number that is measured, by name; empty where all are of one group."""
+        assert self._format is not None
+        found = self._whiteness[i].correlations()[1:]
+        quantities = self._format.predicted[: len(found)]
+        several = len({each.group for each in quantities}) > 1
+        return dict(zip((each.name for each in quantities), found, strict=True)) if several else {}
+
+
+def _start_runs(plan: Plan, report: Report) -> list[Iterator[dict[str, numpy.ndarray]]]:
+    """Return a run of each competitor over a log, some measurements after the others."""
+    rows, models = max(ROWS // len(plan.seeds), 1), plan.models
+    return [
+        run_stretches(models[name], maker, plan.kinds[name], plan.seeds, report, rows, name)
+        for name, maker in plan.competitors.items()
+    ]
+
+
+@one_thread()
+def score_log(
+    experiment: Experiment,
+    competitors: Mapping[str, Any],
+    roles: Roles,
+    tick: Callable[[float], None] = lambda share: None,
+) -> LogScores:
+    """Run competitors over a log, and return the sums of what they did.
+
+    Args:
+        experiment: on the recording.
+        competitors: what makes them, by name.
+        roles: of the measurements of the recording.
+        tick: called with the share that is done.
+    """
+    with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
+        plan = plan_of(experiment, competitors)
+        scores, runs = LogScores(plan, roles), _start_runs(plan, report_scores)
+        done, horizon = 0, plan.models[scores.names[0]].task.horizon
+        while done < horizon:
+            reports: list[dict[str, numpy.ndarray]] = []
+            for run in runs:
+                reports.append(next(run))
+                rows = len(reports[0]["estimate"])
+                tick((done + rows * len(reports) / len(runs)) / horizon)
+            scores.add(done, reports)
+            done += rows
+    return scores
+
+
+@one_thread()
+def replay_log(experiment: Experiment, competitors: Mapping[str, Any]) -> "xarray.Dataset":
+    """Run competitors over a log, and return what pictures show of every measurement, as of an evaluation."""
+    plan = plan_of(experiment, competitors)
+    task = plan.models[next(iter(competitors))].task
+    kept: dict[str, dict[str, numpy.ndarray]] = {}
+    for name, run in zip(plan.competitors, _start_runs(plan, report_picture), strict=True):
+        arrays, done = kept.setdefault(name, {}), 0
+        for report in run:
+            for key, each in report.items():
+                if key not in arrays:
+                    arrays[key] = numpy.full((len(plan.seeds), task.horizon, *each.shape[1:-1]), math.nan)
+                arrays[key][:, done : done + len(each)] = numpy.moveaxis(each, -1, 0)
+            done += len(each)
+    return plan.dataset(kept, plan.seeds)
