@@ -380,7 +380,7 @@ def test_drawing_a_vector_leaves_its_episodes_alone(backend, monkeypatch):
 def test_the_functions_of_the_model_are_left_to_compiled_code_without_a_render_mode(monkeypatch):
     pytest.importorskip("llvmlite")
     called = []
-    monkeypatch.setattr(ModelStepper, "step", lambda *_: called.append("step"))
+    monkeypatch.setattr(ModelStepper, "decide", lambda *_: called.append("decide"))
     env = TaskVectorEnv(ID, 2, backend="compiled")
     env.reset(seed=0)
     env.step(env.action_space.sample())
