@@ -93,10 +93,12 @@ def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
 
 
 def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples; None holds none."""
+    """Apply a function to the arrays of nested tuples and dictionaries; None holds none."""
     first = parts[0]
     if first is None:
         return None
+    if isinstance(first, dict):
+        return {name: map_nested(function, *(part[name] for part in parts)) for name in first}
     if isinstance(first, tuple):
         answers = [map_nested(function, *each) for each in zip(*parts, strict=True)]
         return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
