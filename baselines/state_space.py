@@ -249,24 +249,33 @@ class ExtendedSmoother(Extended):
         self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        measured = scans.stack_scans(measurements)
-        if isinstance(states[0], Buffered):
+        measured, memories = scans.stack_scans(measurements), scans.stack_scans(states)
+        if isinstance(memories, Buffered):
             measured = _put_in_order(measured, self.task.parameters.lateness, self.xp)
-            filtered = self._filter(states[0].now, measured)
-        else:
-            filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
+            memories = self._filter_in_order(memories.settled, measured)
+        filtered = smoothing.Gaussian(memories.mean, memories.covariance)
         motion = scans.by_stretches(self._motion, filtered.mean, measured)
         smoothed = smoothing.smooth(filtered, motion, self.lag)
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
-    def _filter(self, start: EstimateState, measured: StateSpaceMeasurement) -> smoothing.Gaussian:
-        """Filtered estimates at the start and at all measurements, ``(..., K, N)``."""
-        track = scans.Track(*measured.available.shape[-2:], lambda some: (scans.take_scans(measured, some),))
-        found = [state[:2] for _, state in scans.recur(self._take_alone, track, start)]
-        return smoothing.Gaussian(*scans.join([scans.stack_scans([start[:2]]), *found]))
+    def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
+        """Estimates at the start and at K measurements with what came late.
 
-    def _take_alone(self, measurement: StateSpaceMeasurement, state: EstimateState) -> EstimateState:
-        return self.take(state, Past(measurement, None, None))
+        Args:
+            settled: what they were ``lateness`` measurements before the start and before each measurement, at least
+                those at the start, ``(..., K + 1, N)``.
+            measured: in order, ``(..., K, N)``.
+        """
+        K = measured.available.shape[-2]
+        known = max(K - self.task.parameters.lateness, 0)
+        found = [scans.take_scans(settled, slice(K - known, K + 1))]
+        for k in range(known, K):
+            state, measurement = (
+                scans.map_nested(lambda values, place=place: values[..., place, :], part)
+                for part, place in ((found[-1], -1), (measured, k))
+            )
+            found.append(scans.stack_scans([self.take(state, Past(measurement, None, None))]))
+        return scans.join(found)
 
     def _motion(self, mean: Array, measurement: StateSpaceMeasurement) -> smoothing.Motion:
         """How the state moves from a mean ``(n, N)`` to a measurement."""
@@ -282,7 +291,9 @@ def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> St
     """Measurements ``(..., K, N)`` with what came late among those that it belongs to."""
     plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
     late, late_available = (values[:, lateness:] for values in (measured.late, measured.late_available))
-    own, rest = (scans.take_scans(plain, some) for some in (slice(0, late.shape[1]), slice(late.shape[1], None)))
+    own, rest = (
+        scans.take_scans(plain, some) for some in (slice(0, late.shape[1]), slice(late.shape[1], None))
+    )
     own = own._replace(
         values=xp.where(late_available > 0.0, late, own.values),
         available=xp.maximum(own.available, late_available),

@@ -7,13 +7,12 @@ Shapes: a time axis of K scans stands before the batch, ``(..., K, N)``.
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy
 
 from ..compiler.functions import CompiledFunction, leaves, round_up_lanes
-from ..compiler.namespace import NotTraceable
 from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
 from ..compiler.sequence import CallSequence, moving_array
@@ -21,8 +20,7 @@ from .array_namespace import Array, namespace
 
 Carried = TypeVar("Carried", bound=tuple[Any, ...])
 Step = Callable[..., Any]
-"""Of what is given of a scan and what is carried from the one before, in the order of the recursion; it knows no time
-axis."""
+"""Of what is given of a scan and what is carried from the next one; it knows no time axis."""
 LEAST = 64
 """Scans from which on a recursion is compiled; a shorter one ends before its step is traced."""
 TOGETHER = 8192
@@ -110,44 +108,25 @@ def _flatten_time(values: Array) -> Array:
     return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
 
 
+def repeat(part: Any, last: tuple[int, int]) -> Any:
+    """Give nested tuples of arrays the last two axes, where they have axes of one."""
+    return map_nested(
+        lambda values: namespace(values).broadcast_to(values, (*values.shape[:-2], *last)), part
+    )
+
+
+# --- recursions
+
+
 class Track(NamedTuple):
-    """What a recursion is given, by stretches of scans."""
+    """What a recursion is given, some scans after the others."""
 
     scans: int
-    """Of the recursion, K."""
+    """K."""
     episodes: int
     """N."""
     given: Callable[[slice], Sequence[Any]]
-    """Nested tuples of arrays ``(..., scans, N)``, whose scans ``step`` is given one by one."""
-
-
-def recur(step: Step, track: Track, start: Carried, back: bool = False) -> Iterator[tuple[slice, Carried]]:
-    """Run a recursion over a track.
-
-    Args:
-        step: of the recursion.
-        track: what it is given.
-        start: carried into the first step, nested tuples of arrays ``(..., N)``.
-        back: whether it begins with the last scan.
-
-    Yields:
-        Stretches of scans in the order of the recursion, and what is carried out of each of their steps, with a time
-        axis.
-    """
-    K, N, given = track
-    compiled, width = _compiled(step, K, start), round_up_lanes(N)
-    length = max(1, TOGETHER // width)
-    firsts = range(0, K, length)
-    for first in reversed(firsts) if back else firsts:
-        stretch = slice(first, min(first + length, K))
-        parts = given(stretch)
-        if compiled is None:
-            found = _run(step, parts, start, back)
-        else:
-            found = _run_compiled(compiled, parts, start, back)
-        yield stretch, found
-        edge = 0 if back else -1
-        start = map_nested(lambda values, edge=edge: values[..., edge, :], found)
+    """Nested tuples of arrays ``(..., scans, N)`` of some scans, of which the step is given one by one."""
 
 
 def backward(
@@ -160,11 +139,11 @@ def backward(
     """Run a recursion from the end of a track.
 
     Args:
-        step: of the recursion.
+        step: not made anew for each call, as what is compiled is kept by it.
         track: what is given of the first K - 1 scans.
         nothing_later: what is carried from some of K scans if nothing later is used.
         lag: how many later scans are used; default: all.
-        keep: what is kept of that which is carried from some scans; each episode and scan for itself.
+        keep: what is kept of that which is carried from some scans, of each for itself.
 
     Returns:
         What is kept of that which is carried from each of K scans.
@@ -174,86 +153,78 @@ def backward(
     """
     if lag is not None and lag < 0:
         raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
-    last = track.scans
+    last, N, _ = track
     end = nothing_later(slice(last, last + 1))
-    found = [keep(end)]
-    if lag is None or lag >= last:
-        start = map_nested(lambda values: values[..., 0, :], end)
-        found += [keep(carried) for _, carried in recur(step, track, start, True)]
-    else:
-        compiled = _compiled(step, last, end)
-        length = max(1, lag, TOGETHER // track.episodes)
-        for first in reversed(range(0, last, length)):
-            found.append(keep(_lagged(compiled or step, track, nothing_later, lag, first, first + length)))
+    compiled = _compiled(step, end) if last >= LEAST else None
+    carried, found = _scan(end, 0), [keep(end)]
+    whole = lag is None or lag >= last
+    length = max(1, TOGETHER // round_up_lanes(N)) if whole else max(lag or 1, TOGETHER // N)
+    for first in reversed(range(0, last, length)):
+        beyond = min(first + length, last)
+        if whole:
+            given = track.given(slice(first, beyond))
+            some = _run(step, given, carried) if compiled is None else _run_compiled(compiled, given, carried)
+            carried = _scan(some, 0)
+        else:
+            some = _run_lagged(compiled or step, track, nothing_later, lag or 0, slice(first, beyond))
+        found.append(keep(some))
     return join(found[::-1])
 
 
-def _lagged(
-    step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, first: int, beyond: int
+def _scan(part: Any, place: int) -> Any:
+    return map_nested(lambda values: values[..., place, :], part)
+
+
+def _run_lagged(
+    step: Step, track: Track, nothing_later: Callable[[slice], Carried], lag: int, scans: slice
 ) -> Carried:
-    """What is carried from the scans between two with a lag: all take one step together, ``lag`` times over."""
-    last = min(beyond + lag - 1, track.scans)  # of the scans that these depend on
-    begun = nothing_later(slice(first, last + 1))
-    given = track.given(slice(first, last))
-    carried, end = begun, take_scans(begun, slice(-1, None)) if last > first else begun
+    """What is carried from some scans with a lag: all take one step together, ``lag`` times over."""
+    last = min(scans.stop - 1 + lag, track.scans)  # of the scans that these depend on
+    given, carried = track.given(slice(scans.start, last)), nothing_later(slice(scans.start, last + 1))
+    end = take_scans(carried, slice(-1, None))
     for _ in range(lag):
-        stepped = over_time(step, *given, map_nested(lambda values: values[..., 1:, :], carried))
-        carried = join([stepped, end])
-    return take_scans(carried, slice(0, min(beyond, track.scans) - first))
+        carried = join([over_time(step, *given, take_scans(carried, slice(1, None))), end])
+    return take_scans(carried, slice(0, scans.stop - scans.start))
 
 
-def repeat(part: Any, last: tuple[int, int]) -> Any:
-    """Return nested tuples of arrays whose axes of one are those of all scans, or of the whole batch."""
-    return map_nested(
-        lambda values: namespace(values).broadcast_to(values, (*values.shape[:-2], *last)), part
-    )
-
-
-def _run(step: Step, parts: Sequence[Any], carried: Carried, back: bool) -> Carried:
+def _run(step: Step, given: Sequence[Any], carried: Carried) -> Carried:
     """Carry from scan to scan in Python."""
-    found, count = [], leaves(tuple(parts))[0].shape[-2]
-    for k in reversed(range(count)) if back else range(count):
-        carried = step(*(map_nested(lambda values, k=k: values[..., k, :], part) for part in parts), carried)
+    found = []
+    for k in reversed(range(leaves(tuple(given))[0].shape[-2])):
+        carried = step(*(_scan(part, k) for part in given), carried)
         found.append(carried)
-    stacked: Carried = stack_scans(found[::-1] if back else found)
+    stacked: Carried = stack_scans(found[::-1])
     return stacked
 
 
 _traced = functools.lru_cache(16)(lambda step: CompiledFunction(step, Graph(), unchanged=0))
 
 
-def _compiled(step: Step, scans: int, carried: Any) -> CompiledFunction | None:
-    """The step of a long recursion on NumPy's arrays, to be compiled; None of any other."""
-    of_numpy = all(type(values) is numpy.ndarray for values in leaves(carried))
-    if not AVAILABLE or scans < LEAST or not of_numpy:
+def _compiled(step: Step, carried: Any) -> CompiledFunction | None:
+    """The step on NumPy's arrays, to be compiled; None on any others."""
+    if not AVAILABLE or any(type(values) is not numpy.ndarray for values in leaves(carried)):
         return None
     compiled: CompiledFunction = _traced(step)
     return compiled
 
 
-def _run_compiled(compiled: CompiledFunction, parts: Sequence[Any], start: Carried, back: bool) -> Carried:
-    """Carry from scan to scan in native code; in Python what cannot be traced."""
-    first = [map_nested(lambda values: values[..., 0, :], part) for part in parts]
-    try:
-        special = compiled.specialise(*first, start)
-    except NotTraceable:
-        return _run(compiled.function, parts, start, back)
+def _run_compiled(compiled: CompiledFunction, given: Sequence[Any], start: Carried) -> Carried:
+    """Carry from scan to scan in native code."""
     N = leaves(start)[0].shape[-1]
-    given = [_rows_of_scans(values, round_up_lanes(N)) for values in leaves(tuple(parts))]
-    count, direction = len(given[0]), -1 if back else 1
-    found = [
-        numpy.empty((count + 1, *values.shape[:-1], round_up_lanes(N))) for values in leaves(start)
-    ]
+    width = round_up_lanes(N)
+    special = compiled.specialise(*(_scan(part, 0) for part in given), start)
+    rows = [_rows_of_scans(values, width) for values in leaves(tuple(given))]
+    found = [numpy.empty((len(rows[0]) + 1, *values.shape[:-1], width)) for values in leaves(start)]
     for memory, values in zip(found, leaves(start), strict=True):
-        memory[-1 if back else 0] = _rows_of_scans(values[..., None, :], memory.shape[-1])[0]
-    inputs = [values[::direction] for values in given] + [memory[::direction][:-1] for memory in found]
-    outputs = [memory[::direction][1:] for memory in found]
-    arrays = inputs + outputs
-    calls = [special.bound([a[0] for a in inputs], [a[0] for a in outputs]) for _ in range(2)]
-    moving = [moving_array(call, place, values) for call in calls for place, values in enumerate(arrays)]
-    CallSequence(calls[:1], calls[1:], moving).run(count, round_up_lanes(N))
-    # Copies, without the lanes beyond.
-    kept = iter((memory[:-1] if back else memory[1:])[..., :N].copy() for memory in found)
+        memory[-1] = _rows_of_scans(values[..., None, :], width)[0]
+    inputs = [values[::-1] for values in rows] + [memory[:0:-1] for memory in found]
+    outputs = [memory[-2::-1] for memory in found]
+    # Even and odd steps are the same one; each has a table, whose entries move with every step.
+    calls = [special.bound([array[0] for array in inputs], [array[0] for array in outputs]) for _ in range(2)]
+    arrays = enumerate(inputs + outputs)
+    moving = [moving_array(call, place, array) for place, array in arrays for call in calls]
+    CallSequence(calls[:1], calls[1:], moving).run(len(rows[0]), width)
+    kept = iter(memory[:-1, ..., :N].copy() for memory in found)  # without the lanes beyond
     carried: Carried = map_nested(lambda _: numpy.moveaxis(next(kept), 0, -2), start)
     return carried
 

@@ -239,7 +239,11 @@ def smooth_imm(
         return SmoothedBank(bank, nothing)
 
     return backward(
-        _imm_step_of(transition), _track(filtered, arrival), nothing_later, lag, lambda found: keep(found.bank)
+        _imm_step_of(transition),
+        _track(filtered, arrival),
+        nothing_later,
+        lag,
+        lambda found: keep(found.bank),
     )
 
 
@@ -325,7 +329,7 @@ def _likelihood_from_moments(
     # LAPACK refuses what is not finite, for the whole batch; here only the episode's own estimates are lost.
     lost = xp.isnan(ordered_sum([row for matrix in error.covariance for row in matrix]))
     covariance = xp.where(lost, _identity(centre), error.covariance)
-    variances, directions = _eigenvectors(covariance)
+    variances, directions = eigenvectors(covariance)
     informed = variances < 1.0
     variances = xp.where(informed, variances, 1.0)
     along = xp.where(informed, apply(transpose(directions), error.mean), 0.0)
@@ -345,7 +349,7 @@ SWEEPS = 7
 """Of Jacobi's rotations: every one squares the error, and six leave rounding of matrices up to eight rows."""
 
 
-def _eigenvectors(A: Array) -> tuple[Array, Array]:
+def eigenvectors(A: Array) -> tuple[Array, Array]:
     """Eigenvalues ``(n, ...)`` and eigenvectors, the columns of ``(n, n, ...)``, of symmetric matrices: of LAPACK, or
     in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
     """

@@ -249,7 +249,9 @@ def _join_stretches(
             few = more is not None and name.startswith(more.prefix)
             series.setdefault(name, []).append(values[..., : more.episodes if more and few else count].copy())
         tick(count * len(next(iter(found.values()))))
-    return Flown({name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None)
+    return Flown(
+        {name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None
+    )
 
 
 def _step_episodes(
