@@ -177,7 +177,7 @@ def report_smoothed(
         some = slice(first, first := first + len(leaves(stretch)[0]))
         answers = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
         checked = _check_answers(looped.task, state, world[1], *answers)
-        found = over_time(lambda episode: looped.run(report, episode), Episode(*world, checked))
+        found = over_time(lambda episode: looped.run(report, episode), Episode(world[0], world[1], checked))
         yield map_nested(lambda values: numpy.moveaxis(values, -2, 0), found)
         state = map_nested(lambda values: values[..., -1, :], checked)
 

@@ -36,8 +36,8 @@ from .traced_filter import FEEDBACK, LIKELIHOODS, TracedFilter
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
 """Under which the text compiles without a warning."""
 MOST_OPTIMISED = 10_000
-"""Operations of an update, at most, with which the text is tried with ``-O2``; of longer ones the compiler takes half as
-long with ``-O1``, whose code takes a tenth longer."""
+"""Operations of an update, at most, of which the text is tried with ``-O2``; for more the compiler takes half as long
+with ``-O1``, whose code takes a tenth longer."""
 WORST = {"double": 1e-3, "float": 0.1}
 """Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
 EPISODES, MEASUREMENTS = 8, 200
