@@ -290,7 +290,8 @@ class ExtendedSmoother(Extended):
 def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
     """Measurements ``(..., K, N)`` with what came late among those that it belongs to."""
     plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
-    assert measured.late is not None and measured.late_available is not None
+    assert measured.late is not None
+    assert measured.late_available is not None
     late, late_available = (values[:, lateness:] for values in (measured.late, measured.late_available))
     own, rest = (
         scans.take_scans(plain, some) for some in (slice(0, late.shape[1]), slice(late.shape[1], None))
