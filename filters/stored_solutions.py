@@ -28,8 +28,8 @@ def stored(solve: Solve) -> Solve:
         found = _solutions().get(key_of(solve.__name__, *arguments))
         if found is None:
             return solve(*arguments)
-        matrices = tuple(map(numpy.array, found))
-        return matrices if len(matrices) > 1 else matrices[0]
+        matrices = [numpy.array(rows) for rows in found]
+        return tuple(matrices) if len(matrices) > 1 else matrices[0]
 
     return look_up  # type: ignore[return-value]
 
