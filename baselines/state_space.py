@@ -15,7 +15,7 @@ from ..envs.linear.equations import Equations
 from ..envs.linear.state_space import StateSpace, StateSpaceMeasurement, StateSpaceTruth
 from ..envs.linear.state_space_banks import Mixture, MultipleModelBank
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
-from ..filters import kalman, smoothing, unscented
+from ..filters import kalman, scans, smoothing, unscented
 from ..filters.array_namespace import namespace, select_nested
 from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
@@ -249,16 +249,33 @@ class ExtendedSmoother(Extended):
         self, measurements: Sequence[StateSpaceMeasurement], states: Sequence[Any]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        if isinstance(states[0], Buffered):
-            measurements = _put_in_order(measurements, self.task.parameters.lateness, self.xp)
-            states = [states[0].now]
-            for measurement in measurements:
-                states.append(self.take(states[-1], Past(measurement, None, None)))
-        filtered = smoothing.Gaussian(*smoothing.stack_scans([state[:2] for state in states]))
-        before = smoothing.drop_last(filtered.mean)
-        motion = smoothing.over_time(self._motion, before, smoothing.stack_scans(measurements))
+        measured, memories = scans.stack_scans(measurements), scans.stack_scans(states)
+        if isinstance(memories, Buffered):
+            measured = _put_in_order(measured, self.task.parameters.lateness, self.xp)
+            memories = self._filter_in_order(memories.settled, measured)
+        filtered = smoothing.Gaussian(memories.mean, memories.covariance)
+        motion = scans.by_stretches(self._motion, filtered.mean, measured)
         smoothed = smoothing.smooth(filtered, motion, self.lag)
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
+
+    def _filter_in_order(self, settled: EstimateState, measured: StateSpaceMeasurement) -> EstimateState:
+        """Estimates at the start and at K measurements with what came late.
+
+        Args:
+            settled: what they were ``lateness`` measurements before the start and before each measurement, at least
+                those at the start, ``(..., K + 1, N)``.
+            measured: in order, ``(..., K, N)``.
+        """
+        K = measured.available.shape[-2]
+        known = max(K - self.task.parameters.lateness, 0)
+        found = [scans.take_scans(settled, slice(K - known, K + 1))]
+        for k in range(known, K):
+            state, measurement = (
+                scans.map_nested(lambda values, place=place: values[..., place, :], part)
+                for part, place in ((found[-1], -1), (measured, k))
+            )
+            found.append(scans.stack_scans([self.take(state, Past(measurement, None, None))]))
+        return scans.join(found)
 
     def _motion(self, mean: Array, measurement: StateSpaceMeasurement) -> smoothing.Motion:
         """How the state moves from a mean ``(n, N)`` to a measurement."""
@@ -270,22 +287,20 @@ class ExtendedSmoother(Extended):
         )
 
 
-def _put_in_order(
-    measurements: Sequence[StateSpaceMeasurement], lateness: int, xp: Any
-) -> list[StateSpaceMeasurement]:
-    """Measurements with what came late among those that it belongs to."""
-    found = []
-    for k, own in enumerate(measurements):
-        plain = own._replace(values=_numbers(own, xp), late=None, late_available=None)
-        if k + lateness < len(measurements):
-            later = measurements[k + lateness]
-            assert later.late_available is not None
-            plain = plain._replace(
-                values=xp.where(later.late_available > 0.0, later.late, plain.values),
-                available=xp.maximum(own.available, later.late_available),
-            )
-        found.append(plain)
-    return found
+def _put_in_order(measured: StateSpaceMeasurement, lateness: int, xp: Any) -> StateSpaceMeasurement:
+    """Measurements ``(..., K, N)`` with what came late among those that it belongs to."""
+    plain = measured._replace(values=_numbers(measured, xp), late=None, late_available=None)
+    assert measured.late is not None
+    assert measured.late_available is not None
+    late, late_available = (values[:, lateness:] for values in (measured.late, measured.late_available))
+    own, rest = (
+        scans.take_scans(plain, some) for some in (slice(0, late.shape[1]), slice(late.shape[1], None))
+    )
+    own = own._replace(
+        values=xp.where(late_available > 0.0, late, own.values),
+        available=xp.maximum(own.available, late_available),
+    )
+    return scans.join([own, rest])
 
 
 class Unscented(Extended):

@@ -13,7 +13,7 @@ import numpy
 from .block import LaneBlock, block_for
 from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
 from .functions import Call, address_of
-from .native import Code, native_text, processor
+from .native import HOT, IN_LOOPS, Code, native_text, processor
 
 _LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", "<<": "shl", ">>": "lshr"}
 
@@ -248,7 +248,11 @@ def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarra
     table += [normals, len(rows) - normals]
     text = llvm_text(block_for(processor()[1]))
     return Call(
-        Code(functools.partial(native_text, text)),
+        Code(
+            functools.partial(native_text, text, level=0),
+            functools.partial(native_text, text),
+            HOT // IN_LOOPS,
+        ),
         numpy.array(table, dtype=numpy.int64),
         arrays,
         numpy.empty(0),

@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 import numpy
 from numpy.typing import ArrayLike, NDArray
 
+from .stored_solutions import stored
+
 Matrix = NDArray[numpy.float64]
 _MARGIN = 1e-9
 """Distance from the limit of stability that counts as on it: eigenvalues are known to rounding only."""
@@ -57,6 +59,7 @@ def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = F
     return array
 
 
+@stored
 def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     """Discrete model of ``dx/dt = A x + B u`` with ``u`` constant in each interval.
 
@@ -78,6 +81,7 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
+@stored
 def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
     """Transition matrix and process-noise covariance of a continuous model.
 
@@ -207,7 +211,8 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
         )
 
 
-def _riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
+@stored
+def riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
     """Stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
 
     Raises:
@@ -237,7 +242,7 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
         ValueError: where no stabilising solution exists, with the mode to blame.
     """
     _check_filter(F, H, Q, R, continuous=False)
-    predicted = _riccati_solution("discrete", F.T, H.T, Q, R)
+    predicted = riccati_solution("discrete", F.T, H.T, Q, R)
     gain = numpy.linalg.solve(H @ predicted @ H.T + R, H @ predicted).T
     rest = numpy.eye(len(F)) - gain @ H
     posterior = rest @ predicted @ rest.T + gain @ R @ gain.T
@@ -262,7 +267,7 @@ def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: Arra
     H = numpy.atleast_2d(numpy.asarray(H, float))
     intensity, R = intensity_matrix("intensity", intensity, len(A)), square_matrix("R", R, len(H))
     _check_filter(A, H, intensity, R, continuous=True)
-    P = _riccati_solution("continuous", A.T, H.T, intensity, R)
+    P = riccati_solution("continuous", A.T, H.T, intensity, R)
     gain = numpy.linalg.solve(R, H @ P).T
     return SteadyFilter(gain, P, P, numpy.linalg.eigvals(A - gain @ H))
 
@@ -309,9 +314,16 @@ def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Mat
         ValueError: where no stabilising solution exists, with the reason.
     """
     _check_regulator(F, B, weight, control_weight)
-    S = _riccati_solution("discrete", F, B, weight, control_weight)
+    S = riccati_solution("discrete", F, B, weight, control_weight)
     regret = control_weight + B.T @ S @ B
     return Regulator(numpy.linalg.solve(regret, B.T @ S @ F), regret)
+
+
+def check_stable(F: Matrix) -> None:
+    """Raise ValueError if ``x(k+1) = F x(k)`` is not asymptotically stable."""
+    radius = spectral_radius(F)
+    if radius >= 1.0:
+        raise ValueError(f"only a stable loop has stationary variances, got spectral radius {radius:.6g}")
 
 
 def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
@@ -322,9 +334,7 @@ def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
     """
     from scipy.linalg import solve_discrete_lyapunov
 
-    radius = spectral_radius(F)
-    if radius >= 1.0:
-        raise ValueError(f"only a stable loop has stationary variances, got spectral radius {radius:.6g}")
+    check_stable(F)
     X = solve_discrete_lyapunov(F, Q)
     return 0.5 * (X + X.T)
 

@@ -35,15 +35,16 @@ Shapes: a time axis of K scans stands before the batch, ``(n, K, N)``. A scan th
 """
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy
 
 from . import imm
 from .array_namespace import Array, namespace
 from .ordered_sums import ordered_sum
+from .scans import Step, Track, backward, repeat, take_scans
 from .small_matrices import apply, product, transpose
-
-Carried = TypeVar("Carried", bound=tuple[Any, ...])
 
 
 class Gaussian(NamedTuple):
@@ -87,12 +88,15 @@ def rauch_tung_striebel_step(filtered: Gaussian, motion: Motion, later: Gaussian
     )
 
 
-def smooth(filtered: Gaussian, motion: Motion, lag: int | None = None) -> Gaussian:
+def smooth(
+    filtered: Gaussian, motion: Motion | Callable[[slice], Motion], lag: int | None = None
+) -> Gaussian:
     """Smooth a track of one Kalman filter, or extended Kalman filter.
 
     Args:
         filtered: after the update at each of K scans, ``(n, K, N)`` and ``(n, n, K, N)``.
-        motion: from each of the first K - 1 scans to the next one, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``.
+        motion: from each of the first K - 1 scans to the next one, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``; or a
+            function that makes that of some scans, so that not all lie in memory together.
         lag: how many later scans each estimate uses, fewer where the track ends before; default: all of them.
             Zero gives the filter's estimates.
 
@@ -102,7 +106,25 @@ def smooth(filtered: Gaussian, motion: Motion, lag: int | None = None) -> Gaussi
     Raises:
         ValueError: for a negative lag.
     """
-    return backward(rauch_tung_striebel_step, (drop_last(filtered), motion), filtered, lag)
+    smoothed: Gaussian = backward(
+        rauch_tung_striebel_step, _track(filtered, motion), functools.partial(take_scans, filtered), lag
+    )
+    return smoothed
+
+
+def _track(filtered: Any, motion: Any) -> Track:
+    """What a backward recursion is given of a track; ``motion`` is that of all scans, or a function of some, and what
+    is the same at all scans or in the whole batch has an axis of one there.
+    """
+    K, N = filtered.mean.shape[-2:]
+    whole = None if callable(motion) else repeat(motion, (K - 1, N))
+
+    def given(scans: slice) -> tuple[Any, Any]:
+        if whole is not None:
+            return take_scans(filtered, scans), take_scans(whole, scans)
+        return take_scans(filtered, scans), repeat(motion(scans), (scans.stop - scans.start, N))
+
+    return Track(K - 1, N, given)
 
 
 # --- several models
@@ -186,122 +208,55 @@ def imm_step(
 
 
 def smooth_imm(
-    filtered: GaussianMixture, arrival: Arrival, transition: Array, lag: int | None = None
-) -> GaussianMixture:
+    filtered: GaussianMixture,
+    arrival: Arrival | Callable[[slice], Arrival],
+    transition: Array,
+    lag: int | None = None,
+    keep: Callable[[GaussianMixture], Any] = lambda bank: bank,
+) -> Any:
     """Smooth a track of an IMM; :func:`.imm.combine` makes one estimate of each scan.
 
     Args:
         filtered: after the update at each of K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
-        arrival: at all scans but the first, K - 1 of them before the batch.
+        arrival: at all scans but the first, K - 1 of them before the batch; or a function that makes some of them.
         transition: of the modes, row = from, column = to, ``(M, M)``.
         lag: as of :func:`smooth`.
+        keep: what is kept of the smoothed estimates of some scans; default: all of them.
 
     Returns:
-        The smoothed estimates of each mode and the smoothed mode probabilities, in the same shapes.
+        The smoothed estimates of each mode and the smoothed mode probabilities, in the same shapes, or what is kept of
+        them.
 
     Raises:
         ValueError: for a negative lag.
     """
-    nothing = QuadraticLikelihood(
-        filtered.mean, 0.0 * filtered.probabilities, 0.0 * filtered.mean, 0.0 * filtered.covariance
-    )
-    step = functools.partial(imm_step, transition=transition)
-    return backward(step, (drop_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
 
-
-# --- the recursion over time
-
-
-def backward(
-    step: Callable[..., Carried], given: Sequence[Any], nothing_later: Carried, lag: int | None = None
-) -> Carried:
-    """Run a backward recursion over the time axis, the last but one.
-
-    Args:
-        step: of what is given of a scan and what is carried from the next one; it knows no time axis.
-        given: nested tuples of arrays of the first K - 1 scans, ``(..., K - 1, N)``; what is the same at all scans or
-            in the whole batch has an axis of one.
-        nothing_later: what is carried from each of K scans if nothing later is used.
-        lag: how many later scans are used; default: all.
-
-    Returns:
-        What is carried from each of K scans.
-
-    Raises:
-        ValueError: for a negative lag.
-    """
-    if lag is not None and lag < 0:
-        raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
-    K, N = _arrays_of(nothing_later)[0].shape[-2:]
-    given = [_map_arrays(lambda values: _broadcast_scans(values, (K - 1, N)), part) for part in given]
-    if lag is None or lag >= K - 1:
-        found = [_map_arrays(lambda values: values[..., K - 1, :], nothing_later)]
-        for k in reversed(range(K - 1)):
-            found.append(
-                step(*(_map_arrays(lambda values, k=k: values[..., k, :], part) for part in given), found[-1])
-            )
-        return stack_scans(found[::-1])
-    carried = nothing_later
-    for _ in range(lag):
-        stepped = over_time(step, *given, _map_arrays(lambda values: values[..., 1:, :], carried))
-        carried = _map_arrays(
-            lambda early, last: namespace(last).concat([early, last[..., K - 1 :, :]], axis=-2),
-            stepped,
-            nothing_later,
+    def nothing_later(scans: slice) -> SmoothedBank:
+        bank = take_scans(filtered, scans)
+        nothing = QuadraticLikelihood(
+            bank.mean, 0.0 * bank.probabilities, 0.0 * bank.mean, 0.0 * bank.covariance
         )
-    return carried
+        return SmoothedBank(bank, nothing)
+
+    return backward(
+        _imm_step_of(transition),
+        _track(filtered, arrival),
+        nothing_later,
+        lag,
+        lambda found: keep(found.bank),
+    )
 
 
-def over_time(function: Callable[..., Any], *parts: Any) -> Any:
-    """Call a function that knows no time axis once for all scans.
-
-    Args:
-        function: of nested tuples of arrays ``(..., N)``, each episode for itself.
-        *parts: the same with a time axis, ``(..., K, N)``.
-
-    Returns:
-        What it returns, with a time axis.
-    """
-    first = _arrays_of(parts)[0]
-    last = first.shape[-2:]
-    found = function(*_map_arrays(_flatten_time, parts))
-    return _map_arrays(lambda values: namespace(values).reshape(values, (*values.shape[:-1], *last)), found)
+def _imm_step_of(transition: Array) -> Step:
+    """The step of an IMM with a transition matrix, the same object for the same numbers: what is compiled is kept."""
+    if isinstance(transition, numpy.ndarray):
+        return _imm_step_of_numbers(transition.tobytes(), len(transition))
+    return functools.partial(imm_step, transition=transition)
 
 
-def stack_scans(scans: Sequence[Any]) -> Any:
-    """Put a time axis into nested tuples of arrays ``(..., N)``, one for each scan: ``(..., K, N)``."""
-    return _map_arrays(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
-
-
-def drop_last(part: Any) -> Any:
-    """Return nested tuples of arrays ``(..., K, N)`` without the last scan."""
-    return _map_arrays(lambda values: values[..., :-1, :], part)
-
-
-def _map_arrays(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples; None holds none."""
-    first = parts[0]
-    if first is None:
-        return None
-    if isinstance(first, tuple):
-        answers = [_map_arrays(function, *each) for each in zip(*parts, strict=True)]
-        return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
-    return function(*parts)
-
-
-def _arrays_of(part: Any) -> list[Array]:
-    if part is None:
-        return []
-    return [array for each in part for array in _arrays_of(each)] if isinstance(part, tuple) else [part]
-
-
-def _broadcast_scans(values: Array, last: tuple[int, int]) -> Array:
-    return namespace(values).broadcast_to(values, (*values.shape[:-2], *last))
-
-
-def _flatten_time(values: Array) -> Array:
-    """Scans side by side in the batch."""
-    return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
+@functools.lru_cache(16)
+def _imm_step_of_numbers(numbers: bytes, modes: int) -> Step:
+    return functools.partial(imm_step, transition=numpy.frombuffer(numbers).reshape(modes, modes))
 
 
 # --- likelihoods as quadratic forms
@@ -374,9 +329,7 @@ def _likelihood_from_moments(
     # LAPACK refuses what is not finite, for the whole batch; here only the episode's own estimates are lost.
     lost = xp.isnan(ordered_sum([row for matrix in error.covariance for row in matrix]))
     covariance = xp.where(lost, _identity(centre), error.covariance)
-    variances, directions = xp.linalg.eigh(xp.moveaxis(covariance, (0, 1), (-2, -1)))
-    variances = xp.moveaxis(variances, -1, 0)
-    directions = xp.moveaxis(directions, (-2, -1), (0, 1))
+    variances, directions = eigenvectors(covariance)
     informed = variances < 1.0
     variances = xp.where(informed, variances, 1.0)
     along = xp.where(informed, apply(transpose(directions), error.mean), 0.0)
@@ -391,6 +344,48 @@ def _likelihood_from_moments(
 
 
 # --- matrices
+
+SWEEPS = 7
+"""Of Jacobi's rotations: every one squares the error, and six leave rounding of matrices up to eight rows."""
+
+
+def eigenvectors(A: Array) -> tuple[Array, Array]:
+    """Eigenvalues ``(n, ...)`` and eigenvectors, the columns of ``(n, n, ...)``, of symmetric matrices: of LAPACK, or
+    in a trace by Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
+    """
+    xp, n = namespace(A), A.shape[0]
+    if hasattr(xp, "linalg"):
+        values, vectors = xp.linalg.eigh(xp.moveaxis(A, (0, 1), (-2, -1)))
+        return xp.moveaxis(values, -1, 0), xp.moveaxis(vectors, (-2, -1), (0, 1))
+    rows = [[A[max(i, j), min(i, j)] for j in range(n)] for i in range(n)]
+    columns = [[A[0, 0] * 0.0 + float(i == j) for i in range(n)] for j in range(n)]
+    for _ in range(SWEEPS):
+        for p in range(n):
+            for q in range(p + 1, n):
+                _rotate(rows, columns, p, q)
+    vectors = xp.stack([xp.stack([columns[j][i] for j in range(n)]) for i in range(n)])
+    return xp.stack([rows[i][i] for i in range(n)]), vectors
+
+
+def _rotate(rows: list[list[Array]], columns: list[list[Array]], p: int, q: int) -> None:
+    """Rotate entry (p, q) of a symmetric matrix away, and its eigenvectors with it."""
+    xp, between = namespace(rows[p][q]), rows[p][q]
+    there = between != 0.0
+    ratio = (rows[q][q] - rows[p][p]) / xp.where(there, 2.0 * between, 1.0)
+    root = xp.abs(ratio) + xp.sqrt(1.0 + ratio * ratio)
+    tangent = xp.where(there, xp.where(ratio < 0.0, -1.0, 1.0) / root, 0.0)
+    cosine = 1.0 / xp.sqrt(1.0 + tangent * tangent)
+    sine = tangent * cosine
+    rows[p][p], rows[q][q] = rows[p][p] - tangent * between, rows[q][q] + tangent * between
+    rows[p][q] = rows[q][p] = between * 0.0
+    for k in range(len(rows)):
+        if k not in (p, q):
+            one, other = rows[k][p], rows[k][q]
+            rows[k][p] = rows[p][k] = cosine * one - sine * other
+            rows[k][q] = rows[q][k] = sine * one + cosine * other
+    one_column, other_column = columns[p], columns[q]
+    columns[p] = [cosine * a - sine * b for a, b in zip(one_column, other_column, strict=True)]
+    columns[q] = [sine * a + cosine * b for a, b in zip(one_column, other_column, strict=True)]
 
 
 def semidefinite_root(A: Array) -> Array:

@@ -21,7 +21,7 @@ from filtergym.exports import c_source
 from filtergym.exports.c_filter import file_stem
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
 from filtergym.exports.replay import mean_rows, replay, run_filter
-from filtergym.exports.request import ExportRequest
+from filtergym.exports.request import ExportRequest, request_export
 from filtergym.filters import kalman
 from filtergym.names import find_competitor
 
@@ -456,6 +456,19 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     ):
         assert words in text
     assert "double" not in (folder / "kalman_imm.c").read_text()
+
+
+def test_the_time_of_an_update_is_that_of_optimised_code_and_says_so(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        c_source, "compile_and_test", lambda *_, flags: seen.append(flags[-1]) or "5 ns an update"
+    )
+    request = request_export(problem_of("filtergym/ManeuveringTarget-v0"), "kalman-imm")
+    short = export_c(request, tmp_path / "short")
+    monkeypatch.setattr(c_source, "MOST_OPTIMISED", 100)
+    long = export_c(request, tmp_path / "long")
+    assert seen == ["-O2", "-O1"]
+    assert [short.test, long.test] == [f"5 ns an update with cc {level}" for level in seen]
 
 
 def test_the_operations_of_a_network_are_told_beside_those_of_the_filter(tmp_path, monkeypatch):

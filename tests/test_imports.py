@@ -202,7 +202,7 @@ def test_an_environment_brings_itself_alone() -> None:
             f"env.step(env.action_space.sample())\nassert {task!r} in sys.modules\n"
         )
     brought = imported_by(steps)
-    assert brought - {"llvmlite", "scipy"} == TASKS.keys()  # scipy where constants of one take it
+    assert brought - {"llvmlite"} == TASKS.keys()
 
 
 def test_the_folders_of_baselines_are_those_of_environments() -> None:

@@ -12,10 +12,10 @@ from filtergym.envs.engine.catalogue import folders
 PROBLEM = f"({'|'.join(folders().values())})"
 OF_PROBLEMS = (
     "alpha_beta", "class_fusion", "coordinated_turn", "data_association", "dead_reckoning", "emitter_association",
-    "extended_kalman", "gnss_ins", "gusts", "loosely_coupled", "noise_levels", "polar", "predicted_covariance",
-    "range_errors", "receiver_faults", "satellites", "singer",
+    "extended_kalman", "gnss_ins", "gusts", "linear_systems", "loosely_coupled", "noise_levels", "polar",
+    "predicted_covariance", "range_errors", "receiver_faults", "satellites", "singer", "stored_solutions",
 )  # fmt: skip
-"""Mathematics of one problem, beside what several use."""
+"""Mathematics of problems and their papers alone, beside what all use."""
 PARTS = {
     "logs and advice": (
         rf"envs/logs/|envs/{PROBLEM}/(logs|live|flights|inertial)\.py"

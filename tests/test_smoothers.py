@@ -212,6 +212,24 @@ def test_what_is_not_finite_loses_the_episode():
     np.testing.assert_array_equal(errors[0, [0, 2]], errors[1, [0, 2]])
 
 
+def test_reports_on_a_smoothed_track_are_those_of_single_steps():
+    """Compiled steps report on many measurements together, NumPy's on one after the other: also of lost episodes."""
+
+    class Broken(KalmanIMMSmoother):
+        def smooth(self, measurements, memories):
+            means, covariances = (np.array(part) for part in super().smooth(measurements, memories))
+            means[0, 0, 0], means[1, 12, 1], covariances[2, 2, 7, 2] = np.nan, np.inf, -1.0
+            return means, covariances
+
+    given = {"episodes": 5, "horizon": 20, "tracks": True, "drawn_episodes": 2}
+    both = {"broken": Broken, "whole": ConstantVelocitySmoother}
+    found, expected = (evaluate(TARGET, both, backend=name, **given) for name in ("compiled", "numpy"))
+    assert (found["lost"].sel(policy="broken").values[:3, -1] > 0.0).all()
+    assert set(found) == set(expected)
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name].values, values, rtol=1e-9, atol=1e-7, err_msg=name)
+
+
 def test_episodes_of_a_recording_are_smoothed_each_to_its_end_without_truth():
     name = "imm-turn-smoother"
     made = dataclasses.replace(record(TARGET, scenario="random", episodes=3, horizon=24), truth=None)

@@ -5,7 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from filtergym.filters import gaussian, imm, kalman, smoothing
+from filtergym.compiler.functions import CompiledFunction
+from filtergym.compiler.program import Graph
+from filtergym.filters import gaussian, imm, kalman, scans, smoothing
 
 H = np.array([[1.0, 0.0]])
 
@@ -131,6 +133,46 @@ def test_lag_zero_is_the_filter_to_the_last_bit():
         smoothing.smooth(filtered, motion_of(filtered, F, Q), -1)
 
 
+def test_a_long_track_is_smoothed_alike_in_native_code_and_in_python(monkeypatch):
+    # In native code many scans are one call, here 24 lanes times scans; alone or beside others, and with a lag.
+    count = 70
+    F, Q = transitions(np.random.default_rng(4).uniform(0.1, 3.0, count), 0.7)
+    z, available = np.random.default_rng(5).normal(scale=5.0, size=(count, 3)), np.arange(count) % 4 != 0
+    filtered = forward(batched(START, 3), F, Q, z[None], available, np.array([[0.8]]))
+    single = smoothing.Gaussian(*(part[..., 1:2] for part in filtered))
+    motion = motion_of(filtered, F, Q)
+    alone = motion._replace(predicted=motion.predicted[..., 1:2])
+    monkeypatch.setattr(scans, "TOGETHER", 24)
+    for lag in (None, 1, 5, count - 1, count):
+        found = smoothing.smooth(filtered, motion, lag)
+        one = smoothing.smooth(
+            single, lambda some, own=alone: scans.take_scans(repeated(own, count), some), lag
+        )
+        with monkeypatch.context() as patch:
+            patch.setattr(scans, "LEAST", count + 1)
+            expected = smoothing.smooth(filtered, motion, lag)
+        for own, other, first in zip(found, one, expected, strict=True):
+            np.testing.assert_array_equal(own, first)
+            np.testing.assert_array_equal(other, first[..., 1:2])
+
+
+def repeated(motion, count):
+    return scans.repeat(motion, (count, 1))
+
+
+def test_scans_are_a_sequence_made_of_arrays():
+    track = scans.Scans(smoothing.Gaussian(np.arange(12.0).reshape(3, 2, 2), np.ones((3, 2, 2, 2))))
+    assert len(track) == 3
+    assert [one.mean[0, 0] for one in track] == [0.0, 4.0, 8.0]
+    np.testing.assert_array_equal(track[-1].mean, [[8.0, 9.0], [10.0, 11.0]])
+    assert [one.mean[1, 1] for one in track[1:]] == [7.0, 11.0]
+    stacked, expected = scans.stack_scans(track), scans.stack_scans(list(track))
+    for own, other in zip(stacked, expected, strict=True):
+        np.testing.assert_array_equal(own, other)
+    with pytest.raises(IndexError):
+        track[3]
+
+
 # --- several models
 
 TRANSITION = np.array([[0.9, 0.1], [0.2, 0.8]])
@@ -228,6 +270,42 @@ def simulated(seed, sigmas, transition, probabilities, intervals, R, batch):
             states[:, k + 1, n] = x
         measured[:, n] = states[0, 1:, n] + np.sqrt(R) * rng.normal(size=len(intervals))
     return states, measured
+
+
+@pytest.mark.parametrize("lag", [None, 2])
+def test_a_long_track_of_an_imm_is_smoothed_alike_in_native_code_and_in_python(monkeypatch, lag):
+    intervals = np.random.default_rng(10).uniform(0.3, 2.0, 65)
+    motions = [transitions(intervals, sigma) for sigma in (0.1, 2.0)]
+    _, z = simulated(11, (0.1, 2.0), TRANSITION, PROBABILITIES, intervals, 1.0, 2)
+    filtered, arrival = run_imm(
+        batched(START, 2), motions, TRANSITION, PROBABILITIES, z, np.arange(65) % 5 != 2, 1.0
+    )
+    found = smoothing.smooth_imm(filtered, arrival, TRANSITION, lag)
+    monkeypatch.setattr(scans, "LEAST", 66)
+    expected = smoothing.smooth_imm(filtered, arrival, TRANSITION, lag)
+    # Other code for exponentials, and eigenvectors by rotations in place of LAPACK's.
+    for own, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 8])
+def test_rotations_find_the_eigenvectors(n):
+    # Also of equal eigenvalues, of which any basis is one, and of matrices that are diagonal, or zero.
+    rng = np.random.default_rng(n)
+    values = np.sort(rng.uniform(0.0, 1.2, (n, 6)), axis=0)
+    values[:, 1], values[:, 2], values[: n // 2, 3] = 1.0, 0.0, 1e-9
+    Q = np.linalg.qr(rng.normal(size=(6, n, n)))[0]
+    Q[4] = np.eye(n)
+    A = np.einsum("kij,jk,klj->ilk", Q, values, Q)
+    graph = Graph()
+    rotated = CompiledFunction(lambda A: smoothing.eigenvectors(A), graph)
+    found, vectors = rotated(A)
+    np.testing.assert_allclose(np.sort(found, axis=0), values, rtol=0, atol=4e-16 * n)
+    np.testing.assert_allclose(
+        np.einsum("ijk,jk,ljk->ilk", vectors, found, vectors), A, rtol=0, atol=1e-15 * n
+    )
+    identity = np.broadcast_to(np.eye(n)[..., None], A.shape)
+    np.testing.assert_allclose(np.einsum("jik,jlk->ilk", vectors, vectors), identity, rtol=0, atol=1e-15 * n)
 
 
 @pytest.mark.parametrize("lag", [None, 0, 1, 3])

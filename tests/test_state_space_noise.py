@@ -11,6 +11,7 @@ from own_models import simulate
 import filtergym
 from filtergym import Input, Sensor, read_recording
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.contract.filter import FilterInput
 from filtergym.envs.engine.backend import make_model
 from filtergym.envs.engine.registration import USER_TASKS
 from filtergym.evaluation.running.times import Point, ProcessorTime, front
@@ -246,7 +247,9 @@ def test_smoothing_knows_the_noise_of_inputs_and_late_measurements(make):
     task = make_model(cls, None, backend="numpy", late=0.4, lateness=2).task
     smoother = problem_of(cls.id).baselines.smoothers["kalman-smoother"](task)
     measurements, states = [m for _, m, _, _ in kept], [smoother.start(start.measurement)]
-    means, covariances = smoother.smooth(measurements, [states[0]] * (len(kept) + 1))
+    for measurement in measurements:
+        states.append(smoother.update(states[-1], FilterInput(measurement)))
+    means, covariances = smoother.smooth(measurements, states)
     for lane in range(3):
         x, P, steps = np.array(MEAN), np.array(COVARIANCE), []
         for k, m in enumerate(measurements):

@@ -11,7 +11,7 @@ from ...envs.contract.filter import EstimateState
 from ...envs.contract.observation import Array
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
-from ...filters import coordinated_turn, imm, smoothing
+from ...filters import coordinated_turn, imm, scans, smoothing
 from ...filters.small_matrices import apply
 from ..table import Variant
 from .estimators import (
@@ -45,10 +45,8 @@ class ConstantVelocitySmoother(ConstantVelocity):
         self, measurements: Sequence[Measurement], states: Sequence[EstimateState]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.Gaussian(*smoothing.stack_scans([state[:2] for state in states]))
-        motion = smoothing.over_time(
-            self._motion, smoothing.drop_last(filtered.mean), smoothing.stack_scans(measurements)
-        )
+        filtered = smoothing.Gaussian(*scans.stack_scans(states)[:2])
+        motion = scans.by_stretches(self._motion, filtered.mean, scans.stack_scans(measurements))
         smoothed = smoothing.smooth(filtered, motion, self.lag)
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
 
@@ -98,13 +96,15 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self, measurements: Sequence[Measurement], states: Sequence[KalmanMixture]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.GaussianMixture(*smoothing.stack_scans([state[3:] for state in states]))
-        arrival = smoothing.over_time(
-            self._arrival, smoothing.drop_last(filtered), smoothing.stack_scans(measurements)
-        )
-        bank = smoothing.smooth_imm(filtered, arrival, self.transition, self.lag)
-        mean, covariance = imm.combine(*bank)
-        return mean[:4, 1:], covariance[:4, :4, 1:]
+        filtered = smoothing.GaussianMixture(*scans.stack_scans(states)[3:])
+        arrival = scans.by_stretches(self._arrival, filtered, scans.stack_scans(measurements))
+
+        def estimate(bank: smoothing.GaussianMixture) -> tuple[Array, Array]:
+            mean, covariance = imm.combine(*bank)
+            return mean[:4], covariance[:4, :4]
+
+        mean, covariance = smoothing.smooth_imm(filtered, arrival, self.transition, self.lag, estimate)
+        return mean[:, 1:], covariance[:, :, 1:]
 
 
 class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleModel):

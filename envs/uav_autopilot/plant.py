@@ -87,10 +87,16 @@ class Design(NamedTuple):
     control_weight: float
     steady: linear_systems.SteadyFilter
     """The nominal filter once settled."""
-    state_covariance: numpy.ndarray
-    """Of the state in the nominal loop without command, ``(n, n)``."""
+    loop: linear_systems.ClosedLoop
+    """The nominal one without command."""
     optimal: linear_systems.Regulator | None
     """Control of the true plant if its state were known; None where the weights determine none."""
+
+    @property
+    def state_covariance(self) -> numpy.ndarray:
+        """Of the state in the nominal loop without command, ``(n, n)``; few need it, and it takes SciPy."""
+        n = len(self.weight)
+        return linear_systems.stationary_covariance(*self.loop)[:n, :n]
 
 
 MOST_RATIO = 1e15
@@ -168,9 +174,8 @@ def design(parameters: UavAutopilotParameters) -> Design:
             "moment_disturbance or actuator_disturbance, or let the plant decay more slowly"
         )
     loop = linear_systems.estimate_feedback_loop(model.F, model.B, H, L, steady.gain, Q, R)
-    n = len(names)
-    X = linear_systems.stationary_covariance(*loop)[:n, :n]
-    output = numpy.eye(n)[names.index(OUTPUT[parameters.plant])]
+    linear_systems.check_stable(loop.transition)
+    output = numpy.eye(len(names))[names.index(OUTPUT[parameters.plant])]
     N = linear_systems.feedforward_gain(model.F, model.B, output, L)
     try:
         optimal = linear_systems.discrete_regulator(
@@ -178,4 +183,4 @@ def design(parameters: UavAutopilotParameters) -> Design:
         )
     except ValueError:  # the weights ignore what does not decay, which a feedback of one's own may still hold
         optimal = None
-    return Design(model, true_model, H, R, L, N, weight, control_weight, steady, X, optimal)
+    return Design(model, true_model, H, R, L, N, weight, control_weight, steady, loop, optimal)

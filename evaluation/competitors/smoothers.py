@@ -1,18 +1,21 @@
 """A smoother in the loop: run forward like an estimator, then asked again with all that it has kept."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy
 
-from ...compiler.functions import map_arrays
+from ...compiler.functions import leaves, round_up_lanes
 from ...envs.contract.failures import explain_errors
-from ...envs.contract.filter import Filter, FilterInput
+from ...envs.contract.filter import Filter, FilterInput, Likelihood
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
 from ...envs.contract.task import Task
 from ...envs.engine.compiled import can_step
 from ...envs.engine.lanes import Lanes, whole_episode
+from ...envs.engine.programs import Report
+from ...filters.scans import TOGETHER, Scans, map_nested, over_time, stack_scans
+from .filters import Adapted, Checked, find_fault, is_lacking
 
 
 class SmoothedTrack(Filter[Task, Any, int]):
@@ -29,6 +32,9 @@ class SmoothedTrack(Filter[Task, Any, int]):
     def __init__(self, task: Task, means: numpy.ndarray, covariances: numpy.ndarray) -> None:
         super().__init__(task)
         self.means, self.covariances = means, covariances
+        count = means.shape[-1]
+        self.lanes = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
+        """Episodes in lanes, the last one again in those beyond."""
 
     def start(self, initial: Any) -> int:
         """Nothing is measured yet."""
@@ -40,11 +46,11 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
     def mean(self, state: int) -> Array:
         """What was found at the last measurement."""
-        return self.means[:, state - 1]
+        return self.means[:, state - 1, self.lanes]
 
     def covariance(self, state: int) -> Array:
-        """Likewise."""
-        return self.covariances[:, :, state - 1]
+        """What was found at the last measurement."""
+        return self.covariances[:, :, state - 1, self.lanes]
 
 
 def check_open_loop(model: Model, name: str) -> None:
@@ -82,10 +88,10 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
     own = looped.filter.own.own if looped.filter.in_python else looped.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
-    C = len(looped.task.components)
+    C, N = len(looped.task.components), lanes.count if run is _run_compiled else lanes.width
     return (
-        _check_shape("means", means, (C, length, lanes.width), name),
-        _check_shape("covariances", covariances, (C, C, length, lanes.width), name),
+        _check_shape("means", means, (C, length, N), name),
+        _check_shape("covariances", covariances, (C, C, length, N), name),
     )
 
 
@@ -110,18 +116,100 @@ def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
     return episode.measurement, episode.filter.own
 
 
-def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
-    """The same of one that is compiled; its measurements are masked afterwards, as it is shown them."""
-    first = lanes.state.filter.own
-    kept, _ = lanes.run(report_forward, measurements=length)
-    moments = [_moment(kept, k) for k in range(length)]
-    measurements = [looped.task.world.mask_missing(measurement) for measurement, _ in moments]
-    return measurements, [first, *(memory for _, memory in moments)]
+def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[Scans, Scans]:
+    """Measurements and memories of a smoother that is compiled; its measurements are masked as it is shown them."""
+    start = map_nested(lambda values: values[None, ..., : lanes.count], lanes.state.filter.own)
+    measured: list[Any] = []
+    memories = [start]
+    for stretch in run_stretches(lanes, report_forward, length):
+        # Copies without the lanes beyond, by which those of one episode are eight times as long.
+        measurement, memory = map_nested(lambda values: values[..., : lanes.count].copy(), stretch)
+        masked = over_time(looped.task.world.mask_missing, stack_scans(Scans(measurement)))
+        measured.append(map_nested(lambda values: numpy.moveaxis(values, -2, 0), masked))
+        memories.append(memory)
+    return Scans(_join(measured)), Scans(_join(memories))
 
 
-def _moment(kept: Any, k: int) -> Any:
-    """What was kept of a measurement, rows one after the other: by these matrix products round."""
-    return map_arrays(lambda values: numpy.ascontiguousarray(values[k]), kept)
+def run_stretches(lanes: Lanes, report: Report, length: int) -> Iterator[Any]:
+    """Run episodes that have just begun, and yield reports on some measurements after the others, ``(scans, ..., N)``.
+
+    Args:
+        lanes: compiled ones, whose filter nothing steers.
+        report: as of :meth:`.Lanes.run`.
+        length: measurements of each of them.
+    """
+    together = max(1, TOGETHER // lanes.width)
+    for first in range(0, length, together):
+        yield lanes.run(report, measurements=min(together, length - first))[0]
+
+
+def _join(stretches: Sequence[Any]) -> Any:
+    return map_nested(lambda *arrays: numpy.concatenate(arrays), *stretches)
+
+
+# --- what is reported of the smoothed track
+
+
+def report_world(model: Model, episode: Episode) -> tuple[Any, Any]:
+    """Report what happens whatever is estimated."""
+    return episode.truth, episode.measurement
+
+
+def report_smoothed(
+    looped: Model, lanes: Lanes, track: SmoothedTrack, report: Report, length: int
+) -> Iterator[dict[str, numpy.ndarray]]:
+    """Report on a smoothed track as if a filter had answered it step by step, for many measurements together.
+
+    Args:
+        looped: model whose filter answers it.
+        lanes: compiled episodes of the same world that have just begun, whatever their filter is.
+        track: what was found.
+        report: of arrays ``(..., N)`` by name.
+        length: measurements of each of them.
+
+    Yields:
+        What is reported of some measurements after the others, arrays ``(scans, ..., N)`` by name.
+    """
+    start, none, first = lanes.state.filter, numpy.zeros(lanes.width), 0
+    state = Checked(None, start.mean, start.covariance, none, none)
+    for stretch in run_stretches(lanes, report_world, length):
+        world = map_nested(lambda values: numpy.moveaxis(values, 0, -2), stretch)
+        some = slice(first, first := first + len(leaves(stretch)[0]))
+        answers = track.means[:, some][..., track.lanes], track.covariances[:, :, some][..., track.lanes]
+        checked = _check_answers(looped.task, state, world[1], *answers)
+        found = over_time(lambda episode: looped.run(report, episode), Episode(world[0], world[1], checked))
+        yield map_nested(lambda values: numpy.moveaxis(values, -2, 0), found)
+        state = map_nested(lambda values: values[..., -1, :], checked)
+
+
+def _check_answers(
+    task: Task, before: Checked, measurement: Any, means: numpy.ndarray, covariances: numpy.ndarray
+) -> Checked:
+    """States of a :class:`.CheckedFilter` at measurements ``(..., scans, N)``, from answers to them.
+
+    Args:
+        task: the estimation problem.
+        before: state before the first of them.
+        measurement: all of them.
+        means: ``(C, scans, N)``; what is held is written into it.
+        covariances: ``(C, C, scans, N)``, likewise.
+    """
+    lacking = over_time(lambda some: is_lacking(task.world.mask_missing(some), numpy), measurement)
+    missed = numpy.maximum.accumulate(numpy.where(lacking, 1.0, before.missed), axis=0)
+
+    def fault_of(mean: Array, covariance: Array, missed: Array) -> Array:
+        return find_fault(mean, covariance, 0.0 * missed, missed, numpy)
+
+    fault = numpy.where(before.fault > 0.0, before.fault, over_time(fault_of, means, covariances, missed))
+    # From its first fault on an episode is lost for that reason, and its last valid answer stays.
+    for lane in numpy.flatnonzero((fault > 0.0).any(axis=0)):
+        first = numpy.argmax(fault[:, lane] > 0.0)
+        fault[first:, lane] = fault[first, lane]
+        for answers, start in ((means, before.mean), (covariances, before.covariance)):
+            last = answers[..., first - 1, lane] if first else start[..., lane]
+            answers[..., first:, lane] = last[..., None]
+    own = Adapted(means, covariances, None, Likelihood.unknown(fault))
+    return Checked(own, means, covariances, fault, missed)
 
 
 def _check_shape(word: str, values: Any, shape: Sequence[int], name: str) -> numpy.ndarray:

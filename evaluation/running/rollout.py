@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
-from ...compiler.functions import Specialised, round_up_lanes
+from ...compiler.functions import Specialised
 from ...compiler.native import optimised_code
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
@@ -29,7 +29,7 @@ from ..competitors.kinds import (
     kind_of,
     make_competitor,
 )
-from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
+from ..competitors.smoothers import SmoothedTrack, check_open_loop, report_smoothed, report_world, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
 
@@ -124,14 +124,14 @@ def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int]
 def _smoothed_estimates(
     model: Model, competitor: Any, seeds: Sequence[int], name: str
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother, N a multiple of eight.
+    """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother.
 
     Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
     """
     task = model.task
     lengths = task.lengths(uniforms_of_seeds(seeds, task.noise))
-    K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
-    means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
+    K, C, N = task.horizon, len(task.components), len(seeds)
+    means, covariances = numpy.empty((C, K, N)), numpy.empty((C, C, K, N))
     for length in numpy.unique(lengths).tolist():
         lanes = numpy.flatnonzero(lengths == length)
         own = [seeds[lane] for lane in lanes.tolist()]
@@ -140,8 +140,7 @@ def _smoothed_estimates(
         for kept, answered in zip((means, covariances), found, strict=True):
             kept[..., :length, lanes] = answered[..., : len(own)]
             kept[..., length:, lanes] = answered[..., -1:, : len(own)]
-    last = numpy.minimum(numpy.arange(width), len(seeds) - 1)
-    return means[..., last], covariances[..., last]
+    return means, covariances
 
 
 class More(NamedTuple):
@@ -194,6 +193,13 @@ def run_episodes(
     looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
     if is_policy:
         compiled_policy = _compiled_policy_of(model, competitor, name)
+    if kind == "smoother" and isinstance(track := looped.filter.own.own, SmoothedTrack):
+        forward = put_in_loop(model, competitor, kind, name, count)
+        if can_step(forward, report_world):
+            lanes = start_lanes(forward, seeds)
+            length = lanes.decisions_per_episode * model.task.decision_interval
+            reported = report if more is None else more.report
+            return _join_stretches(report_smoothed(looped, lanes, track, reported, length), count, tick, more)
     compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
     if compiled and (compiled_policy is not None or not is_policy):
         if more is None:
@@ -274,6 +280,21 @@ def _one_after_another(parts: Sequence[Flown]) -> Flown:
     }
     actions = [part.action for part in parts if part.action is not None]
     return Flown(found, numpy.concatenate(actions) if actions else None)
+
+
+def _join_stretches(
+    stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, more: More | None
+) -> Flown:
+    """Keep what is reported of many measurements together, arrays ``(scans, ..., N)`` by name."""
+    series: dict[str, list[numpy.ndarray]] = {}
+    for found in stretches:
+        for name, values in found.items():
+            few = more is not None and name.startswith(more.prefix)
+            series.setdefault(name, []).append(values[..., : more.episodes if more and few else count].copy())
+        tick(count * len(next(iter(found.values()))))
+    return Flown(
+        {name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None
+    )
 
 
 def _step_episodes(
