@@ -176,7 +176,7 @@ def programs(tmp_path_factory):
         place = tmp_path_factory.mktemp("program")
         (place / "first.csv").write_text(lines(log_of(id)), encoding="utf-8")
         name = "mine.filter.json" if id == TARGET else "extended"
-        found[id] = place, advised(place, id, place / "first.csv", name, RENAMES[id])
+        found[id] = place, advised(place, id, place / "first.csv", name, RENAMES[id], ("log", "main"))
     yield found
     forget(OWN)
 
@@ -188,18 +188,20 @@ def run(program, text, *words):
     return subprocess.run([program, *words], input=text.encode(), capture_output=True, env=env, check=False)
 
 
-def advised(place, id, log, name, rename=None):
+def advised(place, id, log, name, rename, programs=("log",)):
     """Export the filter of a log, and compile its programs under the sanitizers."""
     recording = read_recording(log, id, rename=rename)
     if id == TARGET:
-        family = log_families(recording)["constant-velocity"]
-        fit = Fit({**family.start, "log10_noise_scale": 0.1}, 0.0, 1, 0.0, ())
-        write_advised(place / name, problem_of(id), "constant-velocity", recording, fit, {}, "test")
+        moved = "odometry_displacement" in recording.measurements
+        family = "dead-reckoning" if moved else "constant-velocity"
+        scale = {} if moved else {"log10_noise_scale": 0.1}
+        fit = Fit({**log_families(recording)[family].start, **scale}, 0.0, 1, 0.0, ())
+        write_advised(place / name, problem_of(id), family, recording, fit, {}, "test")
         name = str(place / name)
-    request = request_export(problem_of(id), name, None if id == TARGET else recording)
+    request = request_export(problem_of(id), name, recording if id == OWN or moved else None)
     export_c(request, place / "c")
     stem = file_stem(request.name)
-    for program in ("log", "main"):
+    for program in programs:
         words = ["cc", *FLAGS, *STRICT, *SANITIZERS, f"{program}.c", f"{stem}.c", "-lm", "-o", program]
         subprocess.run(words, cwd=place / "c", check=True)
     return name
@@ -264,18 +266,31 @@ def geodetic(table):
     return pandas.concat([found, found.assign(drive="second", lat=found["lat"] + 0.2 * (found["lat"] > 0.0))])
 
 
-def polar(table, stated=True):
-    """Range and azimuth of the positions, with their deviations."""
+def polar(table):
+    """Range and azimuth of the positions, without deviations."""
     east, north = table["East"], table["north"]
-    found = table[["t"]].assign(range=np.hypot(east, north), azimuth=np.degrees(np.arctan2(east, north)))
-    return found.assign(range_sigma=4.0, azimuth_sigma=0.5) if stated else found
+    return table[["t"]].assign(range=np.hypot(east, north), azimuth=np.degrees(np.arctan2(east, north)))
+
+
+def odometry(table, polar=False):
+    """The positions with the displacements of a second sensor, or its speed and heading, which is silent at times."""
+    found = table[["t", "East", "north", "accuracy"]].copy()
+    if polar:
+        found["odometry_speed"], found["odometry_heading"] = 14.0 + 0.1 * table["t"], 120.0 - 0.2 * table["t"]
+    else:
+        found["odometry_x"], found["odometry_y"] = 12.0 + 0.0 * table["t"], -7.0 + 0.01 * table["t"]
+    found.iloc[[10, 11, 25], 4] = np.nan
+    return found
 
 
 PLACES = {
     "latitude": (geodetic, {"t": "time", "alt": "altitude", "drive": "recording"}),
     "range": (polar, {"t": "time"}),
-    "range alone": (lambda table: polar(table, stated=False), {"t": "time"}),
-    "position alone": (lambda table: table[["t", "East", "north"]], {"t": "time", "East": "x", "north": "y"}),
+    "odometry": (odometry, {name: RENAMES[TARGET][name] for name in ("t", "East", "north", "accuracy")}),
+    "odometry by speed": (
+        lambda table: odometry(table, polar=True),
+        {name: RENAMES[TARGET][name] for name in ("t", "East", "north", "accuracy")},
+    ),
 }
 
 

@@ -13,7 +13,7 @@ from ..envs.logs.flight_tables import DAY, DELIMITERS
 from ..envs.logs.own_models import MOST_MISSED
 from ..envs.logs.recorded_tables import MOST_TWICE, UNEVEN
 from .c_filter import FilterText
-from .c_log_programs import LOG, MEMBERS, PLAIN_ROWS, PLOTS, POSITIONS, PROJECT
+from .c_log_programs import LOG, MEMBERS, ODOMETRY, PLAIN_ROWS, PLOTS, POSITIONS, PROJECT, READ_ODOMETRY
 from .traced_filter import TracedFilter
 
 if TYPE_CHECKING:
@@ -37,6 +37,9 @@ PLOT_VALUES = {
     "available": "available",
     "interval": "interval",
     "elapsed": "elapsed",
+    "odometry_displacement_0": "row->odometry ? row->moved[0] / scans : 0.0",
+    "odometry_displacement_1": "row->odometry ? row->moved[1] / scans : 0.0",
+    "odometry_available": "row->odometry ? 1.0 : 0.0",
 }
 """What the numbers of a measurement are of a plot."""
 
@@ -110,8 +113,8 @@ class LogText(FilterText):
     # --- the program
 
     def log_program(self, request: "ExportRequest") -> str:
-        """Text of a program that reads a log of the user; empty where its rows are no plain rows, and it was no table of
-        plots that a filter was advised for.
+        """Text of a program that reads a log of the user; empty where its rows are no plain rows, and no filter was
+        advised for a table of plots.
         """
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
@@ -183,12 +186,14 @@ class LogText(FilterText):
         """Text of the program for plots, as they were read when a filter was advised; empty for other logs."""
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
-        if names is None or not measured <= {*PLOT_VALUES}:
+        second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), ())
+        moves = "odometry_available" in measured
+        if names is None or not measured <= {*PLOT_VALUES} or moves > bool(second):
             return ""
         deviations = (
             ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
         )
-        first = [*names[:2], *deviations, *names[2:]]
+        first = [*names[:2], *deviations, *names[2:], *second]
         # What else the log has says which rows supply each other.
         others = [name for name in log.columns if name not in (*first, "time", RECORDING)]
         columns = [log.columns.get(name, name).lower() for name in (*first, *others)]
@@ -205,6 +210,8 @@ class LogText(FilterText):
             fix=" && !(a == 0.0 && b == 0.0)" if geodetic else "",
             both=int(names[0] == "x"),
             position=POSITIONS[names],
+            odometry=READ_ODOMETRY.format(displacement=ODOMETRY[second]) if moves else "",
+            read_odometry="if (read_odometry(n) != 0) return 2;\n    " if moves else "",
             stated_polar=int(deviations[0] == "range_sigma"),
             fill=self._plot_fill(),
             start=self._plot_start(),
@@ -212,6 +219,8 @@ class LogText(FilterText):
         about = """A track starts from the first two plots, the second of which is before the first row that is
    written; scans without a row have missed the target."""
         limits = {"FARTHEST": rows.farthest, "MOST_MISSED": rows.most_missed, "FINER": rows.finer}
+        if moves:
+            limits["FIRST_ODOMETRY"] = first.index(second[0])
         return self._log(about, follow, columns, 2, MEMBERS, **limits)
 
     def _plot_fill(self) -> str:

@@ -482,8 +482,38 @@ int main(int argc, char **argv) {{
 """Reads a log, and writes an estimate for each row."""
 MEMBERS = """
     double p[2], v[2], m[2]; /* position, m east and north, its variances, and as it was measured */
-    int plot;"""
+    double moved[2];         /* since the row before, m east and north, by a second sensor */
+    int plot, odometry;      /* whether these are there */"""
 """Of a row that may hold a plot."""
+ODOMETRY = {
+    ("odometry_x", "odometry_y"): """row->moved[0] = a;
+        row->moved[1] = b;""",
+    ("odometry_speed", "odometry_heading"): """if (i > 0) {
+            const double *last_cell = own[i - 1]->cell, half = 0.5 * (row->time - own[i - 1]->time);
+            const double c = last_cell[FIRST_ODOMETRY], d = last_cell[FIRST_ODOMETRY + 1];
+            row->moved[0] = half * (c * sin(d * DEGREE) + a * sin(b * DEGREE));
+            row->moved[1] = half * (c * cos(d * DEGREE) + a * cos(b * DEGREE));
+        }""",
+}
+"""How a displacement is made of the columns a and b of a second sensor, the first pair that a log has."""
+READ_ODOMETRY = """
+/* Makes displacements of the rows of a track, of which those that lack a number have none. */
+static int read_odometry(long n) {{
+    long i;
+    int k;
+    for (k = FIRST_ODOMETRY; k < FIRST_ODOMETRY + 2; ++k)
+        if (column[k] < 0) return fail("it lacks the column", names[k], NULL);
+    for (i = 0; i < n; ++i) {{
+        Row *row = own[i];
+        const double a = row->cell[FIRST_ODOMETRY], b = row->cell[FIRST_ODOMETRY + 1];
+        row->moved[0] = row->moved[1] = (double)NAN;
+        {displacement}
+        row->odometry = row->moved[0] == row->moved[0] && row->moved[1] == row->moved[1];
+    }}
+    return 0;
+}}
+"""
+"""Reads a second sensor."""
 POSITIONS = {
     ("latitude", "longitude", "altitude"): """if (!(fabs(a) <= 90.0 && fabs(b) <= 360.0))
             return fail("degrees are expected of latitude and longitude,", "not these", row);
@@ -572,6 +602,7 @@ static void leave_out_stale(long n) {{
         }}
 }}
 
+{odometry}
 /* Makes positions and variances of the rows of a track. */
 static int read_plots(long n) {{
     long i, plots = 0;
@@ -605,26 +636,28 @@ static int read_plots(long n) {{
         }}
     }}
     leave_out_stale(n);
-    for (i = 0; i < n; ++i) plots += own[i]->plot;
+    {read_odometry}for (i = 0; i < n; ++i) plots += own[i]->plot;
     return plots < 3 ? fail("a track starts from two plots and goes on: there are no three", "of them", own[0]) : 0;
 }}
 
-static int step(double at, const Row *row, {own}_estimate *estimate) {{
+/* Takes in a scan: the last one of several until a row, or one before that misses the target. */
+static int step(double at, const Row *row, double scans, int is_last, {own}_estimate *estimate) {{
     static const double none[2] = {{0.0, 0.0}}, nominal[2] = {{{nominal}, {nominal}}};
-    const double interval = at - last, elapsed = at - last_plot, available = row != NULL ? 1.0 : 0.0;
-    const double *p = row != NULL ? row->p : none, *v = row != NULL ? row->v : nominal;
+    const double interval = at - last, elapsed = at - last_plot, available = is_last && row->plot ? 1.0 : 0.0;
+    const double *p = available > 0.0 ? row->p : none, *v = available > 0.0 ? row->v : nominal;
     {own}_measurement m;
     int status;
     (void)interval;
     (void)elapsed;
     (void)p;
     (void)v;
+    (void)scans;
     {fill}
     status = {own}_update(&state, &m, estimate);
     if (status > MISSED) return status;
     scan += 1.0;
     last = at;
-    if (row != NULL) last_plot = at;
+    if (available > 0.0) last_plot = at;
     return status;
 }}
 
@@ -651,12 +684,12 @@ static int follow(long n) {{
             last = last_plot = row->time;
             continue;
         }}
-        scans = rint((row->time - last) / INTERVAL);
+        scans = fmax(rint((row->time - last) / INTERVAL), 1.0);
         if (scans > MOST_MISSED + 1.0) return fail("too many intervals without a row end", "here: cut it", row);
         begun = last;
         for (k = 1.0; k < scans; k += 1.0)
-            (void)note(row, step(begun + (row->time - begun) * k / scans, NULL, &estimate));
-        print_row(row, note(row, step(row->time, row->plot ? row : NULL, &estimate)), &estimate);
+            (void)note(row, step(begun + (row->time - begun) * k / scans, row, scans, 0, &estimate));
+        print_row(row, note(row, step(row->time, row, scans, 1, &estimate)), &estimate);
     }}
     return wrong;
 }}

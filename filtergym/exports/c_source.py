@@ -4,7 +4,6 @@ The filter itself is written by :mod:`.c_filter`; what differs in the programs a
 :mod:`.c_programs`.
 """
 
-import re
 import shutil
 import subprocess
 import tempfile
