@@ -259,6 +259,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
     with whole_files(folder) as waiting:
         texts = files_of(writer, replayed, _notes(figures, replayed, precision))
         program = writer.log_program(request)
+        figures = figures._replace(reads_log=bool(program))
         for file, text in {**texts, **({"log.c": program} if program else {})}.items():
             (waiting / file).write_text(text, encoding="ascii")
     return figures
