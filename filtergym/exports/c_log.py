@@ -123,7 +123,13 @@ class LogText(FilterText):
         return self._plot_log(self.plot_rows, request.log)
 
     def _log(
-        self, about: str, follow: str, names: Sequence[str], needed: int, members: str = "", **reading: float
+        self,
+        about: str,
+        follow: str,
+        names: Sequence[str],
+        needed: int,
+        limits: Mapping[str, float],
+        members: str = "",
     ) -> str:
         """Text of the program.
 
@@ -132,12 +138,12 @@ class LogText(FilterText):
             follow: text of the function of that name.
             names: of the columns, in lower case.
             needed: of them, the first ones.
+            limits: further numbers of the reading.
             members: further ones of a row.
-            **reading: further numbers of the reading.
         """
         shown = [identifier(name) for name, _ in self.components]
         header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
-        defined = {**READING, **reading}
+        defined = {**READING, **limits}
         time = self.log_columns.get("time")
         C = len(self.components)
         return LOG.format(
@@ -180,20 +186,20 @@ class LogText(FilterText):
         about = """A track starts with the initial estimate of the model one interval before the first row. An
    empty cell was not received; of an input the last number holds on."""
         limits = {"RECEIVED": len(rows.received), "UNEVEN": UNEVEN, "MOST_MISSED": MOST_MISSED}
-        return self._log(about, follow, names, len(names), **limits)
+        return self._log(about, follow, names, len(names), limits)
 
     def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
         """Text of the program for plots, as they were read when a filter was advised; empty for other logs."""
         names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
         measured = {*self.structs["measurement"].columns.values()}
-        second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), ())
+        second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
         moves = "odometry_available" in measured
-        if names is None or not measured <= {*PLOT_VALUES} or moves > bool(second):
+        if names is None or not measured <= {*PLOT_VALUES} or moves > (second is not None):
             return ""
         deviations = (
             ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
         )
-        first = [*names[:2], *deviations, *names[2:], *second]
+        first = [*names[:2], *deviations, *names[2:], *(second or ())]
         # What else the log has says which rows supply each other.
         others = [name for name in log.columns if name not in (*first, "time", RECORDING)]
         columns = [log.columns.get(name, name).lower() for name in (*first, *others)]
@@ -210,7 +216,7 @@ class LogText(FilterText):
             fix=" && !(a == 0.0 && b == 0.0)" if geodetic else "",
             both=int(names[0] == "x"),
             position=POSITIONS[names],
-            odometry=READ_ODOMETRY.format(displacement=ODOMETRY[second]) if moves else "",
+            odometry=READ_ODOMETRY.format(displacement=ODOMETRY[second]) if moves and second else "",
             read_odometry="if (read_odometry(n) != 0) return 2;\n    " if moves else "",
             stated_polar=int(deviations[0] == "range_sigma"),
             fill=self._plot_fill(),
@@ -219,9 +225,9 @@ class LogText(FilterText):
         about = """A track starts from the first two plots, the second of which is before the first row that is
    written; scans without a row have missed the target."""
         limits = {"FARTHEST": rows.farthest, "MOST_MISSED": rows.most_missed, "FINER": rows.finer}
-        if moves:
+        if moves and second:
             limits["FIRST_ODOMETRY"] = first.index(second[0])
-        return self._log(about, follow, columns, 2, MEMBERS, **limits)
+        return self._log(about, follow, columns, 2, limits, MEMBERS)
 
     def _plot_fill(self) -> str:
         """Statements that make a measurement ``m`` of a plot."""
