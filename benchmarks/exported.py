@@ -83,8 +83,9 @@ int main(int argc, char **argv) {{
                 {own}_measurement measurement;
                 {own}_estimate estimate;
                 set_measurement(&measurement, rows + (e * T + k) * M);
-                {own}_update(&state, &measurement, &estimate);
-                for (i = 0; i < C; ++i) means[(e * T + k) * C + i] = (double)estimate.mean{mean};
+                const int there = {own}_update(&state, &measurement, &estimate) <= 1;
+                for (i = 0; i < C; ++i)
+                    means[(e * T + k) * C + i] = there ? (double)estimate.mean{mean} : (double)NAN;
             }}
         }}
         best = fmin(best, (double)(clock() - begin) / CLOCKS_PER_SEC / (double)(E * T));

@@ -152,6 +152,19 @@ class PlainRows(NamedTuple):
     """Time between rows, s; None where they may come at any time: the median then lies before the first."""
 
 
+class PlotRows(NamedTuple):
+    """How the rows of a table are plots of a track, which starts from the first two of them."""
+
+    farthest: float
+    """m from the origin."""
+    most_missed: int
+    """Scans that may be missing between two rows."""
+    finer: float
+    """Times that a deviation exceeds the resolution of positions where noise does not repeat one by chance."""
+    deviation: float
+    """m, of a scan without a plot where columns state those of plots."""
+
+
 @dataclass(frozen=True)
 class LogFormat:
     """The tables of real measurements that an environment reads."""
@@ -178,6 +191,8 @@ class LogFormat:
     empty where they may not."""
     plain_rows: PlainRows | None = None
     """How the rows are measurements as they stand; None where more is done to them."""
+    plot_rows: PlotRows | None = None
+    """How the rows are plots of a track; None where they are not."""
     noise_hint: str = ""
     """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     decision_interval: int | None = None

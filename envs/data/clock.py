@@ -2,6 +2,8 @@
 
 SINCE_1970 = 1e8
 """s, from which on a time in seconds is one since 1970: a log of three years begins with zero, a date after 1973."""
+TIME_UNITS = 1e9, 1e6, 1e3
+"""Of a second, in which numbers since 1970 may count."""
 
 
 def time_unit(time: float) -> float:
@@ -9,4 +11,4 @@ def time_unit(time: float) -> float:
 
     1e11 seconds after 1970 are in the year 5138, 1e11 milliseconds in 1973; and so on in steps of a thousand.
     """
-    return next((unit for unit in (1e9, 1e6, 1e3) if time > SINCE_1970 * unit), 1.0)
+    return next((unit for unit in TIME_UNITS if time > SINCE_1970 * unit), 1.0)

@@ -60,6 +60,8 @@ package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of o
 order of their times; rows on the ``ground`` are not flown.
 """
 FOOT = 0.3048
+DELIMITERS = ",;\t"
+"""Of cells in CSV: the first of these that the line of names has."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 DATE = re.compile(
     r"(?:(?P<y>\d{4})/(?P<m>\d{1,2})/(?P<d>\d{1,2})|(?P<D>\d{1,2})\.(?P<M>\d{1,2})\.(?P<Y>\d{4}))(?=[ T]|$)"
@@ -121,7 +123,7 @@ def _csv(file: Path, known: ColumnNames) -> FlightTable:
     with open_foreign(file) as content, io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as text:
         lines = _bounded_lines(text)
         header = next(lines, "")
-        delimiter = next((d for d in ",;\t" if d in header), ",")
+        delimiter = next((d for d in DELIMITERS if d in header), DELIMITERS[0])
         names = [name.strip() for row in csv.reader([header], delimiter=delimiter) for name in row]
         lower = check_column_names(names)
         wanted = {name: i for i, name in enumerate(lower) if name in known}

@@ -551,7 +551,11 @@ def _side_by_side(
                 log_time=_take_rows(own.log_time, found.rows)[None],
                 started=numpy.array([found.start - own.time[0]]),
                 typical={name: value for name, value in found.typical.items() if name not in keywords},
-                columns={name: original.get(name, name) for name in own.table if not name.startswith(TRUTH)},
+                columns={
+                    name: original.get(name, name)
+                    for name in (*own.table, *({RECORDING} & {*original}))
+                    if not name.startswith(TRUTH)
+                },
                 deviations=found.deviations,
                 deviations_from=found.deviations_from,
                 origin={} if own.origin is None else own.origin._asdict(),

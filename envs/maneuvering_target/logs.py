@@ -16,6 +16,7 @@ from ..contract.log_format import (
     NO_DEVIATIONS,
     Column,
     LogFormat,
+    PlotRows,
     Predicted,
     TrackLog,
     TrackStart,
@@ -409,5 +410,6 @@ LOG_FORMAT = LogFormat(
     predict=predict_position,
     predicted=(Predicted("x", "m", "position"), Predicted("y", "m", "position")),
     plane=("x", "y", "truth_position_x", "truth_position_y"),
+    plot_rows=PlotRows(FARTHEST_RANGE, LARGEST_GAP, FINER, ManeuveringTargetParameters.range_sigma),
     longest_interval=60.0,
 )

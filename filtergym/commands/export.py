@@ -148,6 +148,11 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
         f"{request.name} {figures.difference:.1e} standard deviations",
         f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
+        *(
+            ["no log.c: it reads tables of plots, and those of models of one's own"]
+            if request.log is not None and not figures.reads_log
+            else []
+        ),
     ):
         console.print(line, highlight=False, soft_wrap=True)
 

@@ -4,7 +4,6 @@ The filter itself is written by :mod:`.c_filter`; what differs in the programs a
 :mod:`.c_programs`.
 """
 
-import re
 import shutil
 import subprocess
 import tempfile
@@ -24,10 +23,10 @@ from ..compiler.c_text import (
     literal,
 )
 from ..envs.contract.companions import array_meanings, find_companion
-from ..envs.contract.log_format import TIME, LogFormat, LogSetup, PlainRows
+from ..envs.contract.log_format import LogFormat
 from ..evaluation.storage.files import whole_files
-from .c_filter import FilterText
-from .c_programs import INITIAL_IN_ROW, INITIAL_OF_MODEL, LOG, MAIN, PLAIN_LOG, POSITIONS, PROJECT, TEST
+from .c_log import LogText, name_list
+from .c_programs import INITIAL_IN_ROW, INITIAL_OF_MODEL, MAIN, TEST
 from .figures import Figures, operation_words
 from .replay import Replay, mean_rows, replay, run_filter
 from .request import ExportRequest
@@ -49,7 +48,7 @@ VECTORS = 2, 50
 """Episodes and measurements among the test's vectors, at most."""
 
 
-class Writer(FilterText):
+class Writer(LogText):
     """The files of a filter: itself, and the programs around it.
 
     Args:
@@ -57,8 +56,8 @@ class Writer(FilterText):
         traced: its programs.
         scalar: kind of numbers.
         components: what is estimated.
-        rows: how rows of a log are its measurements as they stand; None where more is done to them.
-        columns: names in the log of the columns that have others there.
+        log_format: as of :class:`.LogText`, also the next one.
+        columns: of the log.
 
     Attributes:
         limit: largest difference with which the test passes, standard deviations.
@@ -70,11 +69,10 @@ class Writer(FilterText):
         traced: TracedFilter,
         scalar: Scalar,
         components: Sequence[tuple[str, str]],
-        rows: PlainRows | None = None,
+        log_format: LogFormat | None = None,
         columns: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(name, traced, scalar, components)
-        self.plain_rows, self.log_columns = rows, columns or {}
+        super().__init__(name, traced, scalar, components, log_format, columns)
         self.limit = WORST[scalar.name]
 
     def rows(self) -> str:
@@ -93,12 +91,6 @@ class Writer(FilterText):
         text.append(f"#endif /* {own.upper()}_ROWS_H */\n")
         return "\n".join(text)
 
-    def columns(self, part: str) -> list[str]:
-        """Names of the columns of a table, in the order of the rows of an argument."""
-        names = self.structs[part].columns
-        begin = "initial_" if part == "initial" else ""
-        return [f"{begin}{names[row]}" for row in sorted(names)]
-
     def main(self) -> str:
         """Text of a program that reads a table of measurements and writes one of estimates."""
         C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
@@ -115,8 +107,8 @@ class Writer(FilterText):
         ]
         return MAIN.format(
             own=self.name,
-            columns=_string(",".join(given)),
-            header=_string(",".join(header)),
+            columns=name_list(",".join(given)),
+            header=name_list(",".join(header)),
             initial=len(initial),
             measurement=len(measurement),
             count=len(given),
@@ -137,7 +129,9 @@ class Writer(FilterText):
             entry="" if C == 1 else "[i][j]",
             feedback=sum(member.name == FEEDBACK for member in self.traced.estimate),
             steer=STEER if any(member.name == FEEDBACK for member in self.traced.estimate) else "",
-            told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
+            told="".join(
+                f"\n        print_number(there ? (double)estimate.{name} : (double)NAN);" for name in told
+            ),
         )
 
     def table_columns(self) -> list[str]:
@@ -145,41 +139,9 @@ class Writer(FilterText):
         rows = self.plain_rows
         if rows is None:
             return [*self.columns("initial"), *self.columns("measurement")]
-        own = [name for name in self.columns("measurement") if self._source(name) == ("other", 0)]
+        own = [name for name in self.columns("measurement") if self.source_of(name) == ("other", 0)]
         timed = ["interval"] * (rows.interval is None)
         return [*map(identifier, ["recording", *timed, *rows.received, *rows.held]), *own]
-
-    def _source(self, name: str) -> tuple[str, int]:
-        """What a number of a measurement follows from in a plain row: its kind and its place among those."""
-        kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
-        kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
-        return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
-
-    def _fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
-        """Statements that make a measurement ``given`` of a plain row.
-
-        Args:
-            received: expression of the first number that is received; the others follow it.
-            held: likewise of the inputs.
-            interval: expression of the interval.
-            others: expressions of all else, in its order; default: zero.
-        """
-        lines, rest = [], iter(others)
-        for row, name in enumerate(self.columns("measurement")):
-            kind, place = self._source(name)
-            cell = f"{received}[{place}]"
-            value = {
-                "received": f"{cell} == {cell} ? {cell} : 0.0",
-                "there": f"{cell} == {cell} ? 1.0 : 0.0",
-                "held": f"{held}[{place}]",
-                "interval": interval,
-            }.get(kind) or next(rest, "0.0")
-            lines.append(f"given[{row}] = {value};")
-        return "\n    ".join(lines)
-
-    def _estimate(self, rows: PlainRows) -> list[float]:
-        """Initial estimate of all tracks, in the order of the rows of its struct."""
-        return [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
 
     def _layout(self) -> str:
         """Functions of main.c that say where in a row everything is."""
@@ -193,103 +155,16 @@ class Writer(FilterText):
             f"if (row[{place}] == row[{place}]) last[{place - count}] = row[{place}];"
             for place in range(count, held)
         ]
-        fill = self._fill(f"(row + {first})", "last", "row[1]", others)
+        fill = self.fill(f"(row + {first})", "last", "row[1]", others)
         if hold:
             fill = "\n    ".join([f"static double last[{len(hold)}];", *hold, fill])
-        return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self._estimate(rows))), fill=fill)
-
-    def plain_log_program(self, interval: float | None = None) -> str:
-        """Text of a program that reads a log whose rows are measurements as they stand; empty where they are not.
-
-        Args:
-            interval: between rows that a user has set, s.
-        """
-        rows = self.plain_rows
-        if rows is None:
-            return ""
-        C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
-        shown = [identifier(name) for name, _ in self.components]
-        header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
-        times = dict.fromkeys([self.log_columns.get("time", "time"), *TIME])
-        names = [self.log_columns.get(name.lower(), name) for name in (*rows.received, *rows.held)]
-        return PLAIN_LOG.format(
-            own=self.name,
-            interval=literal(0.0 if rows.interval is None else interval or rows.interval),
-            first=literal(interval or 0.0),
-            received=len(rows.received),
-            count=len(names),
-            measurement=len(self.columns("measurement")),
-            times=", ".join(_quote(name.lower()) for name in times),
-            names=", ".join(_quote(name.lower().replace(" ", "")) for name in names),
-            estimate=", ".join(map(literal, self._estimate(rows))),
-            fill=self._fill("row", "held", "interval"),
-            header=_string(",".join(header)),
-            C=C,
-            digits=digits,
-            mean="" if C == 1 else "[i]",
-            covariance="" if C == 1 else "[i][i]",
-        )
-
-    def log_program(self, log: LogSetup) -> str:
-        """Text of a program that reads a log as it was read when the filter was advised; empty where it was no table of
-        plots.
-        """
-        names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
-        if names is None or (names[0] == "latitude") != (log.plane is not None):
-            return ""
-        deviations = (
-            ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
-        )
-        columns = [
-            log.columns.get(name, name).lower() for name in ("time", *names[:2], *deviations, *names[2:])
-        ]
-        real, C = self.scalar.name, len(self.components)
-        values = {
-            "scan": "scan", "position_0": "p[0]", "position_1": "p[1]", "variance_0": "v[0]", "variance_1": "v[1]",
-            "available": "available", "interval": "interval", "elapsed": "elapsed",
-        }  # fmt: skip
-        struct = self.structs["measurement"]
-        if not {*struct.columns.values()} <= {*values}:
-            return ""
-        fill = [
-            f"m.{struct.places[row]} = ({real}){values[struct.columns[row]]};"
-            for row in sorted(struct.places)
-        ]
-        begin = self.structs["initial"]
-        initial = {"mean_0": "p[0]", "mean_1": "p[1]", "mean_2": "(p[0] - p0[0]) / lasted"}
-        initial["mean_3"] = "(p[1] - p0[1]) / lasted"
-        for i in range(2):
-            initial[f"covariance_{i}_{i}"] = f"v[{i}]"
-            initial[f"covariance_{i}_{i + 2}"] = initial[f"covariance_{i + 2}_{i}"] = f"v[{i}] / lasted"
-            initial[f"covariance_{i + 2}_{i + 2}"] = f"(v0[{i}] + v[{i}]) / (lasted * lasted)"
-        start = [
-            f"initial.{begin.places[row]} = ({real})({initial.get(begin.columns[row], '0.0')});"
-            for row in sorted(begin.places)
-        ]
-        shown = [identifier(name) for name, _ in self.components]
-        header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
-        return LOG.format(
-            own=self.name,
-            columns=", ".join(_string(name) for name in columns),
-            header=_string(",".join(header)),
-            count=len(columns),
-            position=POSITIONS[names],
-            project=PROJECT.format(origin=", ".join(map(literal, log.plane))) if log.plane else "",
-            stated_polar=int(deviations[0] == "range_sigma"),
-            first=literal(log.deviations[deviations[0]]),
-            second=literal(log.deviations[deviations[1]]),
-            interval=literal(log.interval),
-            fill="\n    ".join(fill),
-            start="\n                ".join(start),
-            upper=self.name.upper(),
-            C=C,
-            digits=17 if self.scalar is DOUBLE else 9,
-        )
+        return INITIAL_OF_MODEL.format(estimate=", ".join(map(literal, self.initial_estimate)), fill=fill)
 
     def test(self) -> str:
         """Text of a program that compares the filter with the vectors."""
         return TEST.format(
             own=self.name,
+            upper=self.name.upper(),
             limit=literal(self.limit),
             C=len(self.components),
             mean="" if len(self.components) == 1 else "[i]",
@@ -334,32 +209,13 @@ class Writer(FilterText):
         there = [
             value > 0.0
             for value, name in zip(row, self.columns("measurement"), strict=True)
-            if self._source(name)[0] == "there"
+            if self.source_of(name)[0] == "there"
         ]
         for value, name in zip(row, self.columns("measurement"), strict=True):
-            kind, place = self._source(name)
+            kind, place = self.source_of(name)
             if kind != "there":
                 found[kind].append("" if kind == "received" and not there[place] else repr(value))
         return [cell for cells in found.values() for cell in cells]
-
-
-def _quote(text: str) -> str:
-    """A literal of C of any words: what is no letter, digit or plain sign is written in octal."""
-    return (
-        '"'
-        + "".join(
-            chr(byte) if (chr(byte).isalnum() and byte < 128) or chr(byte) in " _-./()[]" else f"\\{byte:03o}"
-            for byte in text.encode()
-        )
-        + '"'
-    )
-
-
-def _string(text: str) -> str:
-    """A literal of C of words that are identifiers already."""
-    assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
-    pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
-    return "\n    ".join(f'"{piece}"' for piece in pieces)
 
 
 def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
@@ -389,7 +245,7 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
         traced,
         scalar,
         replayed.components,
-        log_format.plain_rows if log_format else None,
+        log_format,
         {**getattr(request.scenario, "columns", {}), **(request.log.columns if request.log else {})},
     )
     writer.about = _about(request, writer, precision, command)
@@ -402,17 +258,11 @@ def export_c(request: ExportRequest, folder: Path, precision: str = "double", co
     folder.mkdir(parents=True, exist_ok=True)
     with whole_files(folder) as waiting:
         texts = files_of(writer, replayed, _notes(figures, replayed, precision))
-        program = _log_program(request, writer)
+        program = writer.log_program(request)
+        figures = figures._replace(reads_log=bool(program))
         for file, text in {**texts, **({"log.c": program} if program else {})}.items():
             (waiting / file).write_text(text, encoding="ascii")
     return figures
-
-
-def _log_program(request: ExportRequest, writer: Writer) -> str:
-    """Text of a program that reads a log of the user; empty where there is none."""
-    if writer.plain_rows is not None:
-        return writer.plain_log_program(request.keywords.get("sampling_interval"))
-    return "" if request.log is None else writer.log_program(request.log)
 
 
 def price_of(request: ExportRequest) -> dict[str, int] | None:
@@ -459,7 +309,7 @@ def _about(request: ExportRequest, writer: Writer, precision: str, command: str)
                 "Estimates from a log of your own:",
                 f"    cc -std=c99 -O2 log.c {own}.c -lm -o log && ./log mine.csv",
             ]
-            if _log_program(request, writer)
+            if writer.log_program(request)
             else []
         ),
         "",

@@ -21,6 +21,8 @@ class Figures(NamedTuple):
     """Of a network, where it is asked."""
     test: str = ""
     """What the compiled test has said; empty without a compiler."""
+    reads_log: bool = False
+    """Whether a program reads logs of the user."""
 
 
 def operation_words(figures: Figures) -> str:

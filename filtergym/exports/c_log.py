@@ -1,0 +1,276 @@
+"""The program that reads a user's log: what it reads and how is taken from where the reader itself declares it."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from ..compiler.c_text import DOUBLE, Scalar, identifier, literal
+from ..envs.contract.live_input import LARGEST
+from ..envs.contract.log_format import RECORDING, TIME, LogFormat, LogSetup, PlainRows, PlotRows, is_assumed
+from ..envs.data.clock import SINCE_1970, TIME_UNITS
+from ..envs.data.foreign_parsers import LONGEST_CELL, MOST_COLUMNS
+from ..envs.logs.flight_tables import DAY, DELIMITERS
+from ..envs.logs.own_models import MOST_MISSED
+from ..envs.logs.recorded_tables import MOST_TWICE, UNEVEN
+from .c_filter import FilterText
+from .c_log_programs import LOG, MEMBERS, ODOMETRY, PLAIN_ROWS, PLOTS, POSITIONS, PROJECT, READ_ODOMETRY
+from .traced_filter import TracedFilter
+
+if TYPE_CHECKING:
+    from .request import ExportRequest
+
+READING = {
+    "SINCE_1970": SINCE_1970,
+    "DAY": DAY,
+    "LARGEST": LARGEST,
+    "LONGEST_CELL": LONGEST_CELL,
+    "MOST_COLUMNS": MOST_COLUMNS,
+    "MOST_TWICE": MOST_TWICE,
+}
+"""Numbers of the reader of tables, by their names there and in C."""
+PLOT_VALUES = {
+    "scan": "scan + 1.0",
+    "position_0": "p[0]",
+    "position_1": "p[1]",
+    "variance_0": "v[0]",
+    "variance_1": "v[1]",
+    "available": "available",
+    "interval": "interval",
+    "elapsed": "elapsed",
+    "odometry_displacement_0": "row->odometry ? row->moved[0] / scans : 0.0",
+    "odometry_displacement_1": "row->odometry ? row->moved[1] / scans : 0.0",
+    "odometry_available": "row->odometry ? 1.0 : 0.0",
+}
+"""What the numbers of a measurement are of a plot."""
+
+
+class LogText(FilterText):
+    """A filter as text, and how it is fed from the rows of a table.
+
+    Args:
+        name: as of :class:`.FilterText`, also the next three.
+        traced: its programs.
+        scalar: kind of numbers.
+        components: what is estimated.
+        log_format: of the environment; None where it reads no logs.
+        columns: names in the log of the columns that have others there.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        traced: TracedFilter,
+        scalar: Scalar,
+        components: Sequence[tuple[str, str]],
+        log_format: LogFormat | None = None,
+        columns: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(name, traced, scalar, components)
+        self.plain_rows = log_format.plain_rows if log_format else None
+        self.plot_rows = log_format.plot_rows if log_format else None
+        self.log_columns = columns or {}
+
+    def columns(self, part: str) -> list[str]:
+        """Names of the columns of a table, in the order of the rows of an argument."""
+        names = self.structs[part].columns
+        begin = "initial_" if part == "initial" else ""
+        return [f"{begin}{names[row]}" for row in sorted(names)]
+
+    @property
+    def initial_estimate(self) -> list[float]:
+        """Of all tracks of plain rows, in the order of the rows of its struct."""
+        rows = self.plain_rows
+        return [] if rows is None else [*rows.mean.tolist(), *rows.covariance.ravel().tolist()]
+
+    def source_of(self, name: str) -> tuple[str, int]:
+        """What a number of a measurement follows from in a plain row: its kind and its place among those."""
+        kind, _, place = name.rpartition("_") if name[-1].isdigit() else (name, "", "0")
+        kinds = {"values": "received", "available": "there", "inputs": "held", "interval": "interval"}
+        return (kinds[kind], int(place)) if kind in kinds else ("other", 0)
+
+    def fill(self, received: str, held: str, interval: str, others: Sequence[str] = ()) -> str:
+        """Statements that make a measurement ``given`` of a plain row.
+
+        Args:
+            received: expression of the first number that is received; the others follow it.
+            held: likewise of the inputs.
+            interval: expression of the interval.
+            others: expressions of all else, in its order; default: zero.
+        """
+        lines, rest = [], iter(others)
+        for row, name in enumerate(self.columns("measurement")):
+            kind, place = self.source_of(name)
+            cell = f"{received}[{place}]"
+            value = {
+                "received": f"{cell} == {cell} ? {cell} : 0.0",
+                "there": f"{cell} == {cell} ? 1.0 : 0.0",
+                "held": f"{held}[{place}]",
+                "interval": interval,
+            }.get(kind) or next(rest, "0.0")
+            lines.append(f"given[{row}] = {value};")
+        return "\n    ".join(lines)
+
+    # --- the program
+
+    def log_program(self, request: "ExportRequest") -> str:
+        """Text of a program that reads a log of the user; empty where its rows are no plain rows, and no filter was
+        advised for a table of plots.
+        """
+        if self.plain_rows is not None:
+            return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
+        if self.plot_rows is None or request.log is None:
+            return ""
+        return self._plot_log(self.plot_rows, request.log)
+
+    def _log(
+        self,
+        about: str,
+        follow: str,
+        names: Sequence[str],
+        needed: int,
+        limits: Mapping[str, float],
+        members: str = "",
+    ) -> str:
+        """Text of the program.
+
+        Args:
+            about: how a track starts, for the comment.
+            follow: text of the function of that name.
+            names: of the columns, in lower case.
+            needed: of them, the first ones.
+            limits: further numbers of the reading.
+            members: further ones of a row.
+        """
+        shown = [identifier(name) for name, _ in self.components]
+        header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
+        defined = {**READING, **limits}
+        time = self.log_columns.get("time")
+        C = len(self.components)
+        return LOG.format(
+            own=self.name,
+            about=about,
+            include=self.name if members else "rows",
+            reading="\n".join(f"#define {name} {_number(value)}" for name, value in defined.items()),
+            count=len(names),
+            needed=needed,
+            times=", ".join(_quote(name.lower()) for name in (TIME if time is None else [time])),
+            names=", ".join(_quote(name) for name in names),
+            recording=_quote(self.log_columns.get(RECORDING, RECORDING).lower()),
+            delimiters=_quote(DELIMITERS),
+            units=", ".join(map(literal, TIME_UNITS)),
+            members=members,
+            follow=follow,
+            header=name_list(",".join(header)),
+            C=C,
+            digits=17 if self.scalar is DOUBLE else 9,
+            mean="" if C == 1 else "[i]",
+            covariance="" if C == 1 else "[i][i]",
+        )
+
+    def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
+        """Text of the program for rows that are measurements as they stand.
+
+        Args:
+            rows: how they are.
+            interval: between rows that a user has set, s.
+        """
+        names = [self.log_columns.get(name.lower(), name).lower() for name in (*rows.received, *rows.held)]
+        follow = PLAIN_ROWS.format(
+            own=self.name,
+            interval=literal(0.0 if rows.interval is None else interval or rows.interval),
+            first=literal(interval or 0.0),
+            measurement=len(self.columns("measurement")),
+            estimate=", ".join(map(literal, self.initial_estimate)),
+            fill=self.fill("row", "held", "interval"),
+        )
+        about = """A track starts with the initial estimate of the model one interval before the first row. An
+   empty cell was not received; of an input the last number holds on."""
+        limits = {"RECEIVED": len(rows.received), "UNEVEN": UNEVEN, "MOST_MISSED": MOST_MISSED}
+        return self._log(about, follow, names, len(names), limits)
+
+    def _plot_log(self, rows: PlotRows, log: LogSetup) -> str:
+        """Text of the program for plots, as they were read when a filter was advised; empty for other logs."""
+        names = next((names for names in POSITIONS if {*names[:2]} <= {*log.columns}), None)
+        measured = {*self.structs["measurement"].columns.values()}
+        second = next((pair for pair in ODOMETRY if {*pair} <= {*log.columns}), None)
+        moves = "odometry_available" in measured
+        if names is None or not measured <= {*PLOT_VALUES} or moves > (second is not None):
+            return ""
+        deviations = (
+            ["sigma_x", "sigma_y"] if "sigma_x" in log.deviations else ["range_sigma", "azimuth_sigma"]
+        )
+        first = [*names[:2], *deviations, *names[2:], *(second or ())]
+        # What else the log has says which rows supply each other.
+        others = [name for name in log.columns if name not in (*first, "time", RECORDING)]
+        columns = [log.columns.get(name, name).lower() for name in (*first, *others)]
+        usual = [log.deviations[name] for name in deviations]
+        geodetic = names[0] == "latitude"
+        follow = PLOTS.format(
+            own=self.name,
+            interval=literal(float(log.parameters.get("sampling_interval", log.interval))),
+            first=literal(usual[0]),
+            second=literal(usual[1]),
+            nominal=literal((usual[0] if is_assumed(log.deviations_from) else rows.deviation) ** 2),
+            project=PROJECT if geodetic else "",
+            locate="if (find_origin(n) != 0) return 2;\n    " if geodetic else "",
+            fix=" && !(a == 0.0 && b == 0.0)" if geodetic else "",
+            both=int(names[0] == "x"),
+            position=POSITIONS[names],
+            odometry=READ_ODOMETRY.format(displacement=ODOMETRY[second]) if moves and second else "",
+            read_odometry="if (read_odometry(n) != 0) return 2;\n    " if moves else "",
+            stated_polar=int(deviations[0] == "range_sigma"),
+            fill=self._plot_fill(),
+            start=self._plot_start(),
+        )
+        about = """A track starts from the first two plots, the second of which is before the first row that is
+   written; scans without a row have missed the target."""
+        limits = {"FARTHEST": rows.farthest, "MOST_MISSED": rows.most_missed, "FINER": rows.finer}
+        if moves and second:
+            limits["FIRST_ODOMETRY"] = first.index(second[0])
+        return self._log(about, follow, columns, 2, limits, MEMBERS)
+
+    def _plot_fill(self) -> str:
+        """Statements that make a measurement ``m`` of a plot."""
+        struct, real = self.structs["measurement"], self.scalar.name
+        return "\n    ".join(
+            f"m.{place} = ({real})({PLOT_VALUES[struct.columns[row]]});"
+            for row, place in sorted(struct.places.items())
+        )
+
+    def _plot_start(self) -> str:
+        """Statements that make the ``initial`` estimate of two plots, as the reader does."""
+        struct, real = self.structs["initial"], self.scalar.name
+        values = {"mean_0": "p[0]", "mean_1": "p[1]"}
+        values |= {f"mean_{i + 2}": f"(p[{i}] - p0[{i}]) / lasted" for i in range(2)}
+        for i in range(2):
+            values[f"covariance_{i}_{i}"] = f"v[{i}]"
+            values[f"covariance_{i}_{i + 2}"] = values[f"covariance_{i + 2}_{i}"] = f"v[{i}] / lasted"
+            values[f"covariance_{i + 2}_{i + 2}"] = f"(v0[{i}] + v[{i}]) / (lasted * lasted)"
+        return "\n                ".join(
+            f"initial.{place} = ({real})({values.get(struct.columns[row], '0.0')});"
+            for row, place in sorted(struct.places.items())
+        )
+
+
+def _number(value: float) -> str:
+    """A literal of C, of a whole number without a point."""
+    return str(value) if isinstance(value, int) else literal(value)
+
+
+def _quote(text: str) -> str:
+    """A literal of C of any words: what is no letter, digit or plain sign is written in octal."""
+    return (
+        '"'
+        + "".join(
+            chr(byte) if (chr(byte).isalnum() and byte < 128) or chr(byte) in " _-./()[]" else f"\\{byte:03o}"
+            for byte in text.encode()
+        )
+        + '"'
+    )
+
+
+def name_list(text: str) -> str:
+    """Return a literal of C of words that are identifiers already, with commas between them."""
+    assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
+    pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
+    return "\n    ".join(f'"{piece}"' for piece in pieces)
