@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy
 
 from .block import LANES
-from .functions import UNCOUNTED, Call, address_of, run_over
+from .functions import UNCOUNTED, Call, address_of, empty_lanes, run_over
 from .native import Native, address_of_code, native_text
 
 TILE = 64
@@ -45,14 +45,20 @@ entry:
   %steps = load i64, ptr %steps.place
   %tile.place = getelementptr i64, ptr %given, i64 7
   %tile = load i64, ptr %tile.place
+  %lasting.place = getelementptr i64, ptr %given, i64 8
+  %lasting = load ptr, ptr %lasting.place
+  %lasts.place = getelementptr i64, ptr %given, i64 9
+  %lasts = load i64, ptr %lasts.place
+  %hop = mul i64 %tile, 8
   br label %tile.head
 tile.head:
   %start = phi i64 [%first, %entry], [%ahead, %tile.next]
+  %hopped = phi i64 [0, %entry], [%hops, %tile.next]
   %ahead = add i64 %start, %tile
   %whole = icmp slt i64 %ahead, %last
   %end = select i1 %whole, i64 %ahead, i64 %last
   %any = icmp slt i64 %start, %last
-  br i1 %any, label %step.head, label %exit
+  br i1 %any, label %step.head, label %home.head
 step.head:
   %step = phi i64 [0, %tile.head], [%step.after, %step.next]
   %more = icmp slt i64 %step, %steps
@@ -94,7 +100,7 @@ step.next:
 rewind.head:
   %back = phi i64 [0, %step.head], [%back.after, %rewind.body]
   %backs = icmp slt i64 %back, %moving
-  br i1 %backs, label %rewind.body, label %tile.next
+  br i1 %backs, label %rewind.body, label %hop.start
 rewind.body:
   %back.place = getelementptr ptr, ptr %entries, i64 %back
   %back.at = load ptr, ptr %back.place
@@ -106,8 +112,35 @@ rewind.body:
   store i64 %origin, ptr %back.at
   %back.after = add i64 %back, 1
   br label %rewind.head
+hop.start:
+  %hops = add i64 %hopped, %hop
+  br label %hop.head
+hop.head:
+  %same = phi i64 [0, %hop.start], [%same.after, %hop.body]
+  %sames = icmp slt i64 %same, %lasts
+  br i1 %sames, label %hop.body, label %tile.next
+hop.body:
+  %same.place = getelementptr ptr, ptr %lasting, i64 %same
+  %same.at = load ptr, ptr %same.place
+  %there = load i64, ptr %same.at
+  %nearer = sub i64 %there, %hop
+  store i64 %nearer, ptr %same.at
+  %same.after = add i64 %same, 1
+  br label %hop.head
 tile.next:
   br label %tile.head
+home.head:
+  %home = phi i64 [0, %tile.head], [%home.after, %home.body]
+  %homes = icmp slt i64 %home, %lasts
+  br i1 %homes, label %home.body, label %exit
+home.body:
+  %home.place = getelementptr ptr, ptr %lasting, i64 %home
+  %home.at = load ptr, ptr %home.place
+  %away = load i64, ptr %home.at
+  %begun = add i64 %away, %hopped
+  store i64 %begun, ptr %home.at
+  %home.after = add i64 %home, 1
+  br label %home.head
 exit:
   ret void
 }
@@ -150,6 +183,8 @@ class CallSequence:
         odd: those of an odd step, as many; needed where there is more than one step.
         moving: what moves on with every step, in tables of these calls; after the last step it is where it was.
         steps: how many; the first is an even one.
+        passing: places of arrays ``(..., tile)`` of these calls that every tile of lanes has after the other: what lies
+            in them when a tile ends is lost.
         tile: lanes that go through all steps together.
     """
 
@@ -159,6 +194,7 @@ class CallSequence:
         odd: Sequence[Call] = (),
         moving: Sequence[Moving] = (),
         steps: int = 1,
+        passing: Sequence[tuple[Call, int]] = (),
         tile: int = TILE,
     ) -> None:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
@@ -172,16 +208,24 @@ class CallSequence:
         self._entries = numpy.array(
             [each.call.address + 8 * each.entry for each in moving], dtype=numpy.int64
         )
-        self._given = self._put_together(self._tables, self._entries)
+        self._passing = passing
+        self._lasting = numpy.array([call.address + 8 + 16 * i for call, i in passing], dtype=numpy.int64)
+        self._given = self._put_together(self._tables, self._entries, self._lasting)
         self._run = functools.partial(_driver(), address_of(self._given))
         self._shares: dict[tuple[int, int], _Share] = {}
 
-    def _put_together(self, tables: numpy.ndarray, entries: numpy.ndarray) -> numpy.ndarray:
+    def _put_together(
+        self, tables: numpy.ndarray, entries: numpy.ndarray, lasting: numpy.ndarray
+    ) -> numpy.ndarray:
         """What the driver is given."""
         count, steps, tile = self._form
         addresses = address_of(self._codes), address_of(tables), count, address_of(entries)
         return numpy.array(
-            [*addresses, address_of(self._amounts), len(self._amounts), steps, tile], dtype=numpy.int64
+            [
+                *(*addresses, address_of(self._amounts), len(self._amounts), steps, tile),
+                *(address_of(lasting), len(lasting)),
+            ],
+            dtype=numpy.int64,
         )
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
@@ -221,26 +265,41 @@ class CallSequence:
             self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
             self._tries += 1
 
+    def run_once(self, width: int, threads: int = 1) -> None:
+        """Run over all lanes what is not run again, with better code at once where so many steps are worth it."""
+        self.expect(self._form[1] * width // 2, in_sequence=True)
+        self.run(width, threads)
+
     def _run_share(self, first: int, last: int) -> None:
-        """Run from one lane to another with tables of its own, since entries move."""
+        """Run from one lane to another with tables and passing arrays of its own."""
         share = self._shares.get((first, last))
         if share is None:
-            tables = [call.table.copy() for call in self._calls]
-            addresses = numpy.array(list(map(address_of, tables)), dtype=numpy.int64)
-            # An entry is in one of these tables, as far from its begin as in the call's.
-            owners = [
-                int(numpy.flatnonzero((e >= self._tables) & (e < self._ends()))[0]) for e in self._entries
-            ]
-            entries = addresses[owners] + self._entries - self._tables[owners]
-            given = self._put_together(addresses, entries)
-            share = self._shares[first, last] = _Share(tables, addresses, entries, given, address_of(given))
+            share = self._shares[first, last] = self._make_share()
         for own, call in zip(share.tables, self._calls, strict=True):
             own[:] = call.table
+        for table, place, array in share.passing:
+            table[1 + 2 * place] = address_of(array) - 8 * first
         _driver()(share.address, first, last)
 
-    def _ends(self) -> numpy.ndarray:
-        """Addresses at which the calls' tables end."""
-        return self._tables + 8 * numpy.array([len(call.table) for call in self._calls])
+    def _make_share(self) -> "_Share":
+        tables = [call.table.copy() for call in self._calls]
+        addresses = numpy.array(list(map(address_of, tables)), dtype=numpy.int64)
+        ends = self._tables + 8 * numpy.array([len(table) for table in tables])
+
+        def moved(entries: numpy.ndarray) -> tuple[numpy.ndarray, list[int]]:
+            """The same entries in these tables, and which tables they are in."""
+            owners = [int(numpy.flatnonzero((e >= self._tables) & (e < ends))[0]) for e in entries]
+            return addresses[owners] + entries - self._tables[owners], owners
+
+        (entries, _), (lasting, owners) = moved(self._entries), moved(self._lasting)
+        arrays: dict[int, numpy.ndarray] = {}
+        passing = []
+        for owner, (call, place) in zip(owners, self._passing, strict=True):
+            known = call.arrays[place]
+            own = arrays.setdefault(id(known), empty_lanes(known.shape[:-1], known.shape[-1]))
+            passing.append((tables[owner], place, own))
+        given = self._put_together(addresses, entries, lasting)
+        return _Share(tables, addresses, entries, lasting, passing, given, address_of(given))
 
 
 class _Share(NamedTuple):
@@ -249,5 +308,8 @@ class _Share(NamedTuple):
     tables: list[numpy.ndarray]
     addresses: numpy.ndarray
     entries: numpy.ndarray
+    lasting: numpy.ndarray
+    passing: list[tuple[numpy.ndarray, int, numpy.ndarray]]
+    """Tables, places in them, and arrays that are there."""
     given: numpy.ndarray
     address: int

@@ -223,7 +223,7 @@ def _run_compiled(compiled: CompiledFunction, given: Sequence[Any], start: Carri
     calls = [special.bound([array[0] for array in inputs], [array[0] for array in outputs]) for _ in range(2)]
     arrays = enumerate(inputs + outputs)
     moving = [moving_array(call, place, array) for place, array in arrays for call in calls]
-    CallSequence(calls[:1], calls[1:], moving).run(len(rows[0]), width)
+    CallSequence(calls[:1], calls[1:], moving, len(rows[0])).run_once(width)
     kept = iter(memory[:-1, ..., :N].copy() for memory in found)  # without the lanes beyond
     carried: Carried = map_nested(lambda _: numpy.moveaxis(next(kept), 0, -2), start)
     return carried

@@ -15,7 +15,7 @@ from ...compiler.functions import (
     leaves,
     map_arrays,
 )
-from ...compiler.sequence import CallSequence, Moving, moving_array
+from ...compiler.sequence import TILE, CallSequence, Moving, moving_array
 from ...filters.ordered_sums import ordered_sum
 from ..contract.model import Episode
 from ..contract.observation import Array, DecisionMeans
@@ -274,17 +274,42 @@ class Stepper:
                 empty_lanes((interval, *array.shape[:-1]), self.width) for array in each._reported
             ]
             each._first_rewards = each.reported[0].reshape(interval, -1)[:, 0]
-        turns: list[list[Call]] = [[draw], [draw]]
+        turns: list[list[Call]] = [[draw.copy()], [draw.copy()]]
         moving: list[Moving] = []
         for each in (self, *others):
             for now, turn in enumerate(turns):
                 turn += each._bound_copies(now, noise, each.reported, moving)
+        passing = self._let_pass(turns, noise, others) if self.width > TILE else []
         shown = [turn[len(self._calls[0])] for turn in turns]
         if self._passing is not None:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
             shown = []
         orders = turns, turns[::-1]
-        return _Bound(draw, [CallSequence(even, odd, moving, interval) for even, odd in orders], shown)
+        return _Bound(
+            draw, [CallSequence(even, odd, moving, interval, passing) for even, odd in orders], shown
+        )
+
+    def _let_pass(
+        self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
+    ) -> list[tuple[Call, int]]:
+        """Give calls of decisions memory of a tile for what is not looked at afterwards: noise, and filters between
+        update and prediction. Returns where, as :class:`.CallSequence` takes it.
+        """
+        row = noise.call_of_each().arrays[2]
+        places = {
+            id(array): empty_lanes(array.shape[:-1], TILE)
+            for each in (self, *others)
+            for array in each._written
+        }
+        places[id(row)] = empty_lanes(row.shape[:-1], TILE)
+        found = []
+        for call in (call for turn in turns for call in turn):
+            for place, array in enumerate(call.arrays):
+                memory = places.get(id(row) if call.table[1 + 2 * place] == noise.address else id(array))
+                if memory is not None:
+                    call.replace(place, memory)
+                    found.append((call, place))
+        return found
 
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
@@ -328,9 +353,7 @@ class Stepper:
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
-        sequence = CallSequence(turns[0], turns[1], moving, steps)
-        sequence.expect(steps * self.width // 2, in_sequence=True)
-        sequence.run(self.width, self._threads)
+        CallSequence(turns[0], turns[1], moving, steps).run_once(self.width, self._threads)
         self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])

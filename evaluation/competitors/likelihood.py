@@ -311,9 +311,7 @@ class WindowLikelihood:
             for call in calls
             for place, series in (*enumerate(arrays, 1), (last, found))
         ]
-        sequence = CallSequence(calls[:1], calls[1:], moving, len(found))
-        sequence.expect(len(found) * lanes // 2, in_sequence=True)
-        sequence.run(lanes)
+        CallSequence(calls[:1], calls[1:], moving, len(found)).run_once(lanes)
         after = iter(memories[len(found) % 2])
         return map_arrays(lambda array: next(after).astype(array.dtype), memory)
 
