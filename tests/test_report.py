@@ -17,7 +17,7 @@ from made_results import results_of
 from filtergym.reports.pages.html_report import report_html
 from filtergym.reports.pages.outcome import find_lead, outcome_sentences
 from filtergym.reports.tables.headline import headline_table
-from filtergym.reports.tables.ranking import best_of_origins, ranking, remarks
+from filtergym.reports.tables.ranking import best_of_origins, remarks
 from filtergym.reports.tables.reasons import reason_sentences
 from filtergym.reports.tables.results import (
     MOST_SHOWN,
@@ -386,7 +386,7 @@ def has_the_lead_of_a_naive_search(result, seed):
     times = rng.permutation([cost[4] for cost in costs.values()])
     costs = {name: (*cost[:4], float(time)) for (name, cost), time in zip(costs.items(), times, strict=True)}
     records = made(result, costs, {}).records
-    lead = find_lead(records, ranking(records, ["net", "small"]), "learned")
+    lead = find_lead(records, ["net", "small"], "learned")
     naive = naive_leaders(costs, ["net", "small"])
     assert (lead is None) == (not naive)
     if lead is not None:
