@@ -510,14 +510,12 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     lines = found["policy"].values.tolist()
     assert lines == ["mine", "imm", classical, "known-turn"]
     assert found["role"].values.tolist() == ["agent", "paper", "strongest classical", "reference"]
-    records = {
-        (r.policy, r.metric): r
-        for r in tidy_records(dataset.sel(policy=lines))
-        if r.window == "all"
-    }
+    records = {(r.policy, r.metric): r for r in tidy_records(dataset.sel(policy=lines)) if r.window == "all"}
     for line in lines:
         np.testing.assert_array_equal(found["cost"].sel(policy=line), costs[line])
-        assert found["anees"].sel(policy=line).values.mean() == pytest.approx(records[line, "anees"].value, rel=1e-9)
+        assert found["anees"].sel(policy=line).values.mean() == pytest.approx(
+            records[line, "anees"].value, rel=1e-9
+        )
     table = standing.standing_table(found, {"mine": run.beat_paper})
     difference = records["mine", "geometric_cost_difference"]
     cells = {column.header: list(column.cells) for column in table.columns}

@@ -139,7 +139,9 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
         values = _by_name(records)
         for place in ranking(records):
-            both = [values.get((place.policy, metric, "state", "all")) for metric in ("anees", "median_anees")]
+            both = [
+                values.get((place.policy, metric, "state", "all")) for metric in ("anees", "median_anees")
+            ]
             texts = [consistency(record) for record in both]
             if place.policy != "random" and any(INCONSISTENT in text for text in texts):
                 rows.append([bare_name(measured.problem.id), f"`{place.policy}`", *texts])

@@ -188,4 +188,6 @@ def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> N
         return
     names = [str(training.folder) for training in opened]
     found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)
-    print_table(standing.standing_table(found, {name: run.beat_paper for name, run in zip(names, runs, strict=True)}))
+    print_table(
+        standing.standing_table(found, {name: run.beat_paper for name, run in zip(names, runs, strict=True)})
+    )

@@ -10,7 +10,7 @@ from ...evaluation.running.metrics import Record
 from ...evaluation.running.times import EQUAL_TIMES, times_of_records
 from ..tables.ranking import find_record, ranking, rival_of
 from ..tables.results import Result
-from ..tables.terminal_tables import HEADLINE
+from ..tables.terminal_tables import HEADLINE, consistency_word
 
 HALF = (0.45, 0.55)
 """Share of the paper's cost that is called half of it."""
@@ -26,6 +26,52 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
     """
     usual = [result for result in results if result.default] or list(results)
     return [sentence_of(result) for result in usual if ranking(result.records)]
+
+
+def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
+    """Say of each of the user's own competitors what it costs against the paper's algorithm and the best of the others,
+    and whether its covariance is as large as its errors.
+
+    Args:
+        records: of one environment and scenario whose truth is known.
+        own: names of the user's.
+        paper: name of the paper's algorithm; it may be missing in the records.
+    """
+    return [
+        _own_sentence(records, name, paper) for name in own if find_record(records, name, "geometric_cost")
+    ]
+
+
+def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
+    against = find_record(records, name, HEADLINE)
+    behind = find_record(records, name, "behind_best")
+    compared = [] if against is None or against.value is None else [(against, paper)]
+    if behind is not None and behind.component not in (name, paper):
+        compared.append((behind, behind.component))
+    clauses = [_comparison(record, f"`{other}`", not i) for i, (record, other) in enumerate(compared)]
+    places = ranking(records)
+    if places and places[0].policy == name and len(places) > 1:
+        clauses.append(f"the lowest of all {len(places)}")
+    if not clauses:
+        cost = find_record(records, name, "cost")
+        clauses = [f"error cost {cost.value:.3g}, compared with none" if cost and cost.value else "no cost"]
+    nees = find_record(records, name, "anees", "state")
+    value = "" if nees is None or nees.value is None else f", ANEES {nees.value:.3g}"
+    covariance = "states no covariance" if not value else consistency_word(nees)
+    return f"`{name}`: {', '.join(clauses)}; {covariance}{value}."
+
+
+def _comparison(difference: Record, other: str, first: bool) -> str:
+    """Say by how much a cost is above or below another's, where the interval of their paired ratio leaves one out; the
+    first comparison of a sentence names what is compared.
+    """
+    value = difference.value or 0.0
+    if _low(difference) <= 0.0 <= _high(difference):
+        return f"level with {other}"
+    if value >= 1.0:
+        return f"{1.0 + value:.2g} times {'the error cost' if first else 'that'} of {other}"
+    what = " error cost" if first else ""
+    return f"{100.0 * abs(value):.1f} % {'more' if value > 0.0 else 'less'}{what} than {other}"
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:

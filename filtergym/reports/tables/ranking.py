@@ -23,11 +23,9 @@ def find_record(
         metric: that is wanted.
         component: "state", or that of a state.
     """
-    for record in records:
-        if (record.policy, record.metric, record.window) == (name, metric, "all"):
-            if component in (None, record.component):
-                return record
-    return None
+    wanted = name, metric, "all"
+    found = (r for r in records if (r.policy, r.metric, r.window) == wanted)
+    return next((record for record in found if component in (None, record.component)), None)
 
 
 def ranking(records: Sequence[Record]) -> list[Record]:
@@ -103,7 +101,8 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
     elif best.policy != paper and difference is not None and difference.value is not None:
         sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
         means, lost = (
-            find_record(records, best.policy, metric) for metric in ("relative_cost_difference", "lost_tracks")
+            find_record(records, best.policy, metric)
+            for metric in ("relative_cost_difference", "lost_tracks")
         )
         if means is not None and means.value is not None:
             sentence += f" ({100.0 * means.value:+.1f} % of the means)"
@@ -114,8 +113,10 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
         sentence += f". Other episodes of the kind would name another one in {_share(1.0 - chosen.value)}"
     behind = None if rival is None else find_record(records, rival.policy, "behind_best")
     if rival is not None and behind is not None:
-        named = f"classical competitor, `{rival.policy}` ({rival.kind})," if was_learned else (
-            f"learned agent, `{rival.policy}`,"
+        named = (
+            f"classical competitor, `{rival.policy}` ({rival.kind}),"
+            if was_learned
+            else (f"learned agent, `{rival.policy}`,")
         )
         sentence += f". The strongest {named} costs {with_interval(behind, 100.0)} % more than it"
         if behind.low is not None and behind.low <= 0.0:
@@ -131,10 +132,12 @@ def _share(share: float) -> str:
 def origin(result: Result, name: str, kind: str) -> str:
     """Return where a competitor comes from.
 
-    "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator", filters of
-    its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", who knows the
-    truth; or "bound".
+    "yours"; "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator",
+    filters of its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", which
+    knows something of the truth; or "bound".
     """
+    if name in result.own:
+        return "yours"
     if name == result.paper:
         return "paper"
     if name in result.learned:

@@ -19,7 +19,7 @@ from ...envs.contract.model import Episode, Model
 from ...evaluation.competitors.kinds import RandomPolicy
 from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...filters.gaussian import log_density
-from .terminal_tables import INCONSISTENT, consistency, plain_table, with_interval
+from .terminal_tables import INCONSISTENT, consistency, cost_title, plain_table, with_interval
 
 SCREENING_SECONDS = 1.5
 """Time for asking every classical competitor, on a few episodes, whether it may be the strongest."""
@@ -33,9 +33,7 @@ def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
     return {"cost": model.cost(episode), "anees": nees / len(model.task.components)}
 
 
-def measure_standing(
-    run: TrainingRun, agents: Mapping[str, Path], trust: bool = False
-) -> xarray.Dataset:
+def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool = False) -> xarray.Dataset:
     """Measure agents, and the competitors they are compared with, on the episodes of a run's validations.
 
     Args:
@@ -53,17 +51,24 @@ def measure_standing(
     problem, known = run.problem, run.problem.baselines
     episodes = TrainingEpisodes(run, validation.VALIDATION_EPISODES, validation_backend(run))
     reference = known.score_reference if known.score_reference in known.references else None
-    opponents = {"paper": known.score_paper, "strongest classical": _strongest(run, episodes), "reference": reference}
+    opponents = {
+        "paper": known.score_paper,
+        "strongest classical": _strongest(run, episodes),
+        "reference": reference,
+    }
     roles = dict.fromkeys(agents, "agent") | {name: role for role, name in opponents.items() if name}
     means = [
         episodes.means(
-            find_learned_policy(problem.task, str(agents[name]), trust) if name in agents else problem.competitor(name),
+            find_learned_policy(problem.task, str(agents[name]), trust)
+            if name in agents
+            else problem.competitor(name),
             report=_cost_and_nees,
         )
         for name in roles
     ]
     variables = {
-        metric: (("policy", "episode"), numpy.stack([own[metric] for own in means])) for metric in ("cost", "anees")
+        metric: (("policy", "episode"), numpy.stack([own[metric] for own in means]))
+        for metric in ("cost", "anees")
     }
     coords = {"policy": list(roles), "role": ("policy", list(roles.values()))}
     return xarray.Dataset(variables, coords, {"environment": problem.id, "scenario": run.scenario})
@@ -104,7 +109,13 @@ def standing_table(standing: xarray.Dataset, passed: Mapping[str, Passed | None]
     papers = standing["policy"].values[standing["role"].values == "paper"].tolist()
     table.add_column("name", no_wrap=True)
     table.add_column("")
-    for title in ("cost", cost_title(*papers), "means,\n%", "ANEES", "beat paper\nafter steps"):
+    for title in (
+        "cost",
+        cost_title("".join(papers)),
+        "means,\n%",
+        "ANEES",
+        f"beat {''.join(papers) or 'paper'}\nafter steps",
+    ):
         table.add_column(title, justify="right", no_wrap=True)
     paper = standing["cost"].sel(policy=papers[0]).values if papers else None
     for name, role in zip(standing["policy"].values.tolist(), standing["role"].values.tolist(), strict=True):
@@ -123,7 +134,7 @@ def standing_table(standing: xarray.Dataset, passed: Mapping[str, Passed | None]
         row.append("-" if first is None else f"{first['steps']:,}\n({first['seconds']:.1f} s)")
         table.add_row(*row)
     table.caption = (
-        "cost vs paper is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
+        "cost vs is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
         f"ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off by more than "
         "a factor of two. Agents were chosen on these episodes."
     )
