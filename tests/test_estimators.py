@@ -340,6 +340,18 @@ def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkey
     sys.modules.pop("mine")
 
 
+@pytest.mark.parametrize("given", ["z, dt", "z", "measurement, dt", "y, t"])
+def test_a_class_of_one_track_is_refused_with_its_adapter(given):
+    made = {}
+    exec(f"def start(self, x0, P0): pass\ndef update(self, {given}): pass", made)  # as students write it
+    found = type("OneTrack", (), {name: made[name] for name in ("start", "update")})
+    sentence = (
+        rf"'one': update\({given}\) is of a filter that knows one track, .*adapters\.SingleTrackEstimator"
+    )
+    with pytest.raises(ValueError, match=sentence):
+        filtergym.evaluate(ID, {"one": found}, episodes=1)
+
+
 def test_an_update_with_the_memory_last_is_refused():
     class Old(Start):
         def update(self, measurement, memory):

@@ -372,10 +372,11 @@ def write(
                     save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
-    for sentence in (
-        own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else ()
-    ):
+    sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
+    for sentence in sentences:
         print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
+    if sentences:
+        console.print()
     for table in printed:
         print_table(table)
     phrases = phrases_of(found.dataset)

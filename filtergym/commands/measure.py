@@ -373,6 +373,7 @@ def benchmark(
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
+    policy: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
     format: Formats = None,
     columns: Columns = 2,
     backend: Backend = "auto",
@@ -386,6 +387,12 @@ def benchmark(
 
     Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
     """
+    if policy:
+        raise ValueError(
+            f"benchmark runs what is shipped, and --policy {policy[0]} names another competitor: filtergym evaluate "
+            f"--protocol filtergym-1 --policy {policy[0]} runs it in every environment, and filtergym evaluate "
+            f"ENVIRONMENT --policy {policy[0]} in one"
+        )
     formats = check_formats(format or [])
     check_columns(columns)
     options = BenchmarkOptions(
