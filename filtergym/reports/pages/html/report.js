@@ -158,6 +158,9 @@
     },
   };
 
+  // Who costs more than an axis shows.
+  const over = (end, names) => `over +${Math.round(end)} %: ${names.slice(0, 3).join(", ")}${names.length > 3 ? ` and ${names.length - 3} more` : ""}`;
+
   function dotted(rows, lines, paper) {
     // One row: a line for each competitor; several: a line for each scenario, competitors beside each other.
     const single = lines === null;
@@ -178,12 +181,11 @@
         error_x: { type: "data", symmetric: false, array: high, arrayminus: low, color: style.color, thickness: 1.2, width: 0 } };
     });
     // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
-    const values = drawn.flatMap((trace) => trace.x);
     const ends = drawn.flatMap(({ x, error_x }) => x.flatMap((value, i) => [value - error_x.arrayminus[i], value + error_x.array[i]]));
     const range = [Math.max(-100, Math.min(...ends, 0) * 1.05 - 3), Math.min(200, Math.max(...ends, 5) * 1.05 + 3)];
-    const beyond = values.filter((x) => x > range[1]).length;
+    const beyond = drawn.filter(({ x }) => x.some((value) => value > range[1])).map(({ name }) => name);
     const narrow = window.innerWidth < 640;
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} cost more than +${Math.round(range[1])} %, see the table)` : "");
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond.length ? `<br>(${over(range[1], beyond)})` : "");
     const yaxis = single
       ? { automargin: true, categoryorder: "array", categoryarray: entries.map((line) => plain(line.name)).reverse(), tickfont: { size: narrow ? 9 : 11 }, dtick: 1 }
       : { tickvals: rows.map((_, i) => i), ticktext: rows.map(([scenario, role]) => `${plain(scenario)}<br><i>${plain(role)}</i>`), range: [rows.length - 0.5, -0.5], zeroline: false, tickfont: { size: narrow ? 9 : 11 } };
@@ -208,15 +210,16 @@
       if (!own.length) continue;
       const color = look({ origin: kind, colour: { learned: 0, classical: 1, estimator: 2 }[kind] ?? null }).color;
       drawn.push({ x: own.map((p) => p[2]), y: own.map((p) => p[3]), name: kind, mode: "markers+text", cliponaxis: false,
-        text: own.map(([name, , , , , on]) => on || kind === "yours" ? plain(name) : ""), textposition: "bottom left", textfont: { size: 10 },
+        text: own.map(([name, , , , , on]) => on || kind === "yours" ? plain(name) : ""), textposition: own.map(([, , time]) => time < Math.sqrt(left * right) ? "bottom right" : "bottom left"), textfont: { size: 10 },
         customdata: own.map(([name, , , , compiled]) => plain(name) + (compiled ? "" : ", asked in Python")),
         hovertemplate: "%{y:.1f} %, %{x:.3g} ns<extra>%{customdata}</extra>",
         marker: { color, size: 8, line: { color, width: 1.2 }, symbol: own.map(([, , , , compiled]) => ({ paper: "star", learned: "diamond", estimator: "square", yours: "cross" }[kind] || "circle") + (compiled ? "" : "-open")) } });
     }
     if (reference) drawn.push({ x: [left, right], y: [reference[3], reference[3]], mode: "lines", name: plain(reference[0]), line: { color: css("--fg"), width: 1.4, dash: "dash" }, hovertemplate: `%{y:.1f} %, ${reference[2].toPrecision(2)} ns<extra>${plain(reference[0])}</extra>` });
-    const beyond = ranked.length - shown.length, low = Math.min(...drawn.flatMap(({ y }) => y));
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} cost more than +${Math.round(top)} %)` : "");
-    return [drawn, layout({ xaxis: { title: { text: "nanoseconds a measurement" }, ...logarithmic, range: [left, right].map(Math.log10) }, yaxis: { title: { text: title }, range: [low - 0.08 * (top - low), top + 0.05 * (top - low)] } })];
+    const beyond = ranked.filter((point) => !shown.includes(point)).map(([name]) => plain(name)), low = Math.min(...drawn.flatMap(({ y }) => y));
+    const title = `cost against ${plain(paper || "the paper")}, %`;
+    const annotations = beyond.length ? [{ xref: "paper", yref: "paper", x: 1, y: 1, xanchor: "right", yanchor: "top", showarrow: false, text: over(top, beyond) }] : [];
+    return [drawn, layout({ annotations, xaxis: { title: { text: "nanoseconds a measurement" }, ...logarithmic, range: [left, right].map(Math.log10) }, yaxis: { title: { text: title }, range: [low - 0.08 * (top - low), top + 0.05 * (top - low)] } })];
   }
 
   // --- a track with a slider
