@@ -56,9 +56,11 @@ def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
         cost = find_record(records, name, "cost")
         clauses = [f"error cost {cost.value:.3g}, compared with none" if cost and cost.value else "no cost"]
     nees = find_record(records, name, "anees", "state")
-    value = "" if nees is None or nees.value is None else f", ANEES {nees.value:.3g}"
-    covariance = "states no covariance" if not value else consistency_word(nees)
-    return f"`{name}`: {', '.join(clauses)}; {covariance}{value}."
+    covariance = "states no covariance"
+    if nees is not None and nees.value is not None:
+        word = consistency_word(nees)
+        covariance = f"{'' if word == 'no interval' else f'{word}, '}ANEES {nees.value:.3g}"
+    return f"`{name}`: {', '.join(clauses)}; {covariance}."
 
 
 def _comparison(difference: Record, other: str, first: bool) -> str:
