@@ -1,6 +1,8 @@
 """A real browser for pages, where one is installed: Chromium or Chrome without a screen, and its driver."""
 
+import os
 import shutil
+import tempfile
 from contextlib import contextmanager
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -27,7 +29,10 @@ def opened(page, width, dark=False, height=900):
         options.add_argument(argument)
     options.binary_location = next(filter(None, map(shutil.which, BROWSERS)))
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    # The browser leaves folders of its own in the temporary one.
+    folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    service = webdriver.ChromeService(shutil.which("chromedriver"), env={**os.environ, "TMPDIR": folder.name})
+    driver = webdriver.Chrome(options, service)
     try:
         # A window itself cannot be as narrow as a telephone.
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 700}
@@ -37,6 +42,7 @@ def opened(page, width, dark=False, height=900):
         yield driver
     finally:
         driver.quit()
+        folder.cleanup()
 
 
 def emulate_scheme(driver, dark):

@@ -499,30 +499,27 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     monkeypatch.setattr(Problem, "tuned_policies", tuned)
     run = train(small_run("bptt", 400), tmp_path)
     run.problem = dataclasses.replace(problem_of(ID), baselines=few)
-    opponents = standing.Opponents(run)
     names = [*few.policies, *few.estimators, *tuned, "known-turn"]
     agent = training_run.best_agent(tmp_path)
-    lines = [standing.agent_standing(run, agent, "mine", opponents), *opponents.found]
+    found = standing.measure_standing(run, {"mine": agent})
     dataset = evaluate(
         ID, {"mine": str(agent), **{name: name for name in names}}, episodes=16, split="validation"
     )
     costs = {name: dataset["cost"].sel(policy=name).values.mean(axis=1) for name in ["mine", *names]}
     classical = min(set(names) - {"imm", "known-turn"}, key=lambda name: costs[name].mean())
-    assert [(line.name, line.role) for line in lines] == [
-        ("mine", "agent"), ("imm", "paper"), (classical, "strongest classical"), ("known-turn", "reference"),
-    ]  # fmt: skip
-    records = {
-        (r.policy, r.metric): r
-        for r in tidy_records(dataset.sel(policy=[line.name for line in lines]))
-        if r.window == "all"
-    }
+    lines = found["policy"].values.tolist()
+    assert lines == ["mine", "imm", classical, "known-turn"]
+    assert found["role"].values.tolist() == ["agent", "paper", "strongest classical", "reference"]
+    records = {(r.policy, r.metric): r for r in tidy_records(dataset.sel(policy=lines)) if r.window == "all"}
     for line in lines:
-        np.testing.assert_array_equal(line.means["cost"], costs[line.name])
-        assert line.means["anees"].mean() == pytest.approx(records[line.name, "anees"].value, rel=1e-9)
-    table = standing.standing_table(lines[:1], opponents, "random")
+        np.testing.assert_array_equal(found["cost"].sel(policy=line), costs[line])
+        assert found["anees"].sel(policy=line).values.mean() == pytest.approx(
+            records[line, "anees"].value, rel=1e-9
+        )
+    table = standing.standing_table(found, {"mine": run.beat_paper})
     difference = records["mine", "geometric_cost_difference"]
     cells = {column.header: list(column.cells) for column in table.columns}
-    assert cells["cost vs paper, %"][0] == with_interval(difference, 100.0, negligible=0.005)
+    assert cells["cost vs imm, %"][0] == with_interval(difference, 100.0, negligible=0.005)
     means = records["mine", "relative_cost_difference"].value
     assert cells["means,\n%"][0] == f"{100.0 * means:+.1f}"
 

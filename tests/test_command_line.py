@@ -365,6 +365,13 @@ def test_benchmark_runs_until_the_headline_is_narrow(tmp_path, monkeypatch):
     assert 100.0 * benchmark.headline_half_width(found[1]) <= width / 2.0
 
 
+def test_benchmark_says_how_a_filter_of_ones_own_is_run(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    code, _, errors = command("benchmark", "--policy", "mine:Mine")
+    assert (code, "evaluate --protocol filtergym-1 --policy mine:Mine" in errors) == (2, True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
     cell = benchmark.Cell(problem_of(ENV), "paper", 5, ("imm",))
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])

@@ -125,9 +125,8 @@ def test_who_is_best(dataset, found):
     cost = np.exp(np.log(dataset["cost"].mean("time")).mean("episode"))
     cost = cost.drop_sel(policy=["known-turn", "known-input-bound"])
     names = cost["policy"].values[np.argsort(cost.values)].tolist()
-    assert [p.name for p in places] == names
+    assert [p.policy for p in places] == names
     assert names[0] == "bptt"
-    assert {p.role for p in places if p.name in ("bptt", "ppo")} == {"learned"}
     behind = found["ppo", "behind_best"]
     assert behind.component == "bptt"
     expected = float(cost.sel(policy="ppo") / cost.sel(policy="bptt")) - 1.0
@@ -150,7 +149,7 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
             kept = [r._replace(low=low) if r.metric == "behind_best" else r for r in kept]
         return who_is_best(kept)
 
-    everyone = [place.name for place in ranking(records)]
+    everyone = [place.policy for place in ranking(records)]
     classical = [name for name in everyone if name not in learned]
     assert told(everyone, low=0.01) == "learned best"
     assert told(everyone, low=0.0) == told(everyone, low=-0.01) == "no significant difference"
@@ -175,7 +174,7 @@ def test_of_equals_the_first_is_called_the_best(dataset, factor, expected):
     assert {r.component for r in records if r.metric == "behind_best"} == {expected}
     shares = {r.policy: r.value for r in records if r.metric == "best_share"}
     assert (shares[expected], sum(shares.values())) == (1.0, pytest.approx(1.0))
-    assert ranking(records)[0].name == expected
+    assert ranking(records)[0].policy == expected
 
 
 def test_tracks_hold_what_a_track_is_drawn_from(dataset):

@@ -3,6 +3,7 @@
 And the pages for each audience run, the command line's page is that of the code, and every page is in the navigation.
 """
 
+import functools
 import re
 import shlex
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import command_line
+import gymnasium
 import pytest
 from contract import assert_properties
 from environment_page import TABLES, environment_table
@@ -117,6 +119,28 @@ def test_page_of_the_command_line_holds_what_help_says(command):
     for name, known in options.items():
         _, shown, _ = command(name, "--help")
         assert set(re.findall(r"(?<![\w-])--[a-z-]+(?= |$)", shown)) - {"--help"} <= known
+
+
+def test_the_page_of_the_contract_names_the_scenarios_that_are_there():
+    text = (DOCS / "contract.md").read_text(encoding="utf-8")
+    for id, cls in catalogue().items():
+        papers = {name for name in cls.scenarios if name.partition("-")[0] == "paper"}
+        assert papers == ({"paper-noise", "paper-step"} if "UavAutopilot" in id else {"paper"})
+        assert all(f"`{name}`" in text for name in papers)
+        assert [name for name, scenario in cls.scenarios.items() if scenario.training] == ["random"]
+
+
+@pytest.mark.parametrize("row", range(3))
+def test_gymnasium_refuses_what_the_page_of_recipes_says(row):
+    table = (DOCS / "recipes.md").read_text(encoding="utf-8").partition("Gymnasium refuses:")[2]
+    call, said = re.findall(r'^\| `([^|]+)`: "([^|]+)" \|', table, re.M)[row]
+    names = {
+        "ID": "filtergym/ManeuveringTarget-v0",
+        "make_vec": functools.partial(gymnasium.make_vec, num_envs=2),
+        "NormalizeObservation": gymnasium.wrappers.vector.NormalizeObservation,
+    }
+    with pytest.raises((ValueError, gymnasium.error.Error), match=re.escape(said)):
+        eval(call.replace("...", "None"), names)
 
 
 def words_by_hand(text: str) -> int:

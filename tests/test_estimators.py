@@ -1,6 +1,7 @@
 """An estimator that a user brings: the same noise, the same start, and a sentence for whatever goes wrong."""
 
 import json
+import re
 import sys
 from functools import partial
 from pathlib import Path
@@ -336,8 +337,22 @@ def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkey
     code, output, errors = command("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
     assert code == 0, errors
     assert [line for line in output.splitlines() if line.startswith("mine:Mine  ")]
-    assert "mine:Mine: " in output  # why, in sentences: it is the first that is named
+    assert output.count("mine:Mine: ") > 1  # why, in sentences: it is the first that is named
+    assert re.match(r"mine:Mine: [\d.]+ ", output)  # the first sentence is about the user's own
+    assert "cost vs imm, %" in output
     sys.modules.pop("mine")
+
+
+@pytest.mark.parametrize("given", ["z, dt", "z", "measurement, dt", "y, t"])
+def test_a_class_of_one_track_is_refused_with_its_adapter(given):
+    made = {}
+    exec(f"def start(self, x0, P0): pass\ndef update(self, {given}): pass", made)  # as students write it
+    found = type("OneTrack", (), {name: made[name] for name in ("start", "update")})
+    sentence = (
+        rf"'one': update\({given}\) is of a filter that knows one track, .*adapters\.SingleTrackEstimator"
+    )
+    with pytest.raises(ValueError, match=sentence):
+        filtergym.evaluate(ID, {"one": found}, episodes=1)
 
 
 def test_an_update_with_the_memory_last_is_refused():

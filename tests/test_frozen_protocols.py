@@ -211,6 +211,7 @@ def test_what_the_command_prints_and_refuses(small, tmp_path, command):
     assert code == 0, errors
     _, digest = read_protocol(small)
     assert "| adaptive, mehra | " in shown
+    assert "vs kalman" in shown  # each environment names whom costs are compared with
     assert f"protocol SHA-256 {digest}" in shown
     assert re.search(r"@misc\{small,\n(  \w+ = \{[^\n]+\},\n)+\}", shown)
     assert "year = {2026}" in shown

@@ -417,10 +417,30 @@ def test_positions_of_a_receiver_without_a_fix_are_no_measurements(tmp_path):
     )
 
 
+def test_a_column_that_is_not_understood_can_be_ignored(tmp_path):
+    table = {"time": np.arange(9.0), "x": np.arange(9.0), "y": np.zeros(9)}
+    pandas.DataFrame({**table, "accuracy": 3.0}).to_csv(tmp_path / "log.csv", index=False)
+    pandas.DataFrame(table).to_csv(tmp_path / "plain.csv", index=False)
+    with pytest.raises(
+        ValueError, match=r"the column accuracy, which is not read: .* by --rename 'accuracy=-'"
+    ):
+        read_recording(tmp_path / "log.csv", TARGET, speeds=(0.01, 1000.0))
+    found = read_recording(tmp_path / "log.csv", TARGET, speeds=(0.01, 1000.0), rename={"Accuracy": "-"})
+    plain = read_recording(tmp_path / "plain.csv", TARGET, speeds=(0.01, 1000.0))
+    np.testing.assert_array_equal(found.measurements["position"], plain.measurements["position"])
+
+
 @pytest.mark.parametrize(
     ("times", "hint"),
     [
-        ([0.0, 1.0, 3.0, 2.0, 4.0], "time decreases from 3 in row 2 to 2 in row 3: sort the rows by time$"),
+        (
+            [0.0, 1.0, 3.0, 2.0, 4.0],
+            "time decreases from 3 in row 2 to 2 in row 3: sort the rows by time, such as by pandas",
+        ),
+        (
+            [f"2026-03-14T09:12:0{second}.250Z" for second in (1, 3, 2, 4, 5)],
+            r"from 2026-03-14T09:12:03\.250Z in row 1 to 2026-03-14T09:12:02\.250Z in row 2: sort the rows",
+        ),
         ([4294967293, 4294967295, 1, 3, 5], "starts again: add 4294967296 to the times from row 2 on"),
         ([4294967.1, 4294967.2, 0.004, 0.1, 0.2], "starts again: add 4294967.296 to the times from row 2 on"),
     ],

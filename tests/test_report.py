@@ -14,10 +14,12 @@ import pytest
 from contract import assert_properties
 from made_results import results_of
 
+from filtergym.evaluation.figures.front_figure import FrontPanel
+from filtergym.evaluation.running.times import points_of_records
 from filtergym.reports.pages.html_report import report_html
-from filtergym.reports.pages.outcome import find_lead, outcome_sentences
+from filtergym.reports.pages.outcome import find_lead, outcome_sentences, own_sentences
 from filtergym.reports.tables.headline import headline_table
-from filtergym.reports.tables.ranking import best_of_origins, ranking, remarks
+from filtergym.reports.tables.ranking import best_of_origins, remarks
 from filtergym.reports.tables.reasons import reason_sentences
 from filtergym.reports.tables.results import (
     MOST_SHOWN,
@@ -42,6 +44,7 @@ HOSTILE = (
     "</script><script>window.stolen=1</script><img src=x onerror='window.stolen=2'>\"'`${window.stolen=3}"
 )
 SETTINGS = Settings("filtergym benchmark", {"filtergym": "0.1.0"})
+PICTURE = "data:image/svg+xml;base64,"
 
 
 @pytest.fixture(scope="module")
@@ -316,7 +319,8 @@ def made(result, costs, behind):
         ]
         if name in behind:
             value, low, high = behind[name]
-            found = {"metric": "behind_best", "value": value, "low": low, "high": high}
+            best = min(costs, key=lambda name: costs[name][0])
+            found = {"metric": "behind_best", "component": best, "value": value, "low": low, "high": high}
             records.append(like["cost"]._replace(**own, **found))
     return result._replace(records=records, learned=["net", "small"], paper="imm", default=True)
 
@@ -386,7 +390,7 @@ def has_the_lead_of_a_naive_search(result, seed):
     times = rng.permutation([cost[4] for cost in costs.values()])
     costs = {name: (*cost[:4], float(time)) for (name, cost), time in zip(costs.items(), times, strict=True)}
     records = made(result, costs, {}).records
-    lead = find_lead(records, ranking(records, ["net", "small"]), "learned")
+    lead = find_lead(records, ["net", "small"], "learned")
     naive = naive_leaders(costs, ["net", "small"])
     assert (lead is None) == (not naive)
     if lead is not None:
@@ -413,7 +417,7 @@ def test_page_holds_what_the_file_says(result):
     assert html.count('<details class="why"') == len(
         {r.policy for r in result.records if r.metric == "cause_cost"}
     )
-    assert "<td>in turns and other manoeuvres</td>" in html
+    assert '<td data-label="it holds">in turns and other manoeuvres</td>' in html
     assert [one.policy for one in result.worst] == ["imm"] * 3
     assert all(f"<code>{one.seed}</code>" in html for one in result.worst)
     # Every figure says in words what it shows.
@@ -425,9 +429,53 @@ def test_the_page_begins_with_sentences_and_the_picture_of_cost_and_time(result)
     timed = made(result, {**COSTS, "quick $x$_{": COSTS["quick"]}, {"net": (0.2, 0.15, 0.26)})
     html = report_html([timed], SETTINGS)
     [picture] = [address for address in Page(html).addresses if not address.startswith("#")]
-    assert base64.b64decode(picture.removeprefix("data:image/png;base64,")).startswith(b"\x89PNG")
-    assert html.index("is 20 % behind it") < html.index(picture[:60]) < html.index("<table")
-    assert "On the front: quick -10 % in 60 ns, small -30 % in 80 ns, net -40 % in 9e+02 ns" in html
+    assert base64.b64decode(picture.removeprefix(PICTURE)).startswith(b"<?xml")
+    assert report_html([timed], SETTINGS) == html
+    assert html.index("is 20 % behind it") < html.index("<table") < html.index(picture[:60])
+    front = (
+        "On the front, the quickest first: quick -10 % in 60 ns, small -30 % in 80 ns, net -40 % in 900 ns"
+    )
+    assert html.replace("\xa0", " ").count(front) == 2  # for eyes, and for those who cannot see the picture
+    assert "There is no score: no reference takes part." in report_html(
+        [timed._replace(reference="")], SETTINGS
+    )
+
+
+def test_a_filter_of_the_user_comes_first(result):
+    """In the first sentence, in the first picture however much it costs, and marked in every table."""
+    dear = {name: cost for name, cost in COSTS.items() if name != "mine"} | {
+        "mine:<b>": (3.0, 2.5, 3.6, "estimator", 2000.0)
+    }
+    behind = {"net": (0.2, 0.15, 0.26), "mine:<b>": (5.7, 5.0, 6.5)}
+    found = made(result, dear, behind)
+    timed = found._replace(own=["mine:<b>"])
+    [sentence] = own_sentences(timed.records, timed.own, "imm")
+    assert sentence.startswith("`mine:<b>`: 4 times the error cost of `imm`, 6.7 times that of `net`; ")
+    html = report_html([timed], SETTINGS)
+    assert '<p class="yours"><strong><code>mine:&lt;b&gt;</code></strong>: 4 times the error cost' in html
+    assert (
+        html.index('<p class="yours">') < html.index("has 40 % less error cost than") < html.index("<table")
+    )
+    assert html.count('<tr class="yours">') == 2
+    assert "Yours: mine:&lt;b&gt; +300 %" in html.replace("\xa0", " ")
+    for own, top in ((timed.own, 300.0), ((), 100.0)):
+        panel = FrontPanel("", points_of_records(found.records), "imm", "", ["net"], own)
+        assert panel.top == pytest.approx(top)
+        assert [point.name for point in panel.beyond] == ([] if own else ["mine:<b>"])
+
+
+@pytest.mark.parametrize(
+    ("cost", "said"),
+    [
+        ((0.425, 0.4, 0.45), "42.5 % more error cost than `imm`"),
+        ((-0.3, -0.4, -0.2), "30.0 % less error cost than `imm`"),
+        ((0.01, -0.02, 0.04), "level with `imm`"),
+    ],
+)
+def test_a_sentence_compares_the_users_own(result, cost, said):
+    records = made(result, {"imm": COSTS["imm"], "mine": (*cost, "estimator", 100.0)}, {}).records
+    best = ", the lowest of all 2" if cost[0] < 0.0 else ""
+    assert own_sentences(records, ["mine"], "imm") == [f"`mine`: {said}{best}; states no covariance."]
 
 
 def test_nothing_of_a_hostile_file_becomes_markup(result, tmp_path):
@@ -435,7 +483,7 @@ def test_nothing_of_a_hostile_file_becomes_markup(result, tmp_path):
     own, attacked = Page(report_html([result], SETTINGS)), Page(report_html(*read_results(tmp_path)))
     assert attacked.scripts == own.scripts == ["text/plain", "text/plain", ""]
     assert not attacked.handlers
-    assert all(address.startswith(("#", "data:image/png;base64,")) for address in attacked.addresses)
+    assert all(address.startswith(("#", PICTURE)) for address in attacked.addresses)
 
 
 def test_an_environment_without_a_paper_or_a_track_has_a_report_too(result, command_console):

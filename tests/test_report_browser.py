@@ -106,10 +106,28 @@ def test_nothing_is_off_a_narrow_screen(narrow):
         ".filter(right => right > 400.5).length"
     )
     assert beyond == 0
-    # Whatever is wider, a table, scrolls inside itself.
+    # No column is cut: a row of a wide table stands as lines.
+    cut = driver.execute_script(
+        "return [...document.querySelectorAll('.stacked :is(th, td)')].map(x => x.getBoundingClientRect().right)"
+        ".filter(right => right > 400.5).length"
+    )
+    assert cut == 0
+    # Whatever is wider scrolls inside itself.
     assert driver.execute_script(
         "return [...document.querySelectorAll('.table')].every(x => getComputedStyle(x).overflowX === 'auto')"
     )
+
+
+def test_a_table_that_is_too_wide_says_so(page):
+    with browser.opened(page, 1000) as driver:
+        opened_whole(driver)
+        scrolls = driver.execute_async_script(
+            "const done = arguments[0], tables = [...document.querySelectorAll('.table')];"
+            "requestAnimationFrame(() => requestAnimationFrame(() => done("
+            "tables.map(x => [x.scrollWidth > x.clientWidth + 1, x.classList.contains('scrolls')]))))"
+        )
+        assert all(wider == said for wider, said in scrolls)
+        assert any(said for _, said in scrolls)
 
 
 def test_tables_sort_by_number_and_by_name(wide):

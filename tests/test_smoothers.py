@@ -105,7 +105,7 @@ def test_smoothers_are_marked_and_never_ranked():
     assert {"cost", "rmse", "anees", "relative_cost_difference"} < of_smoother
     assert not {"score", "behind_best", "log_likelihood", "anis"} & of_smoother
     assert {r.component or r.policy for r in records if r.metric == "behind_best"} <= {"kalman-imm", "imm"}
-    assert [place.name for place in ranking(records)] == ["kalman-imm", "imm"]
+    assert [place.policy for place in ranking(records)] == ["kalman-imm", "imm"]
     tables = results_tables(records, problem_of(TARGET).knows, 200)
     assert "Not causal, with later measurements: imm-smoother." in tables[-1].caption
     assert [name for name, *_ in rank_competitors(records)] == [

@@ -166,6 +166,22 @@ def test_columns_are_called_as_the_user_says(make, tmp_path):
             read_recording(path, ID, rename={"t": "time", **rename})
 
 
+def test_a_column_is_ignored(make, tmp_path):
+    make()
+    lines = TEXT.splitlines()
+    more = "\n".join([f"{lines[0]},gpss", *(f"{line},1" for line in lines[1:])])
+    path = written(tmp_path / "log.csv", f"{more}\n")
+    assert "not read: column gpss" in read_recording(path, ID).notes
+    found = read_recording(path, ID, rename={"gpss": "-"})
+    plain = read_recording(written(tmp_path / "plain.csv", TEXT), ID)
+    np.testing.assert_array_equal(found.measurements["values"], plain.measurements["values"])
+    assert not any("gpss" in note for note in found.notes)
+    with pytest.raises(ValueError, match="it has no column sped, which was to be left out; it has time, gps"):
+        read_recording(path, ID, rename={"sped": "-"})
+    with pytest.raises(ValueError, match=r"gpss was to be height, .* or gpss=- to ignore the column"):
+        read_recording(path, ID, rename={"gpss": "height"})
+
+
 def test_rows_of_one_time_from_several_sensors_are_one_measurement(make, tmp_path):
     make()
     text = "time,gps,odometry\n10,3.0,\n10,,10.0\n10.4,,9.8\n11.3,14.0,\n12,,10.1\n12,20.5,10.1\n"

@@ -97,6 +97,8 @@ def test_an_honest_submission_holds(name, honest, command):
     digest = read_submission(honest / f"{name}.json")[1]
     assert f"SHA-256 {digest}" in shown
     assert "to repeat it: filtergym verify" in shown
+    assert ": ManeuveringTarget, trial, 32 episodes of random" in shown  # over what, and against whom
+    assert "imm-steady-state, %" in shown
 
 
 def test_results_are_those_of_an_evaluation(honest):

@@ -104,8 +104,12 @@ UNITS = {
     "correlation_time": "s",
     "drift": "m/m^0.5",
     "heading_offset": "degrees",
+    "ratio": "times as much in manoeuvres",
+    "leave_quiet": "chance a measurement that a manoeuvre begins",
+    "leave_noisy": "chance a measurement that a manoeuvre ends",
+    "noise_scale": "times the stated deviations",
 }
-"""Of the parameters of all families."""
+"""Units of the parameters of all families; of those that have none, what they are."""
 
 DECADES = 12.0
 """How far limits of sizes that follow a recording lie from those of 1 s and 1 m: of a millisecond and a kilometre."""

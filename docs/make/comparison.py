@@ -44,18 +44,14 @@ def compared_policies(measured: BenchmarkRecords) -> list[str]:
     problem, records = measured
     known, paper = problem.baselines, measured.paper
     of_default = [record for record in records if record.scenario == problem.task.default_scenario]
-    classical = [
-        place.name
-        for place in ranking(of_default or records)
-        if place.role != "learned" and place.name != paper
-    ]
+    agents = pretrained_agents(problem.id)
+    ranked = [place.policy for place in ranking(of_default or records)]
+    classical = [name for name in ranked if name != paper and name not in agents]
     readings = [paper, known.score_paper]
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
     strongest = classical[:STRONGEST]
-    wanted = dict.fromkeys(
-        (*pretrained_agents(problem.id), *strongest, *readings, *tuned, known.score_reference)
-    )
+    wanted = dict.fromkeys((*agents, *strongest, *readings, *tuned, known.score_reference))
     return [name for name in wanted if name in present]
 
 
@@ -82,7 +78,7 @@ def summary(found: Sequence[BenchmarkRecords]) -> Grid:
         reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
         records = [record for record in every if record.scenario == problem.task.default_scenario]
         values, kinds = _by_name(records), {record.policy: record.kind for record in records}
-        places = [place.name for place in ranking(records)] if records else []
+        places = [place.policy for place in ranking(records)]
         best: dict[str, str] = {}
         for name in places:
             origin = f"learned {kinds[name]}" if name in learned else "classical"
@@ -142,11 +138,13 @@ def covariances(found: Sequence[BenchmarkRecords]) -> Grid:
     for measured in found:
         records = [r for r in measured.records if r.scenario == measured.problem.task.default_scenario]
         values = _by_name(records)
-        for place in ranking(records) if records else ():
-            both = [values.get((place.name, metric, "state", "all")) for metric in ("anees", "median_anees")]
+        for place in ranking(records):
+            both = [
+                values.get((place.policy, metric, "state", "all")) for metric in ("anees", "median_anees")
+            ]
             texts = [consistency(record) for record in both]
-            if place.name != "random" and any(INCONSISTENT in text for text in texts):
-                rows.append([bare_name(measured.problem.id), f"`{place.name}`", *texts])
+            if place.policy != "random" and any(INCONSISTENT in text for text in texts):
+                rows.append([bare_name(measured.problem.id), f"`{place.policy}`", *texts])
     title = "Covariances that do not fit the errors on the training distribution"
     return Grid(title, ["environment", "name", "ANEES, mean", "ANEES, median episode"], rows)
 

@@ -476,18 +476,22 @@ def describe_time(clock: str, time: float) -> str:
     return str(numpy.datetime64(round(time), "s"))
 
 
-def check_order(time: numpy.ndarray) -> None:
+def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> None:
     """Raise ValueError for times that decrease, with both times and what to do.
 
     Args:
         time: s, ``(rows,)``.
+        written: as they stand in the file, likewise; default: the same.
     """
     steps = numpy.diff(time)
     if (steps < 0.0).any():
         row = int((steps < 0.0).argmax())
-        before, after = (numpy.format_float_positional(t, trim="-") for t in time[row : row + 2])
+        before, after = (
+            t if isinstance(t, str) else numpy.format_float_positional(t, trim="-")
+            for t in (time if written is None else written)[row : row + 2]
+        )
         turn = next((turn for turn in COUNTERS if abs(steps[row] + turn) < COUNTER_SHARE * turn), None)
-        hint = "sort the rows by time"
+        hint = "sort the rows by time, such as by pandas' sort_values"
         if turn is not None:
             hint = f"a counter that starts again: add {turn:.10g} to the times from row {row + 1} on"
         elif steps[row] <= -1800.0 and (steps < 0.0).sum() <= 2:

@@ -271,7 +271,8 @@ def unknown_column_notes(names: Iterable[str], known: Iterable[str], noise_hint:
             close = deviations
         if close:
             raise ValueError(
-                f"it has the column {name}, which is not read: did you mean {' or '.join(close)}? else leave it out"
+                f"it has the column {name}, which is not read: did you mean {' or '.join(close)}? else leave it out, "
+                f"of a recording by --rename '{name}=-'"
             )
     noisy = [name for name in ignored if _is_noise(name)]
     others = [name for name in ignored if name not in noisy]

@@ -42,7 +42,7 @@ def read_recording(
             much of the recording has one. For tables.
         truth_offset: s, added to the times of that file.
         rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``; one
-            column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``.
+            column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``, and ``{"speed": "-"}`` ignores one.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:

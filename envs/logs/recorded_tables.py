@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 GEODETIC = ("latitude", "longitude", "altitude")
 """Columns, of which the last may lack; they may be called as in flights."""
+LEFT_OUT = "-"
+"""What a column that is to be ignored is renamed to."""
 TURN_SHARE = 0.05
 """Of a turn, by which a jump of an angle may differ from a whole one."""
 MOST_TWICE = 0.1
@@ -314,7 +316,8 @@ def read_columns(
         cls: the environment.
         keywords: parameters of it.
         truth: in a file of its own.
-        rename: what some columns of the file are, in the environment's names; one column may be several.
+        rename: what some columns of the file are, in the environment's names; one column may be several, and one
+            that is ``LEFT_OUT`` is ignored.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
@@ -373,7 +376,7 @@ def read_columns(
             name or path.name.partition(".")[0], rows.reset_index(drop=True), keywords, log_time[rows.index]
         )
         try:
-            _check_times(own.time)
+            _check_times(own)
             own.drop_duplicates()
             own.note_turns(angles)
             if log_format.plane:
@@ -434,13 +437,15 @@ def _rename(
     """
     for old, new in renamed:
         if old not in names:
-            raise ValueError(f"it has no column {old}, which was to be {new}; it has {list_names(names)}")
-        if new not in known:
+            what = "left out" if new == LEFT_OUT else new
+            raise ValueError(f"it has no column {old}, which was to be {what}; it has {list_names(names)}")
+        if new not in known and new != LEFT_OUT:
             raise ValueError(
-                f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}"
+                f"{old} was to be {new}, which is not read: choose from {list_names(sorted(known))}, or "
+                f"{old}={LEFT_OUT} to ignore the column"
             )
     meanings = {name: [new for old, new in renamed if old == name] or [name] for name in names}
-    pairs = [(name, new) for name in names for new in meanings[name]]
+    pairs = [(name, new) for name in names for new in meanings[name] if new != LEFT_OUT]
     called = [new for _, new in pairs]
     twice = next((new for _, new in renamed if called.count(new) > 1), None)
     if twice is not None:
@@ -495,12 +500,13 @@ def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> d
     return {str(name): rows for name, rows in table.groupby(words, sort=False)}
 
 
-def _check_times(time: numpy.ndarray) -> None:
+def _check_times(own: Columns) -> None:
+    time = own.time
     if len(time) < 2:
         raise ValueError(f"it has {len(time)} row{'s' * (len(time) != 1)}, and a recording needs several")
     if not numpy.isfinite(time).all():
         raise ValueError(f"time has no value in row {int((~numpy.isfinite(time)).argmax())}")
-    check_order(time)
+    check_order(time, own.log_time)
 
 
 def _side_by_side(

@@ -42,8 +42,12 @@ def takes_problem(maker: Any) -> bool:
     return first is not None and (first.default is first.empty or first.name in ("task", "model"))
 
 
+READINGS = ("z", "zk", "y", "meas", "measurement", "obs", "observation")
+"""Names of what the ``update`` of a filter of one track takes first; its own state is in the object."""
+
+
 def check_update_order(found: Any) -> None:
-    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement."""
+    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement, or have none."""
     try:
         names = [name for name in inspect.signature(found.update).parameters if name != "self"]
     except (AttributeError, TypeError, ValueError):  # without one, or compiled
@@ -52,6 +56,12 @@ def check_update_order(found: Any) -> None:
         raise ValueError(
             f"update takes the memory first, as update({', '.join(['memory', *(n for n in names if n != 'memory')])}), "
             f"but this one is update({', '.join(names)}): change the order of its arguments"
+        )
+    if names and names[0].lower() in READINGS:
+        raise ValueError(
+            f"update({', '.join(names)}) is of a filter that knows one track, and here N tracks run side by side: put "
+            "it behind filtergym.adapters.SingleTrackEstimator, whose begin(initial), step(track, measurement) and "
+            "estimate(track) call yours (docs/adapters.md)"
         )
 
 

@@ -14,15 +14,21 @@ from .looks import COLOURS
 from .print_layout import FONT_SIZES, add_title, figure_with_axes, in_print
 
 MOST_ABOVE = 1.0
-"""How far above the paper's cost competitors are drawn, in octaves of the cost; whoever costs more is counted."""
+"""How far above the paper's cost competitors are drawn, in octaves of the cost; of those that cost more only the user's
+own are drawn, and the others are counted."""
 TICKS = (
     *(-99.5, -99, -98, -95, -90, -85, -80, -75, -70, -65, -60, -55, -50, -45, -40, -35, -30, -25, -20, -15, -10, -5),
     *(0, 5, 10, 15, 20, 30, 40, 50, 70, 100),
 )  # fmt: skip
 """Of the cost, %: of these as many are shown as there is room for."""
-LEARNED, PAPER, CLASSICAL = COLOURS[1], COLOURS[0], "0.45"
-DISTANCES = (5.0, 9.0, 15.0, 23.0, 33.0, 45.0)
+LEARNED, PAPER, CLASSICAL, OWN = COLOURS[1], COLOURS[0], "0.45", "#9B5DE5"
+TOUCHES = 3.0
+"""Badness of a place from which on a name touches a line, a point or another name: there only the paper's algorithm and
+the user's own are named."""
+DISTANCES = (5.0, 7.0, 9.0, 15.0, 23.0, 33.0, 45.0)
 """Of a name from its point, points of print; the nearest that is free is taken."""
+NEAR = 3
+"""So many of them for names that may be left out: lines to names farther away would cross."""
 DIRECTIONS = 16
 
 Box = tuple[float, float, float, float]
@@ -38,6 +44,20 @@ class FrontPanel(NamedTuple):
     paper: str
     reference: str
     learned: Collection[str]
+    own: Collection[str] = ()
+    """Names of the user's own competitors, which are always drawn and named."""
+
+    @property
+    def top(self) -> float:
+        """Highest cost that is drawn, %."""
+        ranked = [point for point in self.points if point.kind in RANKED or point.name == self.reference]
+        usual = min(max((point.cost for point in ranked), default=0.0), _percent(MOST_ABOVE))
+        return max([usual, *(point.cost for point in ranked if point.name in self.own)])
+
+    @property
+    def beyond(self) -> list[Point]:
+        """Those that cost more, and are not drawn."""
+        return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
 def points_of_curves(curves: xarray.Dataset) -> list[Point]:
@@ -86,7 +106,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
     axis.set_xscale("log")
     axis.set_yscale("function", functions=(_octaves, _percent))
     costs = [point.cost for point in panel.points if point.kind in RANKED or point.name == panel.reference]
-    top = min(max(costs, default=0.0), _percent(MOST_ABOVE))
+    top = panel.top
     low, high = _octaves(min(costs, default=0.0)), _octaves(top)
     margin = max(0.08 * (high - low), 0.01)
     axis.set_ylim(_percent(low - 1.6 * margin), _percent(high + margin))
@@ -94,7 +114,7 @@ def draw_panel(axis: Any, panel: FrontPanel) -> None:
     times = [point.time.nanoseconds for point in shown] or [1.0]
     wide = max(max(times) / min(times), 2.0) ** 0.08
     axis.set_xlim(min(times) / wide**1.2, max(times) * wide**1.5)
-    _label_axes(axis, sum(point.kind in RANKED and point.cost > top for point in panel.points))
+    _label_axes(axis, panel)
     axis.axhline(0.0, color=PAPER, lw=0.6, zorder=1.0)
     for point in panel.points:
         if point.name == panel.reference:
@@ -126,12 +146,12 @@ def legend_of(panels: Iterable[FrontPanel]) -> list[Any]:
         handles["python"] = Line2D([], [], label="asked in Python", linestyle="", **style)
     handles["front"] = Line2D([], [], color="0.25", lw=1.0, label="the front")
     handles["reference"] = Line2D([], [], color="black", lw=0.9, ls="--", label="reference")
-    order = ("paper's algorithm", "policy", "estimator", "learned", "python", "front", "reference")
+    order = ("yours", "paper's algorithm", "policy", "estimator", "learned", "python", "front", "reference")
     return [handles[name] for name in order if name in handles]
 
 
 def name_points(figure: Any, panels: Mapping[Any, FrontPanel]) -> None:
-    """Write names where nothing else is: of who lies on the front, of the paper's algorithm, of the learned, and of the
+    """Write names where nothing else is: of the paper's algorithm, of the user's own, of those on the front, and of the
     reference.
 
     Args:
@@ -170,7 +190,7 @@ class _Names:
         shown = [p for p in panel.points if p.kind in RANKED and low <= p.cost <= high]
         for point in shown:
             x, y = self._at(point.time.nanoseconds, point.cost)
-            reach = 2.6 * self.pixels
+            reach = (3.6 if point.name == panel.paper else 2.6) * self.pixels  # a star is larger
             self.points.append((x - reach, y - reach, x + reach, y + reach))
         corners = [self._at(point.time.nanoseconds, point.cost) for point in on_front]
         for (x, y), (x2, y2) in itertools.pairwise(corners):
@@ -186,16 +206,18 @@ class _Names:
                 self._add_line((self.window.x0, y), (self.window.x1, y))
                 self._name_line(point, y)
         names = {point.name for point in on_front}
-        others = [p for p in shown if p.name in (panel.paper, *panel.learned) and p.name not in names]
+        always = {panel.paper, *panel.own}
+        others = [p for p in shown if p.name in always and p.name not in names]
         # Who is named first has the best place, so several orders are tried.
         orders = [
-            [*on_front[i:], *on_front[:i], *others][::step] for i in range(len(on_front)) for step in (1, -1)
+            [*others, *on_front[i:], *on_front[:i]][::step] for i in range(len(on_front)) for step in (1, -1)
         ]
         before, best, least = (list(self.names), list(self.lines)), None, math.inf
         for order in orders or [others]:
             self.names, self.lines = list(before[0]), list(before[1])
-            places = [(point, *self._find_place(point)) for point in order]
-            badness = sum(bad for *_, bad in places)
+            found = ((point, self._find_place(point, point.name in always)) for point in order)
+            places = [(point, *place) for point, place in found if place is not None]
+            badness = sum(bad for *_, bad in places) + 3.0 * TOUCHES * (len(order) - len(places))
             if badness < least:
                 best, least = places, badness
         for point, box, _ in best or ():
@@ -227,23 +249,30 @@ class _Names:
         self.names.append(best)
         self._write(point.name, best, "black")
 
-    def _find_place(self, point: Point) -> tuple[Box, float]:
-        """Find and take the best free box for a name; return it and how bad it is."""
+    def _find_place(self, point: Point, always: bool) -> tuple[Box, float] | None:
+        """Find and take the best free box for a name; return it and how bad it is. None: every place touches something,
+        and the name may be left out.
+        """
         width, height = self._extent(point.name)
         x, y = self._at(point.time.nanoseconds, point.cost)
         k = numpy.arange(DIRECTIONS)
         # Below the front nobody is: from there on round.
         angle = math.pi * (1.25 + (k + 1) // 2 * (-1) ** k * 2.0 / DIRECTIONS)
-        reach = numpy.repeat(DISTANCES, DIRECTIONS) * self.pixels
-        cosine, sine = (numpy.tile(f(angle), len(DISTANCES)) for f in (numpy.cos, numpy.sin))
+        distances = DISTANCES if always else DISTANCES[:NEAR]
+        reach = numpy.repeat(distances, DIRECTIONS) * self.pixels
+        cosine, sine = (numpy.tile(f(angle), len(distances)) for f in (numpy.cos, numpy.sin))
         cx = x + reach * cosine + 0.5 * width * _unit(cosine)
         cy = y + reach * sine + 0.5 * height * _unit(sine)
         boxes = numpy.stack(
             [cx - 0.5 * width, cy - 0.5 * height, cx + 0.5 * width, cy + 0.5 * height], axis=1
         )
-        badness = self._crowding(boxes) + numpy.add.outer(0.05 * numpy.array(DISTANCES), 0.06 * k).ravel()
-        badness += 5.0 * self._crosses((x, y), boxes)
+        touched = self._crowding(boxes) + 5.0 * (
+            self._crosses((x, y), boxes) | self._is_nearer((x, y), boxes)
+        )
+        badness = 2.0 * touched + numpy.add.outer(0.05 * numpy.array(distances), 0.06 * k).ravel()
         best = int(numpy.argmin(badness))
+        if touched[best] >= TOUCHES and not always:
+            return None
         box = left, bottom, right, top = tuple(boxes[best].tolist())
         self.names.append((left, bottom, right, top))
         self._add_line((x, y), _nearest(box, (x, y)))
@@ -267,6 +296,18 @@ class _Names:
         found: numpy.ndarray = ((x > a) & (x < c) & (y > b) & (y < d) & others).any(axis=(0, 2))
         return found
 
+    def _is_nearer(self, point: tuple[float, float], boxes: numpy.ndarray) -> numpy.ndarray:
+        """Whether a name in each of the boxes might belong to another point, which is about as near; of those that lie
+        over each other any may be meant.
+        """
+        taken = numpy.array(self.points)
+        centres = 0.5 * (taken[:, :2] + taken[:, 2:])
+        apart = numpy.linalg.norm(centres - point, axis=1) > 5.0 * self.pixels
+        centres = numpy.concatenate([[point], centres[apart]])[:, None]
+        distances = numpy.linalg.norm(centres - numpy.clip(centres, boxes[:, :2], boxes[:, 2:]), axis=-1)
+        nearer: numpy.ndarray = (distances[1:] < 1.3 * distances[0]).any(axis=0)
+        return nearer
+
     def _crowding(self, boxes: numpy.ndarray) -> numpy.ndarray:
         """How much else there is in each box: points weigh more than lines, names more, and the frame most."""
         left, bottom, right, top = boxes.T[..., None]
@@ -279,7 +320,7 @@ class _Names:
             found += weight * numpy.count_nonzero((across > 0.0) & (along > 0.0), axis=1)
         lines = numpy.array(self.lines)
         x, y = lines.reshape(-1, 2).T
-        inside = (x > left) & (x < right) & (y > bottom - margin) & (y < top)
+        inside = (x > left) & (x < right) & (y > bottom - margin) & (y < top + margin)
         found += 3.0 * numpy.count_nonzero(inside.reshape(len(boxes), len(lines), -1).any(axis=2), axis=1)
         window = self.window
         outside = (
@@ -329,30 +370,36 @@ def _on_front(panel: FrontPanel) -> list[Point]:
 def _origin(point: Point, panel: FrontPanel) -> str:
     if point.name == panel.paper:
         return "paper's algorithm"
+    if point.name in panel.own:
+        return "yours"
     return "learned" if point.name in panel.learned else point.kind
 
 
 def _colour(point: Point, panel: FrontPanel) -> str:
     """Colour of a name."""
-    return {"paper's algorithm": PAPER, "learned": LEARNED}.get(_origin(point, panel), "black")
+    return {"paper's algorithm": PAPER, "learned": LEARNED, "yours": OWN}.get(_origin(point, panel), "black")
+
+
+MARKED = ("paper's algorithm", "learned", "yours")
+"""Origins that have a colour wherever they stand."""
 
 
 def _marker(point: Point, panel: FrontPanel, on_front: bool) -> dict[str, Any]:
     where = _origin(point, panel)
-    colour = _colour(point, panel) if on_front or where in ("paper's algorithm", "learned") else CLASSICAL
-    shape = {"paper's algorithm": "*", "learned": "D", "estimator": "s"}.get(where, "o")
-    size = {"*": 7.0, "D": 3.8, "s": 3.6}.get(shape, 3.6) + 0.8 * on_front
+    colour = _colour(point, panel) if on_front or where in MARKED else CLASSICAL
+    shape = {"paper's algorithm": "*", "learned": "D", "estimator": "s", "yours": "P"}.get(where, "o")
+    size = {"*": 7.0, "D": 3.8, "P": 6.0}.get(shape, 3.6) + 0.8 * on_front
     return {
         "marker": shape,
         "markersize": size,
         "color": colour,
         "markerfacecolor": colour if point.time.compiled else "white",
         "markeredgewidth": 0.9,
-        "zorder": 3.5 if on_front else 3.0,
+        "zorder": 3.7 if where in ("paper's algorithm", "yours") else 3.5 if on_front else 3.0,
     }
 
 
-def _label_axes(axis: Any, beyond: int) -> None:
+def _label_axes(axis: Any, panel: FrontPanel) -> None:
     """Ticks and titles of the axes; how many lie beyond the top stands there."""
     from matplotlib.ticker import FixedLocator, NullLocator
 
@@ -367,12 +414,14 @@ def _label_axes(axis: Any, beyond: int) -> None:
     axis.yaxis.set_minor_locator(NullLocator())
     axis.yaxis.set_major_formatter(lambda x, _: f"{x:+g}" if x else "0")
     axis.set_xlabel("nanoseconds a measurement")
-    axis.set_ylabel("cost against the paper, %")
-    if beyond:
+    axis.set_ylabel(f"cost against {panel.paper or 'the paper'}, %")
+    if beyond := len(panel.beyond):
         axis.text(
             0.985,
             0.98,
-            f"{beyond} beyond the top",
+            f"{beyond} cost more than {panel.top:+.0f} %"
+            if beyond > 1
+            else f"1 costs more than {panel.top:+.0f} %",
             transform=axis.transAxes,
             ha="right",
             va="top",

@@ -38,7 +38,8 @@ from ..evaluation.storage.estimates import check_estimates, write_estimates
 from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
 from ..evaluation.storage.store import Store
 from ..extensions import DEPARTURES, load_present
-from ..names import find_competitors, ranked_names
+from ..names import find_competitors, ranked_names, shipped_names
+from ..reports.pages.outcome import own_sentences
 from ..reports.tables.benchmark import result_of, without_smoothers_of_closed_loops
 from ..reports.tables.export import LATEX_WIDTH, latex_table, records_as_csv, write_records
 from ..reports.tables.reasons import reason_sentences
@@ -273,18 +274,25 @@ def tables_of(
     """Return what is printed in so many columns, widest first."""
     tables = [flights_table(found.dataset, flights, found.records, width)] if flights else []
     if found.has_truth:
-        compared = results_tables(found.records, problem.knows, width)
+        compared = results_tables(found.records, problem.knows, width, found.dataset.attrs["paper"])
         paper = found.dataset.attrs["paper"]
         if paper not in {record.policy for record in found.records}:
-            compared[-1].caption = f"{_without_comparison(paper)}\n{compared[-1].caption}"
+            compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
     if found.recorded:
         tables += recording_tables(found.records, differences, found.has_truth, width)
     return tables
 
 
-def _without_comparison(paper: str) -> str:
-    """Explain why costs are compared with none, where the paper's algorithm of this name did not take part."""
+def own_names(problem: Problem, policies: Sequence[str]) -> list[str]:
+    """Of names of competitors those that are not shipped: the user's own."""
+    shipped = shipped_names(problem)
+    return [name for name in dict.fromkeys(policies) if name not in shipped]
+
+
+def _without_comparison(problem: Problem) -> str:
+    """Explain why costs are compared with none, where no reading of the paper's algorithm takes part."""
+    paper = problem.baselines.compared_paper
     if not paper:
         return "Costs are not compared: the environment names no paper's algorithm."
     return f"Costs are compared with that of {paper} where it takes part: add --policy {paper}."
@@ -352,8 +360,10 @@ def write(
     outputs: Outputs,
     learned: list[str],
     worst: Mapping[str, Sequence[WorstTrack]],
+    own: Sequence[str],
 ) -> None:
-    """Write what was asked for, print the tables and the largest reasons, and say where the files are.
+    """Write what was asked for, print sentences on the user's own competitors, tables and the largest reasons, and say
+    where the files are.
 
     Args:
         problem: that was evaluated.
@@ -362,13 +372,19 @@ def write(
         outputs: what is written.
         learned: names that are learned.
         worst: by the names of those whose cost is explained their worst episodes.
+        own: names of the user's own.
     """
     flights = flights_of(found)
     differences = likelihood_differences(problem, found.dataset) if found.recorded else {}
     printed, in_file = (
         tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
     )
-    for table in printed:  # before anything is written, which can fail
+    sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
+    for sentence in sentences:  # before anything is written, which can fail
+        print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
+    if sentences:
+        console.print()
+    for table in printed:
         print_table(table)
     records = [*found.records, *flights]
     if outputs.records is not None:
@@ -379,7 +395,7 @@ def write(
     if outputs.folder is not None and found.curves is not None:
         if found.has_truth:
             settings = settings_of(command_line())
-            results = [result_of(problem, found, learned, worst)]
+            results = [result_of(problem, found, learned, worst, own)]
         whole = found.dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
         if not refusal:  # a summary has no variables
             largest = max(v.nbytes for v in whole.data_vars.values())

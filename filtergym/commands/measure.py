@@ -39,6 +39,7 @@ from .evaluation import (
     find_data,
     find_participants,
     keeps_predictions,
+    own_names,
     run,
     write,
 )
@@ -167,7 +168,7 @@ def evaluate_policies(
     why: Annotated[
         list[str] | None,
         typer.Option(
-            help="Whose cost is explained; repeat for several; default: the first --policy, else the paper's "
+            help="Whose cost is explained; repeat for several; default: yours, the first --policy, else the paper's "
             "algorithm.",
             autocompletion=complete_policy,
         ),
@@ -241,12 +242,12 @@ def evaluate_policies(
     with limit_programs(time_limit, memory_limit), outputs.reserve_space(competitors):
         with Workers(jobs, cluster) as workers:
             found, refusal, failures = run(requests, outputs, workers, store)
-        paper = found.dataset.attrs["paper"]
-        explained = why or explained_by_default(found.records, policy or [], paper)
+        own, paper = own_names(problem, policy or []), found.dataset.attrs["paper"]
+        explained = why or explained_by_default(found.records, [*own, *(policy or [])], paper)
         worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
         if out is not None:
             worst = find_worst(experiment, found, competitors, explained)
-    write(problem, found, refusal, outputs, [one.name for one in learned], worst)
+    write(problem, found, refusal, outputs, [one.name for one in learned], worst, own)
     store.clear()
     for sentence in departure_lines(problem, data, learned, keywords):
         print_sentence(sentence)
@@ -374,6 +375,7 @@ def benchmark(
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
+    policy: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
     format: Formats = None,
     columns: Columns = 2,
     backend: Backend = "auto",
@@ -387,6 +389,12 @@ def benchmark(
 
     Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
     """
+    if policy:
+        raise ValueError(
+            f"benchmark runs what is shipped, and --policy {policy[0]} names another competitor: filtergym evaluate "
+            f"--protocol filtergym-1 --policy {policy[0]} runs it in every environment, and filtergym evaluate "
+            f"ENVIRONMENT --policy {policy[0]} in one"
+        )
     formats = check_formats(format or [])
     check_columns(columns)
     options = BenchmarkOptions(
@@ -414,7 +422,7 @@ def benchmark(
 
         results = run_benchmark(out, options, Callbacks(add_line, tell_result, save_figures), workers)
     tables = [headline_table(results)]
-    tables += [table for r in results for table in results_tables(r.records, r.knows, LATEX_WIDTH)]
+    tables += [table for r in results for table in results_tables(r.records, r.knows, LATEX_WIDTH, r.paper)]
     with whole_files(out) as waiting:
         records_as_csv(waiting / "records.csv", all_records(results))
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))

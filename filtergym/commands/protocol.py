@@ -109,14 +109,17 @@ def _table(found: ProtocolResult) -> Table:
     table.add_column("environment", no_wrap=True)
     if several:
         table.add_column("competitor", overflow="fold")
-    for title in ("cost vs paper, %", "lost\n%", "ANEES", "worst held-out, %", "ns (paper's)"):
+    for title in ("cost, %", "lost\n%", "ANEES", "worst held-out, %", "ns (paper's)"):
         table.add_column(title, justify="right")
     for one in found.environments:
         table.add_row(
-            one.entry.environment.short, *([one.entry.name] if several else []), *_environment_cells(one)
+            f"{one.entry.environment.short}\nvs {one.entry.environment.paper}",
+            *([one.entry.name] if several else []),
+            *_environment_cells(one),
         )
     table.caption = (
-        "Cost is the geometric mean of the ratios of the episodes' costs to those of the paper's algorithm, less one. "
+        "Cost is the geometric mean of the ratios of the episodes' costs to those of the paper's algorithm, which "
+        "stands below the environment, less one. "
         "A track is lost where an episode's mean cost is beyond the bound of the environment. ANEES is 1 if errors are "
         "as large as the covariance says; ! marks one that is off by more than a factor of two. Of the scenarios that "
         "are held out from training the worst is named. ns is the processor time of a measurement on one core of this "

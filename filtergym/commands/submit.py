@@ -10,8 +10,8 @@ from .. import __version__
 from ..baselines.problem import problem_of
 from ..evaluation.running.parallel import Workers
 from ..evaluation.storage.files import writable_file, write_text
-from ..protocol import Entry, measurements_of
-from ..reports.tables.terminal_tables import HEADLINE
+from ..protocol import Entry, Protocol, measurements_of
+from ..reports.tables.terminal_tables import HEADLINE, cost_title, plain_table
 from ..submission import (
     FROZEN,
     OWN,
@@ -34,6 +34,7 @@ from .terminal import (
     complete_policy,
     console,
     one_of,
+    print_table,
     progress_bar,
 )
 
@@ -78,7 +79,7 @@ def submit(
             problem, name, protocol, card, workers, lambda done: bar.update(line, advance=done)
         )
     digest = write_submission(out, made)
-    console.print(_results_table(made.card.title, {"": made.results}))
+    print_table(_results_table(made.card.title, episodes, {"": made.results}))
     console.print(f"saved in {out}, SHA-256 {digest}", soft_wrap=True)
 
 
@@ -128,7 +129,8 @@ def verify_file(
         columns["here"] = found.again
     if found.fresh is not None:
         columns["fresh"] = found.fresh.figures
-    console.print(_results_table(f"{own.card.title}, by {own.card.author}", columns))
+    episodes, _ = protocol_of(problem_of(own.environment), own.protocol)
+    print_table(_results_table(f"{own.card.title}, by {own.card.author}", episodes, columns))
     console.print(f"SHA-256 {found.digest}", soft_wrap=True)
     versions = f"made by filtergym {own.filtergym}, verified by {__version__}"
     for one in found.suspicions:
@@ -161,12 +163,17 @@ def verify_file(
     )
 
 
-def _results_table(title: str, columns: dict[str, tuple[Figure, ...]]) -> Table:
+def _results_table(title: str, protocol: Protocol, columns: dict[str, tuple[Figure, ...]]) -> Table:
     """Cost against the paper's algorithm and consistency in every scenario, from several runs side by side."""
-    table = Table(title=title, title_justify="left", caption=_time_line(columns), caption_justify="left")
+    [own] = protocol.environments
+    held_out = f" and {protocol.held_out_episodes:,} of every other scenario" if own.held_out else ""
+    table = plain_table(
+        f"{title}: {own.short}, {protocol.name}, {protocol.episodes:,} episodes of {own.training}{held_out}"
+    )
+    table.caption = _time_line(columns)
     table.add_column("scenario")
     for name in columns:
-        table.add_column(f"{name} cost vs paper, %".strip(), justify="right")
+        table.add_column(f"{name} {cost_title(own.paper)}".strip(), justify="right")
         table.add_column("ANEES", justify="right")
     rows = {name: {(f.scenario, f.metric): f for f in figures} for name, figures in columns.items()}
     for scenario in dict.fromkeys(f.scenario for figures in columns.values() for f in figures):

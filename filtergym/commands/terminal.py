@@ -143,7 +143,7 @@ RenameOption = Annotated[
     typer.Option(
         "--rename",
         help="What columns of a table are, where they have other names: 't=time,pos=x'. One column may be several: "
-        "'accuracy=sigma_x,accuracy=sigma_y'.",
+        "'accuracy=sigma_x,accuracy=sigma_y'; 'speed=-' ignores one.",
     ),
 ]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
@@ -290,7 +290,10 @@ def renamed(text: str | None) -> dict[str, list[str]]:
     """
     pairs = [part.split("=") for part in text.split(",")] if text else []
     if not all(len(pair) == 2 and all(map(str.strip, pair)) for pair in pairs):
-        raise ValueError(f"--rename takes NAME=MEANING,NAME=MEANING, such as 't=time,pos=x', got {text!r}")
+        raise ValueError(
+            f"--rename takes NAME=MEANING,NAME=MEANING, such as 't=time,pos=x', or NAME=- to ignore a column, "
+            f"got {text!r}"
+        )
     names: dict[str, list[str]] = {}
     for old, new in pairs:
         names.setdefault(old.strip(), []).append(new.strip())

@@ -186,9 +186,8 @@ def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> N
     if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
         console.print("an agent that plain arrays cannot hold is compared with --trust only")
         return
-    opponents = standing.Opponents(runs[0])
-    found = [
-        standing.agent_standing(run, agent, str(training.folder), opponents, trust)
-        for training, run, agent in zip(opened, runs, agents, strict=True)
-    ]
-    print_table(standing.standing_table(found, opponents, runs[0].scenario))
+    names = [str(training.folder) for training in opened]
+    found = standing.measure_standing(runs[0], dict(zip(names, agents, strict=True)), trust)
+    print_table(
+        standing.standing_table(found, {name: run.beat_paper for name, run in zip(names, runs, strict=True)})
+    )

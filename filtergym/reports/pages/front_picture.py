@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.figures.front_figure import FrontPanel, draw_panel, name_points
-from ...evaluation.figures.print_layout import DOTS_PER_INCH, figure_with_axes, in_print
-from ...evaluation.running.times import front, points_of_records
+from ...evaluation.figures.print_layout import figure_with_axes, in_print
+from ...evaluation.running.times import Point, front, points_of_records
 from ..tables.headline import headline
 from ..tables.results import Result
 
@@ -18,7 +18,7 @@ class FrontImage(NamedTuple):
 
     title: str
     words: str
-    """Who is on the front, the quickest first."""
+    """Who is on the front, the quickest first; where the user's own stand; and who costs more than is drawn."""
     address: str
     """The image itself, as a ``data:`` address."""
 
@@ -35,24 +35,38 @@ def front_images(results: Sequence[Result]) -> list[FrontImage]:
         if not any(point.kind in RANKED for point in points.values()):
             continue
         on_front = [points[name] for name in front(list(points.values()))]
-        words = ", ".join(f"{p.name} {p.cost:+.3g} % in {p.time.nanoseconds:.2g} ns" for p in on_front)
         title = result.short if result.default else f"{result.short}, {result.scenario}"
-        panel = FrontPanel(title, list(points.values()), result.paper, result.reference, result.learned)
+        panel = FrontPanel(
+            title, list(points.values()), result.paper, result.reference, result.learned, result.own
+        )
+        lists = {
+            "Yours": [points[name] for name in result.own if name in points],
+            "On the front, the quickest first": on_front,
+            "Not drawn": panel.beyond,
+        }
+        words = " ".join(
+            f"{what}: {', '.join(map(_place, listed))}." for what, listed in lists.items() if listed
+        )
         encoded = base64.b64encode(_draw(panel, columns=1)).decode()
-        found.append(FrontImage(title, words, f"data:image/png;base64,{encoded}"))
+        found.append(FrontImage(title, words, f"data:image/svg+xml;base64,{encoded}"))
     return found
+
+
+def _place(point: Point) -> str:
+    cost = f"{point.cost:+,.0f}" if round(point.cost) else "0"
+    return f"{point.name} {cost}\xa0% in {float(f'{point.time.nanoseconds:.2g}'):,.0f}\xa0ns"
 
 
 @in_print
 def _draw(panel: FrontPanel, *, columns: int) -> bytes:
-    """Return the panel as a PNG of twice the width that a page shows it in."""
+    """Return the panel as SVG whose letters are lines, the same bytes every time."""
     from matplotlib import rc_context
 
     # Names are of anybody: between two dollars they are no formulas.
-    with rc_context({"text.parse_math": False}):
+    with rc_context({"text.parse_math": False, "svg.fonttype": "path", "svg.hashsalt": "filtergym"}):
         figure, (axis,) = figure_with_axes(columns=columns, height=2.3)
         draw_panel(axis, panel)
         name_points(figure, {axis: panel})
         written = io.BytesIO()
-        figure.savefig(written, format="png", dpi=DOTS_PER_INCH)
+        figure.savefig(written, format="svg", metadata={"Date": None})
     return written.getvalue()

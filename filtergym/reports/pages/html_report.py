@@ -26,7 +26,7 @@ from ..tables.terminal_tables import (
 )
 from .front_picture import front_images
 from .html_page import pack, render_page
-from .outcome import outcome_sentences, protocol_sentences
+from .outcome import outcome_sentences, own_sentences, protocol_sentences
 from .why_section import why_section, worst_data
 
 WORDS = ("competitor", "covariance", "origin", "control")
@@ -69,6 +69,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
     return render_page(
         "report.html.jinja",
         "report.js",
+        own=[line for result in results for line in own_sentences(result.records, result.own, result.paper)],
         outcome=outcome_sentences(results),
         protocol=protocol_sentences(results),
         fronts=front_images(results),
@@ -95,6 +96,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "sentence": ranking_sentence(result.records, result.paper, result.learned),
         "header": header,
         "rows": rows,
+        "score": _score_sentence(result, "score" in header),
         "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
         "why": why_section(result),
         "figures": list(_figures(result)),
@@ -124,7 +126,9 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
         return Entry(text, None if record is None else record.value)
 
     against = f"cost against {result.paper or 'paper'}, %"
-    header = ["competitor", against, "lost tracks, %", "means, %", "ANEES", "covariance", "score"]
+    header = ["competitor", against, "lost tracks, %", "means, %", "ANEES", "covariance"]
+    scored = any(r.metric == "score" and r.value is not None for r in records)
+    header += ["score"] * scored
     times, texts = times_of_records(records), column_of_times(records)
     header += [TIME_TITLE] * bool(times)
     header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
@@ -146,7 +150,10 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(means, _number(means)),
                 Entry("-" if value is None else f"{value:.3g}", value),
                 Entry(consistency_word(nees), consistency_word(nees)),
-                Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
+                *[
+                    Entry(score_text(score).partition(" [")[0], None if score is None else score.value)
+                    for _ in range(scored)
+                ],
                 *[
                     Entry(texts.get(name, "-"), times[name].nanoseconds if name in times else None)
                     for _ in range(bool(times))
@@ -162,6 +169,14 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
             ]
         )
     return header, rows
+
+
+def _score_sentence(result: Result, scored: bool) -> str:
+    if scored:
+        return f"The score is 0 for `{result.paper}` and 1 for `{result.reference}`."
+    if result.reference:
+        return f"There is no score: `{result.reference}` is not significantly better than `{result.paper or 'none'}`."
+    return "There is no score: no reference takes part."
 
 
 def _number(text: str) -> float | None:
@@ -231,7 +246,11 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
             names.setdefault(name, origin(one, name, kinds.get(name, "policy")))
     # Learned ones first: there are fewer colours than names.
     coloured = sorted(
-        (name for name, where in names.items() if where not in ("paper", "reference", "bound", "smoother")),
+        (
+            name
+            for name, where in names.items()
+            if where not in ("yours", "paper", "reference", "bound", "smoother")
+        ),
         key=lambda name: names[name] != "learned",
     )
     own = names if result.curves is None else map(str, result.curves["policy"].values.tolist())

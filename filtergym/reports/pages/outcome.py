@@ -8,9 +8,9 @@ from typing import NamedTuple
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import Record
 from ...evaluation.running.times import EQUAL_TIMES, times_of_records
-from ..tables.ranking import Place, ranking, rival_of
+from ..tables.ranking import find_record, ranking, rival_of
 from ..tables.results import Result
-from ..tables.terminal_tables import HEADLINE
+from ..tables.terminal_tables import HEADLINE, consistency_word
 
 HALF = (0.45, 0.55)
 """Share of the paper's cost that is called half of it."""
@@ -25,7 +25,55 @@ def outcome_sentences(results: Sequence[Result]) -> list[str]:
         results: of which those of training distributions are taken; where there is none, all.
     """
     usual = [result for result in results if result.default] or list(results)
-    return [sentence_of(result) for result in usual if ranking(result.records, result.learned)]
+    return [sentence_of(result) for result in usual if ranking(result.records)]
+
+
+def own_sentences(records: Sequence[Record], own: Sequence[str], paper: str) -> list[str]:
+    """Say of each of the user's own competitors what it costs against the paper's algorithm and the best of the others,
+    and whether its covariance is as large as its errors.
+
+    Args:
+        records: of one environment and scenario whose truth is known.
+        own: names of the user's.
+        paper: name of the paper's algorithm; it may be missing in the records.
+    """
+    return [
+        _own_sentence(records, name, paper) for name in own if find_record(records, name, "geometric_cost")
+    ]
+
+
+def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
+    against = find_record(records, name, HEADLINE)
+    behind = find_record(records, name, "behind_best")
+    compared = [] if against is None or against.value is None else [(against, paper)]
+    if behind is not None and behind.component not in (name, paper):
+        compared.append((behind, behind.component))
+    clauses = [_comparison(record, f"`{other}`", not i) for i, (record, other) in enumerate(compared)]
+    places = ranking(records)
+    if places and places[0].policy == name and len(places) > 1:
+        clauses.append(f"the lowest of all {len(places)}")
+    if not clauses:
+        cost = find_record(records, name, "cost")
+        clauses = [f"error cost {cost.value:.3g}, compared with none" if cost and cost.value else "no cost"]
+    nees = find_record(records, name, "anees", "state")
+    covariance = "states no covariance"
+    if nees is not None and nees.value is not None:
+        word = consistency_word(nees)
+        covariance = f"{'' if word == 'no interval' else f'{word}, '}ANEES {nees.value:.3g}"
+    return f"`{name}`: {', '.join(clauses)}; {covariance}."
+
+
+def _comparison(difference: Record, other: str, first: bool) -> str:
+    """Say by how much a cost is above or below another's, where the interval of their paired ratio leaves one out; the
+    first comparison of a sentence names what is compared.
+    """
+    value = difference.value or 0.0
+    if _low(difference) <= 0.0 <= _high(difference):
+        return f"level with {other}"
+    if value >= 1.0:
+        return f"{1.0 + value:.2g} times {'the error cost' if first else 'that'} of {other}"
+    what = " error cost" if first else ""
+    return f"{100.0 * abs(value):.1f} % {'more' if value > 0.0 else 'less'}{what} than {other}"
 
 
 def protocol_sentences(results: Sequence[Result]) -> list[str]:
@@ -54,18 +102,16 @@ def _any_default(results: Sequence[Result]) -> bool:
 
 def sentence_of(result: Result) -> str:
     """Return the sentence on one environment and scenario, in which somebody is ranked."""
-    places = ranking(result.records, result.learned)
-    best = places[0]
-    clauses = [_best_clause(result, best)]
-    learned_is_best = best.role == "learned"
-    rival = rival_of(places)
-    origin = "classical" if learned_is_best else "learned"
+    places = ranking(result.records)
+    first = _best_clause(result, places[0])
+    rival = rival_of(places, result.learned)
     if rival is None:
-        if result.learned or learned_is_best:
-            return f"{_subject(result)}: {clauses[0]}."
-        return f"{_subject(result)}: {clauses[0]}; no learned competitor takes part."
-    clause = f"the best {origin} one, `{rival.name}`, "
-    behind = rival.behind
+        if result.learned:
+            return f"{_subject(result)}: {first}."
+        return f"{_subject(result)}: {first}; no learned competitor takes part."
+    origin = "learned" if rival.policy in result.learned else "classical"
+    clause = f"the best {origin} one, `{rival.policy}`, "
+    behind = find_record(result.records, rival.policy, "behind_best")
     if behind is None or behind.value is None:
         clause += "costs more"
     elif behind.low is None or behind.high is None or behind.low <= 0.0:
@@ -75,30 +121,26 @@ def sentence_of(result: Result) -> str:
         clause += f"costs {times} times as much ({low} to {high} times)"
     else:
         clause += f"is {_percent(behind.value)} % behind it ({_range(behind.low, behind.high)})"
-    if (lead := find_lead(result.records, places, origin)) is not None:
+    if (lead := find_lead(result.records, result.learned, origin)) is not None:
         place = f"where a measurement may take {_times(lead)}"
-        if lead.name == rival.name:
+        if lead.name == rival.policy:
             clause += f", and leads {place}"
         else:
             clause += f"; {place}, the {origin} `{lead.name}` leads"
-    return f"{_subject(result)}: {clauses[0]}; {clause}."
+    return f"{_subject(result)}: {first}; {clause}."
 
 
 def _subject(result: Result) -> str:
     return result.short if result.default else f"{result.short}, scenario `{result.scenario}`"
 
 
-def _best_clause(result: Result, best: Place) -> str:
+def _best_clause(result: Result, best: Record) -> str:
     """Say who has the lowest error cost, and how much less than the paper's algorithm."""
-    if best.name == result.paper:
-        return f"the paper's `{best.name}` has the lowest error cost"
-    kinds = {record.policy: record.kind for record in result.records}
-    what = "learned" if best.role == "learned" else "classical"
-    name = f"the {what} {'filter' if kinds[best.name] == 'estimator' else 'policy'} `{best.name}`"
-    found = next(
-        (r for r in result.records if (r.policy, r.metric, r.window) == (best.name, HEADLINE, "all")),
-        None,
-    )
+    if best.policy == result.paper:
+        return f"the paper's `{best.policy}` has the lowest error cost"
+    what = "learned" if best.policy in result.learned else "classical"
+    name = f"the {what} {'filter' if best.kind == 'estimator' else 'policy'} `{best.policy}`"
+    found = find_record(result.records, best.policy, HEADLINE)
     if found is None or found.value is None or not result.paper:
         return f"{name} has the lowest error cost"
     paper = f"the paper's `{result.paper}`"
@@ -122,7 +164,7 @@ class Lead(NamedTuple):
     """Up to the time of the competitor that ends the lead."""
 
 
-def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -> Lead | None:
+def find_lead(records: Sequence[Record], learned: Sequence[str], origin: str) -> Lead | None:
     """Return where competitors of an origin lead in computing time, though another one has a lower cost.
 
     Someone leads where the interval of its cost against the paper's algorithm lies below that of the cheapest of the
@@ -131,7 +173,7 @@ def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -
 
     Args:
         records: of one environment and scenario.
-        places: of :func:`.ranking.ranking`.
+        learned: names of those that were learned.
         origin: "learned" or "classical", that of the best excluded.
 
     Returns:
@@ -143,18 +185,18 @@ def find_lead(records: Sequence[Record], places: Sequence[Place], origin: str) -
         for r in records
         if (r.metric, r.window) == (HEADLINE, "all") and r.kind in RANKED and r.value is not None
     }
-    known = [place for place in places if place.name in times and place.name in costs]
-    allowed = sorted({times[place.name] for place in known})
+    known = [place.policy for place in ranking(records) if place.policy in times and place.policy in costs]
+    allowed = sorted({times[name] for name in known})
     lead: Lead | None = None
     for first, last in itertools.pairwise([*allowed, math.inf]):
-        # Places are in the order of their cost.
+        # Names are in the order of their cost.
         mine, other = (
             next(
                 (
-                    place.name
-                    for place in known
-                    if ((place.role == "learned") == (origin == "learned")) is own
-                    and times[place.name] <= first * (1.0 if own else EQUAL_TIMES)
+                    name
+                    for name in known
+                    if ((name in learned) == (origin == "learned")) is own
+                    and times[name] <= first * (1.0 if own else EQUAL_TIMES)
                 ),
                 None,
             )

@@ -379,7 +379,7 @@ def parameter_text(
     if interval is None:
         return text
     low, high = parameter_size(key, interval.low), parameter_size(key, interval.high)
-    after = f" {unit}" if unit else ""
+    after = f" {unit}" if unit and " " not in unit else ""  # what a number means is said once
     flat = (interval.open_low and interval.open_high) or (
         key.startswith("log10_") and high > IDENTIFIABLE * low
     )

@@ -157,6 +157,7 @@ def result_of(
     evaluation: Evaluation,
     learned: Sequence[str],
     worst: Mapping[str, Sequence[WorstTrack]] | None = None,
+    own: Sequence[str] = (),
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
@@ -167,6 +168,7 @@ def result_of(
         learned: names that stand for something learned, those of competitors among them.
         worst: by the names of those whose cost is to be explained their worst episodes; default: the paper's algorithm,
             and none.
+        own: names of the user's own.
     """
     dataset, records, curves = evaluation.dataset, evaluation.records, evaluation.curves
     assert curves is not None
@@ -174,7 +176,7 @@ def result_of(
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
     worst = worst or {name: [] for name in [paper] if name in names}
-    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned), *worst]))
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned, own), *worst]))
     components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
@@ -194,6 +196,7 @@ def result_of(
         phrases_of(dataset),
         list(worst),
         [one for episodes in worst.values() for one in episodes],
+        list(own),
     )
 
 

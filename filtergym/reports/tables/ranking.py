@@ -1,8 +1,6 @@
 """Who is best in a scenario, of any control and kind, in words that follow from the records."""
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from ...evaluation.competitors.kinds import RANKED
 from ...evaluation.running.metrics import NEGLIGIBLE, Record
@@ -14,50 +12,47 @@ HARM = 0.02
 """Relative difference to the paper's algorithm beyond which, with its whole interval, a competitor does harm."""
 
 
-class Place(NamedTuple):
-    """A ranked competitor with what is said of it."""
+def find_record(
+    records: Sequence[Record], name: str, metric: str, component: str | None = None
+) -> Record | None:
+    """Return a competitor's record of a metric over all times; of any component unless one is named.
 
-    name: str
-    role: str
-    """"learned", "estimator" or "policy"."""
-    cost: float
-    behind: Record | None
-    """Relative difference of its cost to the best one's."""
-    chosen: float
-    """Share of resamples of the episodes that would call it the best; NaN where it is not known."""
+    Args:
+        records: of one environment and scenario.
+        name: of the competitor.
+        metric: that is wanted.
+        component: "state", or that of a state.
+    """
+    wanted = name, metric, "all"
+    found = (r for r in records if (r.policy, r.metric, r.window) == wanted)
+    return next((record for record in found if component in (None, record.component)), None)
 
 
-def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> list[Place]:
-    """Competitors of one environment and scenario that are ranked, lowest geometric mean of the cost first.
+def ranking(records: Sequence[Record]) -> list[Record]:
+    """Geometric mean of the cost of every ranked competitor of one environment and scenario, lowest first.
 
     Those that are as good as equal to the lowest stand in the order of the records, which is the catalogue's: a filter
     comes before what is made of it.
-
-    Args:
-        records: of the scenario.
-        learned: names of those that were learned; default: the environment's shipped agents.
     """
-    learned = learned_names(records[0].environment) if learned is None else learned
-    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    places = []
-    for name, kind in dict.fromkeys((r.policy, r.kind) for r in records if r.kind in RANKED):
-        record, share = found.get((name, "geometric_cost")), found.get((name, "best_share"))
-        if record is not None and record.value is not None:
-            role = "learned" if name in learned else kind
-            chosen = math.nan if share is None or share.value is None else share.value
-            places.append(Place(name, role, record.value, found.get((name, "behind_best")), chosen))
-    equal = (1.0 + NEGLIGIBLE) * min((place.cost for place in places), default=0.0)
-    return sorted(places, key=lambda place: max(place.cost, equal))
+    costs = [
+        (record.value, record)
+        for record in records
+        if (record.metric, record.window) == ("geometric_cost", "all") and record.kind in RANKED
+        if record.value is not None
+    ]
+    equal = (1.0 + NEGLIGIBLE) * min((cost for cost, _ in costs), default=0.0)
+    return [record for _, record in sorted(costs, key=lambda pair: max(pair[0], equal))]
 
 
-def rival_of(places: Sequence[Place]) -> Place | None:
+def rival_of(places: Sequence[Record], learned: Sequence[str]) -> Record | None:
     """Return the strongest competitor of another origin than the first, learned or classical; None where there is none.
 
     Args:
         places: of :func:`ranking`, one at least.
+        learned: names of those that were learned.
     """
-    was_learned = places[0].role == "learned"
-    return next((place for place in places if (place.role == "learned") != was_learned), None)
+    was_learned = places[0].policy in learned
+    return next((place for place in places if (place.policy in learned) != was_learned), None)
 
 
 def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
@@ -65,15 +60,20 @@ def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None)
 
     It rests on the paired ratio between the best one and the best of the other origin: where its interval holds one,
     nobody is called best.
+
+    Args:
+        records: of the scenario.
+        learned: names of those that were learned; default: the environment's shipped agents.
     """
-    places = ranking(records, learned)
+    places = ranking(records)
     if not places:
         return "nothing is ranked"
-    where = "learned" if places[0].role == "learned" else "classical"
-    rival = rival_of(places)
+    learned = learned_names(records[0].environment) if learned is None else learned
+    where = "learned" if places[0].policy in learned else "classical"
+    rival = rival_of(places, learned)
     if rival is None:
         return f"{where} only"
-    behind = rival.behind
+    behind = find_record(records, rival.policy, "behind_best")
     if behind is None or behind.low is None or behind.low <= 0.0:
         return "no significant difference"
     return f"{where} best"
@@ -85,36 +85,41 @@ def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[st
     Args:
         records: of the scenario.
         paper: name of the paper's algorithm.
-        learned: as of :func:`ranking`.
+        learned: as of :func:`who_is_best`.
     """
-    first = records[0]
-    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    places = ranking(records, learned)
+    places = ranking(records)
     if not places:
-        return f"On `{first.scenario}` nothing is ranked."
-    best, rival = places[0], rival_of(places)
-    difference = found.get((best.name, HEADLINE))
-    sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) has the lowest error cost"
-    if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
+        return f"On `{records[0].scenario}` nothing is ranked."
+    learned = learned_names(records[0].environment) if learned is None else learned
+    best, rival = places[0], rival_of(places, learned)
+    was_learned = best.policy in learned
+    difference = find_record(records, best.policy, HEADLINE)
+    role = "learned" if was_learned else best.kind
+    sentence = f"On `{best.scenario}` `{best.policy}` ({role}) has the lowest error cost"
+    if best.policy != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
         sentence += f", but not significantly less than `{paper}`"
-    elif best.name != paper and difference is not None and difference.value is not None:
+    elif best.policy != paper and difference is not None and difference.value is not None:
         sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
         means, lost = (
-            found.get((best.name, metric)) for metric in ("relative_cost_difference", "lost_tracks")
+            find_record(records, best.policy, metric)
+            for metric in ("relative_cost_difference", "lost_tracks")
         )
         if means is not None and means.value is not None:
             sentence += f" ({100.0 * means.value:+.1f} % of the means)"
         if lost is not None and lost.value:
             sentence += f", {with_interval(lost, 100.0, digits=2)} % of its tracks are lost"
-    if best.chosen < 1.0:
-        sentence += f". Other episodes of the kind would name another one in {_share(1.0 - best.chosen)}"
-    if rival is not None and rival.behind is not None:
-        origin = "classical competitor" if best.role == "learned" else "learned agent"
-        sentence += (
-            f". The strongest {origin}, `{rival.name}`{'' if rival.role == 'learned' else f' ({rival.role})'}, costs "
-            f"{with_interval(rival.behind, 100.0)} % more than it"
+    chosen = find_record(records, best.policy, "best_share")
+    if chosen is not None and chosen.value is not None and chosen.value < 1.0:
+        sentence += f". Other episodes of the kind would name another one in {_share(1.0 - chosen.value)}"
+    behind = None if rival is None else find_record(records, rival.policy, "behind_best")
+    if rival is not None and behind is not None:
+        named = (
+            f"classical competitor, `{rival.policy}` ({rival.kind}),"
+            if was_learned
+            else (f"learned agent, `{rival.policy}`,")
         )
-        if rival.behind.low is not None and rival.behind.low <= 0.0:
+        sentence += f". The strongest {named} costs {with_interval(behind, 100.0)} % more than it"
+        if behind.low is not None and behind.low <= 0.0:
             sentence += ", which is no significant difference"
     return sentence + "."
 
@@ -127,10 +132,12 @@ def _share(share: float) -> str:
 def origin(result: Result, name: str, kind: str) -> str:
     """Return where a competitor comes from.
 
-    "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator", filters of
-    its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", who knows the
-    truth; or "bound".
+    "yours"; "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator",
+    filters of its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", which
+    knows something of the truth; or "bound".
     """
+    if name in result.own:
+        return "yours"
     if name == result.paper:
         return "paper"
     if name in result.learned:
@@ -140,10 +147,9 @@ def origin(result: Result, name: str, kind: str) -> str:
 
 def best_of_origins(result: Result) -> list[tuple[str, str]]:
     """Return origin and name of the best of every origin: the ranked by their cost, then the reference."""
-    kinds = {record.policy: record.kind for record in result.records}
     best: dict[str, str] = {}
-    for place in ranking(result.records, result.learned):
-        best.setdefault(origin(result, place.name, kinds[place.name]), place.name)
+    for place in ranking(result.records):
+        best.setdefault(origin(result, place.policy, place.kind), place.policy)
     if result.reference:
         best["reference"] = result.reference
     return list(best.items())
@@ -157,7 +163,8 @@ def remarks(results: Sequence[Result]) -> list[str]:
     """
     sentences = []
     usual = [result for result in results if result.default] or list(results)
-    judged = [result for result in usual if ranking(result.records, result.learned)]
+    winners = [(result, ranking(result.records)[:1]) for result in usual]
+    judged = [(result, place.policy) for result, first in winners for place in first]
     harmful = [harm for result in results for harm in _harms(result)]
     agents = {(result.environment, name) for result in results for name in result.learned}
     if agents:
@@ -169,9 +176,9 @@ def remarks(results: Sequence[Result]) -> list[str]:
         )
     off = [
         f"`{name}` in {result.short} ({with_interval(nees)})"
-        for result in judged
-        for name in [ranking(result.records, result.learned)[0].name]
-        if (nees := _nees(result, name)) is not None and consistency_word(nees).endswith(INCONSISTENT_WORDS)
+        for result, name in judged
+        if (nees := find_record(result.records, name, "anees", "state")) is not None
+        if consistency_word(nees).endswith(INCONSISTENT_WORDS)
     ]
     if judged:
         sentences.append(
@@ -181,13 +188,6 @@ def remarks(results: Sequence[Result]) -> list[str]:
             f"that does not fit the errors (mean NEES over its dimension, which should be one): {', '.join(off)}."
         )
     return sentences
-
-
-def _nees(result: Result, name: str) -> Record | None:
-    for record in result.records:
-        if (record.policy, record.metric, record.component, record.window) == (name, "anees", "state", "all"):
-            return record
-    return None
 
 
 def _harms(result: Result) -> list[tuple[float, str]]:

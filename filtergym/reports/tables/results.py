@@ -101,6 +101,8 @@ class Result(NamedTuple):
     """Names of those whose cost was to be explained."""
     worst: list[WorstTrack] = []  # noqa: RUF012
     """Their worst episodes."""
+    own: list[str] = []  # noqa: RUF012
+    """Names of the user's own competitors, with which a report begins."""
 
     @property
     def short(self) -> str:
@@ -114,11 +116,11 @@ def settings_of(command: str) -> Settings:
 
 
 def select_competitors(
-    records: Sequence[Record], paper: str, reference: str, learned: Sequence[str]
+    records: Sequence[Record], paper: str, reference: str, learned: Sequence[str], own: Sequence[str] = ()
 ) -> list[str]:
     """Return at most ``MOST_SHOWN`` names whose curves tell most.
 
-    The paper's algorithm, the reference, the learned, the cheapest of each kind, a bound; then by cost.
+    The paper's algorithm, the reference, the user's own, the learned, the cheapest of each kind, a bound; then by cost.
     """
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("geometric_cost", "all")}
     kinds = {r.policy: r.kind for r in records}
@@ -131,7 +133,7 @@ def select_competitors(
     classical = [name for name in by_cost if name not in learned and name != paper]
     first = [name for kind in RANKED for name in [n for n in classical if kinds[n] == kind][:2]]
     bounds = [name for name in kinds if kinds[name] == "bound"]
-    wanted = [paper, reference, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
+    wanted = [paper, reference, *own, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
     return list(dict.fromkeys(name for name in wanted if name in kinds))[:MOST_SHOWN]
 
 

@@ -6,9 +6,9 @@ and ``filtergym benchmark``.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy
+import xarray
 from rich.table import Table
 
 from ...agents import validation
@@ -19,7 +19,7 @@ from ...envs.contract.model import Episode, Model
 from ...evaluation.competitors.kinds import RandomPolicy
 from ...evaluation.statistics.bootstrap import Bootstrap, IntervalEstimate
 from ...filters.gaussian import log_density
-from .terminal_tables import INCONSISTENT, consistency, plain_table, with_interval
+from .terminal_tables import INCONSISTENT, consistency, cost_title, plain_table, with_interval
 
 SCREENING_SECONDS = 1.5
 """Time for asking every classical competitor, on a few episodes, whether it may be the strongest."""
@@ -33,101 +33,95 @@ def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
     return {"cost": model.cost(episode), "anees": nees / len(model.task.components)}
 
 
-class Standing(NamedTuple):
-    """One line of the table."""
-
-    name: str
-    role: str
-    means: Mapping[str, numpy.ndarray]
-    """``cost`` and ``anees`` of every episode, ``(episodes,)``."""
-    beat_paper: Passed | None = None
-    """When an agent was first better than the paper's algorithm."""
-
-
-class Opponents:
-    """Who an agent is measured against, flown once on the episodes of a run's validations.
+def measure_standing(run: TrainingRun, agents: Mapping[str, Path], trust: bool = False) -> xarray.Dataset:
+    """Measure agents, and the competitors they are compared with, on the episodes of a run's validations.
 
     Args:
         run: whose environment, scenario and parameters they meet.
-    """
-
-    def __init__(self, run: TrainingRun) -> None:
-        self.problem = run.problem
-        known = self.problem.baselines
-        self.paper = known.score_paper
-        self.episodes = TrainingEpisodes(run, validation.VALIDATION_EPISODES, validation_backend(run))
-        self.found: list[Standing] = []
-        if self.paper:
-            self._fly(self.paper, "paper")
-        strongest = self._strongest(run)
-        if strongest:
-            self._fly(strongest, "strongest classical")
-        if known.score_reference in known.references:
-            self._fly(known.score_reference, "reference")
-
-    def _fly(self, name: str, role: str) -> None:
-        self.found.append(Standing(name, role, self.measure(self.problem.competitor(name))))
-
-    def measure(self, competitor: Any) -> dict[str, numpy.ndarray]:
-        """Return cost and normalised estimation error of every episode, ``(episodes,)``."""
-        return self.episodes.means(competitor, report=_cost_and_nees)
-
-    def _strongest(self, run: TrainingRun) -> str | None:
-        """Name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
-        known = self.problem.baselines
-        makers = {
-            name: self.problem.competitor(name)
-            for name in (*known.policies, *known.estimators, *self.problem.tuned_policies)
-        }
-        names = [n for n, maker in makers.items() if n != self.paper and maker is not RandomPolicy]
-        if not names:
-            return None
-        horizon = run.make_model().task.horizon
-        each = len(names) * len(self.episodes.weights) * horizon * known.measurement_seconds
-        few = max(FEWEST_SCREENED, int(SCREENING_SECONDS / each))
-        screened = {n: self.episodes.means(makers[n], episodes=few)["cost"].mean() for n in names}
-        finalists = sorted(names, key=screened.__getitem__)[:FINALISTS]
-        if few >= len(self.episodes.seeds):
-            return finalists[0]
-        return min(finalists, key=lambda name: self.episodes.costs(makers[name]).mean())
-
-
-def agent_standing(
-    run: TrainingRun, agent: Path, name: str, opponents: Opponents, trust: bool = False
-) -> Standing:
-    """Measure the best agent of a run.
-
-    Args:
-        run: its record.
-        agent: file of the agent.
-        name: of the agent.
-        opponents: whose episodes it meets.
+        agents: file of each, by name.
         trust: load a model, which can execute code.
 
+    Returns:
+        ``cost`` and ``anees``, normalised estimation error, of every episode, ``(policy, episode)``; ``role`` says what
+        each one is: "agent", "paper", "strongest classical" or "reference".
+
     Raises:
-        ValueError: if the agent cannot be read, or takes ``trust``.
+        ValueError: if an agent cannot be read, or takes ``trust``.
     """
-    competitor = find_learned_policy(run.problem.task, str(agent), trust)
-    return Standing(name, "agent", opponents.measure(competitor), run.beat_paper)
+    problem, known = run.problem, run.problem.baselines
+    episodes = TrainingEpisodes(run, validation.VALIDATION_EPISODES, validation_backend(run))
+    reference = known.score_reference if known.score_reference in known.references else None
+    opponents = {
+        "paper": known.score_paper,
+        "strongest classical": _strongest(run, episodes),
+        "reference": reference,
+    }
+    roles = dict.fromkeys(agents, "agent") | {name: role for role, name in opponents.items() if name}
+    means = [
+        episodes.means(
+            find_learned_policy(problem.task, str(agents[name]), trust)
+            if name in agents
+            else problem.competitor(name),
+            report=_cost_and_nees,
+        )
+        for name in roles
+    ]
+    variables = {
+        metric: (("policy", "episode"), numpy.stack([own[metric] for own in means]))
+        for metric in ("cost", "anees")
+    }
+    coords = {"policy": list(roles), "role": ("policy", list(roles.values()))}
+    return xarray.Dataset(variables, coords, {"environment": problem.id, "scenario": run.scenario})
 
 
-def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) -> Table:
-    """Compare agents with their opponents: cost, its difference to the paper's algorithm, consistency."""
-    lines = [*agents, *opponents.found]
-    episodes = len(lines[0].means["cost"])
-    bootstrap = Bootstrap(episodes)
+def _strongest(run: TrainingRun, episodes: TrainingEpisodes) -> str | None:
+    """Name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
+    problem, known = run.problem, run.problem.baselines
+    makers = {
+        name: problem.competitor(name)
+        for name in (*known.policies, *known.estimators, *problem.tuned_policies)
+    }
+    names = [n for n, maker in makers.items() if n != known.score_paper and maker is not RandomPolicy]
+    if not names:
+        return None
+    horizon = run.make_model().task.horizon
+    each = len(names) * len(episodes.weights) * horizon * known.measurement_seconds
+    few = max(FEWEST_SCREENED, int(SCREENING_SECONDS / each))
+    screened = {n: episodes.means(makers[n], episodes=few)["cost"].mean() for n in names}
+    finalists = sorted(names, key=screened.__getitem__)[:FINALISTS]
+    if few >= len(episodes.seeds):
+        return finalists[0]
+    return min(finalists, key=lambda name: episodes.costs(makers[name]).mean())
+
+
+def standing_table(standing: xarray.Dataset, passed: Mapping[str, Passed | None]) -> Table:
+    """Compare agents with their opponents: cost, its difference to the paper's algorithm, consistency.
+
+    Args:
+        standing: of :func:`measure_standing`.
+        passed: when each agent was first better than the paper's algorithm, by name.
+    """
+    bootstrap = Bootstrap(standing.sizes["episode"])
     table = plain_table(
-        f"{opponents.problem.id}, scenario {scenario} ({episodes} episodes of the validation split; 95 % intervals)"
+        f"{standing.environment}, scenario {standing.scenario} ({standing.sizes['episode']} episodes of the validation "
+        "split; 95 % intervals)"
     )
+    papers = standing["policy"].values[standing["role"].values == "paper"].tolist()
     table.add_column("name", no_wrap=True)
     table.add_column("")
-    for title in ("cost", "cost vs paper, %", "means,\n%", "ANEES", "beat paper\nafter steps"):
+    for title in (
+        "cost",
+        cost_title("".join(papers)),
+        "means,\n%",
+        "ANEES",
+        f"beat {''.join(papers) or 'paper'}\nafter steps",
+    ):
         table.add_column(title, justify="right", no_wrap=True)
-    paper = next((line.means["cost"] for line in lines if line.role == "paper"), None)
-    for line in lines:
-        own = line.means["cost"]
-        row = [line.name, line.role.replace(" ", "\n"), f"{own.mean():.4g}"]
-        if paper is None or line.role == "paper":
+    paper = standing["cost"].sel(policy=papers[0]).values if papers else None
+    for name, role in zip(standing["policy"].values.tolist(), standing["role"].values.tolist(), strict=True):
+        own = standing["cost"].sel(policy=name).values
+        row = [name, role.replace(" ", "\n"), f"{own.mean():.4g}"]
+        if paper is None or role == "paper":
             row += ["-", "-"]
         else:
             difference = bootstrap.geometric_difference(own, paper)
@@ -135,12 +129,12 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
                 with_interval(difference, 100.0, negligible=0.005),
                 f"{100.0 * (own.mean() / paper.mean() - 1.0):+.1f}",
             ]
-        row.append(consistency(IntervalEstimate(float(line.means["anees"].mean()), 0.0, 0.0)))
-        passed = line.beat_paper
-        row.append("-" if passed is None else f"{passed['steps']:,}\n({passed['seconds']:.1f} s)")
+        row.append(consistency(IntervalEstimate(float(standing["anees"].sel(policy=name).mean()), 0.0, 0.0)))
+        first = passed.get(name)
+        row.append("-" if first is None else f"{first['steps']:,}\n({first['seconds']:.1f} s)")
         table.add_row(*row)
     table.caption = (
-        "cost vs paper is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
+        "cost vs is the geometric mean of the ratios of the episodes' costs, means the ratio of the mean costs. "
         f"ANEES is 1 if errors are as large as the covariance says; {INCONSISTENT} marks one that is off by more than "
         "a factor of two. Agents were chosen on these episodes."
     )

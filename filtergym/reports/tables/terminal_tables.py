@@ -129,7 +129,14 @@ def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
     return sorted(found, key=place)
 
 
-def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int) -> list[Table]:
+def cost_title(paper: str) -> str:
+    """Title of the column of costs against the paper's algorithm of this name; a long name has a line of its own."""
+    return f"cost vs{' ' if len(paper) < 10 else chr(10)}{paper or 'paper'}, %"
+
+
+def results_tables(
+    records: Sequence[Any], knows: Mapping[str, str], width: int, paper: str = ""
+) -> list[Table]:
     """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
 
     Args:
@@ -137,11 +144,12 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         knows: what references and bounds know, by their names.
         width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
             own, so that no number is cut.
+        paper: name of the paper's algorithm that costs are compared with.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     names = rank_competitors(records)
-    costs, notes = _cost_columns(records, found)
+    costs, notes = _cost_columns(records, found, paper)
     exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
     fitting = [
         ([competitors_table(names, {**costs, **exact}, True)], []),
@@ -178,10 +186,12 @@ MEAN_COST_NOTE = "cost is the mean cost of a measurement."
 RMSE_NOTE = "A wider terminal shows the intervals of the RMSE, too."
 
 
-def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dict[str, Any], list[str]]:
+def _cost_columns(
+    records: Sequence[Any], found: Mapping[Any, Any], paper: str
+) -> tuple[dict[str, Any], list[str]]:
     """Columns on cost, consistency and time, and the sentences that explain them."""
     columns: dict[str, Callable[[str], str]] = {
-        "cost vs paper, %": lambda name: with_interval(
+        cost_title(paper): lambda name: with_interval(
             found.get((name, HEADLINE, "", "all")), 100.0, negligible=0.005
         ),
         "cost": lambda name: with_interval(found.get((name, "cost", "", "all"))),
@@ -190,7 +200,7 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
     }
     compared = any(r.metric == HEADLINE and r.value is not None for r in records)
-    for title in ["cost"] if compared else ["cost vs paper, %", "means,\n%"]:
+    for title in ["cost"] if compared else [cost_title(paper), "means,\n%"]:
         del columns[title]
     notes = [
         f"{COST_NOTE if compared else MEAN_COST_NOTE} ANEES is 1 if errors are as large as the covariance says; "
@@ -202,7 +212,7 @@ def _cost_columns(records: Sequence[Any], found: Mapping[Any, Any]) -> tuple[dic
     if any(r.metric == "score" and r.value is not None for r in records):
         columns["score"] = lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0]
         notes.append(
-            "score is 0 for the paper's algorithm and 1 for the reference that it is measured against."
+            f"score is 0 for {paper or 'the paper'} and 1 for the reference that it is measured against."
         )
     if times := column_of_times(records):
         columns[TIME_TITLE] = lambda name: times.get(name, "-")

@@ -1,6 +1,7 @@
 // What all pages share: data packed in the page, how figures look, and light or dark. Whatever the data name is text:
 // `plain` keeps Plotly from reading marks in it.
   const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]; // Okabe and Ito
+  const OWN = "#9B5DE5"; // of what the user brings
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const words = (text) => plain(text).replace(/_/g, " ");
   const root = document.documentElement;

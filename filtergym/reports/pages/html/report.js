@@ -26,14 +26,15 @@
 
   function look(line) {
     const style = { color: css("--soft"), width: 1, dash: "solid" };
-    if (line.origin === "paper") Object.assign(style, { color: css("--fg"), width: 2 });
+    if (line.origin === "yours") Object.assign(style, { color: OWN, width: 2.6 });
+    else if (line.origin === "paper") Object.assign(style, { color: css("--fg"), width: 2 });
     else if (line.origin === "reference") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dash" });
     else if (line.origin === "bound") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dot" });
     else if (line.origin === "smoother") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dashdot" });
     else if (line.colour !== null && line.colour < COLOURS.length) Object.assign(style, { color: COLOURS[line.colour], width: line.origin === "learned" ? 2.6 : 1.6 });
     return style;
   }
-  const isGrey = (line) => !["paper", "reference", "bound", "smoother"].includes(line.origin) && !(line.colour < COLOURS.length);
+  const isGrey = (line) => !["yours", "paper", "reference", "bound", "smoother"].includes(line.origin) && !(line.colour < COLOURS.length);
   const faint = (colour) => {
     const [r, g, b] = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
     return `rgba(${r},${g},${b},0.16)`;
@@ -157,6 +158,9 @@
     },
   };
 
+  // Who costs more than an axis shows.
+  const over = (end, names) => `over +${Math.round(end)} %: ${names.slice(0, 3).join(", ")}${names.length > 3 ? ` and ${names.length - 3} more` : ""}`;
+
   function dotted(rows, lines, paper) {
     // One row: a line for each competitor; several: a line for each scenario, competitors beside each other.
     const single = lines === null;
@@ -171,18 +175,17 @@
         y.push(single ? plain(line.name) : row + 0.8 * ((i + 0.5) / entries.length - 0.5));
         text.push(`${value.toFixed(1)} [${from.toFixed(1)}, ${to.toFixed(1)}] %${single ? "" : ", " + plain(scenario)}`);
       });
-      const style = look(single && line.origin !== "paper" && line.origin !== "reference" ? { ...line, colour: line.origin === "learned" ? 0 : line.origin === "estimator" ? 2 : 1 } : line);
+      const style = look(single && !["yours", "paper", "reference"].includes(line.origin) ? { ...line, colour: line.origin === "learned" ? 0 : line.origin === "estimator" ? 2 : 1 } : line);
       return { x, y, text, mode: "markers", name: plain(line.name), showlegend: !single, hovertemplate: "%{text}<extra>" + plain(line.name) + "</extra>",
-        marker: { color: style.color, size: single ? 8 : 7, symbol: { learned: "diamond", reference: "square-open", estimator: "triangle-up" }[line.origin] || "circle" },
+        marker: { color: style.color, size: single ? 8 : 7, symbol: { learned: "diamond", reference: "square-open", estimator: "triangle-up", yours: "cross" }[line.origin] || "circle" },
         error_x: { type: "data", symmetric: false, array: high, arrayminus: low, color: style.color, thickness: 1.2, width: 0 } };
     });
     // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
-    const values = drawn.flatMap((trace) => trace.x);
     const ends = drawn.flatMap(({ x, error_x }) => x.flatMap((value, i) => [value - error_x.arrayminus[i], value + error_x.array[i]]));
     const range = [Math.max(-100, Math.min(...ends, 0) * 1.05 - 3), Math.min(200, Math.max(...ends, 5) * 1.05 + 3)];
-    const beyond = values.filter((x) => x > range[1]).length;
+    const beyond = drawn.filter(({ x }) => x.some((value) => value > range[1])).map(({ name }) => name);
     const narrow = window.innerWidth < 640;
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} beyond the right edge)` : "");
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond.length ? `<br>(${over(range[1], beyond)})` : "");
     const yaxis = single
       ? { automargin: true, categoryorder: "array", categoryarray: entries.map((line) => plain(line.name)).reverse(), tickfont: { size: narrow ? 9 : 11 }, dtick: 1 }
       : { tickvals: rows.map((_, i) => i), ticktext: rows.map(([scenario, role]) => `${plain(scenario)}<br><i>${plain(role)}</i>`), range: [rows.length - 0.5, -0.5], zeroline: false, tickfont: { size: narrow ? 9 : 11 } };
@@ -197,24 +200,26 @@
   function frontOf(points, paper) {
     const ranked = points.filter(([, origin]) => origin !== "reference"), reference = points.find(([, origin]) => origin === "reference");
     // Beyond twice the paper's cost is nobody on the front.
-    const top = Math.min(100, Math.max(5, ...ranked.map(([, , , cost]) => cost))), shown = ranked.filter(([, , , cost]) => cost <= top);
+    const most = Math.min(100, Math.max(5, ...ranked.map(([, , , cost]) => cost)));
+    const top = Math.max(most, ...ranked.filter(([, origin]) => origin === "yours").map(([, , , cost]) => cost)), shown = ranked.filter(([, , , cost]) => cost <= top);
     const steps = shown.filter(([, , , , , on]) => on).sort((a, b) => a[2] - b[2]), times = shown.map(([, , time]) => time);
     const right = Math.max(...times) * 1.6, left = Math.min(...times) / 1.3;
     const drawn = [{ x: [...steps.map((p) => p[2]), right], y: [...steps.map((p) => p[3]), (steps[steps.length - 1] || [0, 0, 0, 0])[3]], mode: "lines", name: "the front", line: { shape: "hv", color: css("--fg"), width: 1.4 }, hoverinfo: "skip" }];
-    for (const kind of ["paper", "classical", "estimator", "learned"]) {
+    for (const kind of ["paper", "classical", "estimator", "learned", "yours"]) {
       const own = shown.filter(([, origin]) => origin === kind);
       if (!own.length) continue;
       const color = look({ origin: kind, colour: { learned: 0, classical: 1, estimator: 2 }[kind] ?? null }).color;
       drawn.push({ x: own.map((p) => p[2]), y: own.map((p) => p[3]), name: kind, mode: "markers+text", cliponaxis: false,
-        text: own.map(([name, , , , , on]) => on ? plain(name) : ""), textposition: "bottom left", textfont: { size: 10 },
+        text: own.map(([name, , , , , on]) => on || kind === "yours" ? plain(name) : ""), textposition: own.map(([, , time]) => time < Math.sqrt(left * right) ? "bottom right" : "bottom left"), textfont: { size: 10 },
         customdata: own.map(([name, , , , compiled]) => plain(name) + (compiled ? "" : ", asked in Python")),
         hovertemplate: "%{y:.1f} %, %{x:.3g} ns<extra>%{customdata}</extra>",
-        marker: { color, size: 8, line: { color, width: 1.2 }, symbol: own.map(([, , , , compiled]) => ({ paper: "star", learned: "diamond", estimator: "square" }[kind] || "circle") + (compiled ? "" : "-open")) } });
+        marker: { color, size: 8, line: { color, width: 1.2 }, symbol: own.map(([, , , , compiled]) => ({ paper: "star", learned: "diamond", estimator: "square", yours: "cross" }[kind] || "circle") + (compiled ? "" : "-open")) } });
     }
     if (reference) drawn.push({ x: [left, right], y: [reference[3], reference[3]], mode: "lines", name: plain(reference[0]), line: { color: css("--fg"), width: 1.4, dash: "dash" }, hovertemplate: `%{y:.1f} %, ${reference[2].toPrecision(2)} ns<extra>${plain(reference[0])}</extra>` });
-    const beyond = ranked.length - shown.length, low = Math.min(...drawn.flatMap(({ y }) => y));
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} beyond the top)` : "");
-    return [drawn, layout({ xaxis: { title: { text: "nanoseconds a measurement" }, ...logarithmic, range: [left, right].map(Math.log10) }, yaxis: { title: { text: title }, range: [low - 0.08 * (top - low), top + 0.05 * (top - low)] } })];
+    const beyond = ranked.filter((point) => !shown.includes(point)).map(([name]) => plain(name)), low = Math.min(...drawn.flatMap(({ y }) => y));
+    const title = `cost against ${plain(paper || "the paper")}, %`;
+    const annotations = beyond.length ? [{ xref: "paper", yref: "paper", x: 1, y: 1, xanchor: "right", yanchor: "top", showarrow: false, text: over(top, beyond) }] : [];
+    return [drawn, layout({ annotations, xaxis: { title: { text: "nanoseconds a measurement" }, ...logarithmic, range: [left, right].map(Math.log10) }, yaxis: { title: { text: title }, range: [low - 0.08 * (top - low), top + 0.05 * (top - low)] } })];
   }
 
   // --- a track with a slider
@@ -287,6 +292,7 @@
         const around = ellipse(x[n], y[n], u * u, r * u * v, v * v), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
         const errors = x.map((u, i) => Math.hypot(u, y[i])).filter(Number.isFinite).sort((a, b) => a - b);
         reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.max(u, v) / 1.5);
+        if (line === first) reach = Math.max(reach, Math.hypot(x[n], y[n])); // the one that the picture is about stays inside
         close.push(path(x.slice(Math.max(0, n - 12), n + 1), y.slice(Math.max(0, n - 12), n + 1), { line: { ...style, width: 1 }, opacity: 0.5, hoverinfo: "skip", ...group }),
           path(around.x, around.y, { line: style, hoverinfo: "skip", ...group }),
           { x: [x[n]], y: [y[n]], mode: "markers", marker: { color: style.color, size: 8 }, ...group });
@@ -312,7 +318,8 @@
       const everything = shown.map((line) => state(line, i));
       Plotly.react(left, values, layout({ xaxis: axis, yaxis: { title: { text: `${words(components[i])}, ${unit}` }, range: extent([...everything, seen(i)]) } }), config);
       const sizes = shown.flatMap((line) => minus(state(line, i), truth(line, i))).filter((x) => x !== null).map(Math.abs).sort((a, b) => a - b);
-      const reach = 1.2 * (sizes[Math.floor(0.98 * (sizes.length - 1))] || 1);
+      const own = minus(state(shown[0], i), truth(shown[0], i)).filter((x) => x !== null).map(Math.abs);
+      const reach = 1.2 * Math.max(sizes[Math.floor(0.98 * (sizes.length - 1))] || 1, ...own);
       Plotly.react(right, errors, layout({ xaxis: axis, yaxis: { title: { text: `error of ${words(components[i])}, ${unit}; dotted: two sigma` }, range: [-reach, reach] } }), config);
     }
 
@@ -393,6 +400,10 @@
   if (start) start.open = true;
   const linked = location.hash && document.getElementById(location.hash.slice(1));
   if (linked && linked.matches("details.cell")) linked.open = true;
+
+  // A table that is wider than its place says so.
+  const places = new ResizeObserver((seen) => seen.forEach(({ target }) => target.classList.toggle("scrolls", target.scrollWidth > target.clientWidth + 1)));
+  for (const place of document.querySelectorAll(".table")) places.observe(place);
 
   for (const table of document.querySelectorAll("table.sortable")) {
     table.tHead.addEventListener("click", (event) => {
