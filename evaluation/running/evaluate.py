@@ -28,7 +28,7 @@ from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .kept import DRAWN_PREFIX, Kept, limits
-from .named_axes import recording_coords, with_named_axes
+from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
@@ -209,13 +209,10 @@ def run_experiment(
     if not workers.alone:
         check_sendable(experiment.task, competitors)
     sizes = [len(piece.seeds) * piece.horizon for piece in pieces]
-    chunks = workers.results(run_piece, pieces, sizes, progress)
-    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
-    count = len(chunks) // len(competitors)
-    for i, name in enumerate(competitors):
-        per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
-        chunks[i * count : (i + 1) * count] = [None] * count
-    dataset = plan.dataset(per_policy, plan.seeds)
+    kept = plan.arrays(len(plan.seeds), experiment.drawn_episodes)
+    for i, found in workers.run(run_piece, pieces, sizes, progress):
+        kept.write(pieces[i].name, pieces[i].part, found)
+    dataset = plan.dataset(kept, plan.seeds)
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
     return dataset
@@ -235,6 +232,11 @@ class Piece(NamedTuple):
     horizon: int
     model: Model | None
     """That was made already, in this process."""
+
+    @property
+    def part(self) -> slice:
+        """Which episodes of the evaluation they are."""
+        return slice(self.first, self.first + len(self.seeds))
 
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
@@ -296,16 +298,6 @@ def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
         )
 
 
-def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
-    """Join what was kept of episodes; the chunks are emptied on the way, so that little is held twice."""
-    if len(chunks) == 1:
-        return chunks[0]
-    return {
-        key: numpy.concatenate([chunk.pop(key) for chunk in chunks if key in chunk])
-        for key in list(chunks[0])
-    }
-
-
 class Plan(NamedTuple):
     """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
 
@@ -340,25 +332,24 @@ class Plan(NamedTuple):
         """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
         return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
-    def dataset(
-        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
-    ) -> "xarray.Dataset":
-        """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
-        experiment = self.experiment
-        dataset = with_named_axes(
-            per_policy, self.kinds, self.controls, self.models, self.scenario.windows, seeds
-        )
-        if self.flown is not None and self.lengths is not None:
-            import xarray
+    def arrays(self, episodes: int, drawn: int) -> StackedArrays:
+        """Return room for what is kept of so many episodes of every competitor; arguments as it has them."""
+        acting = [
+            name
+            for name, model in self.models.items()
+            if self.kinds[name] == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
+        ]
+        return StackedArrays(self.models, acting, episodes, drawn)
 
-            beyond = dataset["time"].values <= self.lengths[:, None]
-            there = xarray.DataArray(beyond, dims=("episode", "time"))
-            of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
-            present = {
-                name: values.where(of_drawn if "drawn_episode" in values.dims else there)
-                for name, values in dataset.data_vars.items()
-            }
-            dataset = dataset.assign(present).assign_coords(
+    def dataset(self, kept: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
+        """Return what was kept of some competitors or episodes as an evaluation."""
+        experiment = self.experiment
+        dataset = with_named_axes(kept, self.kinds, self.models, self.scenario.windows, seeds)
+        if self.flown is not None and self.lengths is not None:
+            beyond = dataset["time"].values > self.lengths[:, None]
+            for values in dataset.data_vars.values() if beyond.any() else ():
+                values.values[:, beyond[: values.shape[1]]] = numpy.nan
+            dataset = dataset.assign_coords(
                 flight=("episode", [self.scenario.flights[i] for i in self.flown]),
                 length=("episode", self.lengths),
             )

@@ -184,7 +184,10 @@ def reduce_episodes(
     def part(first: int) -> Part:
         """Run a block of episodes and reduce it; nothing of what was measured in it outlives the call."""
         piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
-        run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds).isel(policy=0)
+        count = len(piece.seeds)
+        kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
+        kept.write(asked.name, slice(count), run_piece(piece, tick))
+        run = plan.dataset(kept, piece.seeds).isel(policy=0)
         return Part(reduce_run(run, declare, bootstrap, first), _head(run))
 
     parts = (part(first) for first in range(asked.first, asked.end, block))
