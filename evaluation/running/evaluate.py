@@ -309,6 +309,9 @@ class Plan(NamedTuple):
     models: dict[str, Model]
     scenario: Scenario
     seeds: list[int]
+    """Of the episodes that are planned."""
+    first: int
+    """Number of the first of them."""
     flown: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
@@ -322,7 +325,7 @@ class Plan(NamedTuple):
             self.competitors[name],
             self.kinds[name],
             self.controls[name],
-            self.seeds[first : first + count],
+            self.seeds[first - self.first : first - self.first + count],
             first,
             model.task.horizon,
             model if here else None,
@@ -375,8 +378,17 @@ class Plan(NamedTuple):
         )
 
 
-def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
-    """Return the plan of an evaluation; refusals as of :func:`run_experiment`."""
+def plan_of(
+    experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
+) -> Plan:
+    """Return the plan of an evaluation; refusals as of :func:`run_experiment`.
+
+    Args:
+        experiment: which episodes, and how.
+        competitors: by name.
+        first: number of the first episode that is planned; flights and recordings have the plan of all.
+        end: number after that of the last one; None: all that follow.
+    """
     cls = experiment.task
     experiment = replace(
         experiment,
@@ -391,7 +403,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         raise nearest("control", control, cls.controls)
     if not competitors:
         raise ValueError("name at least one policy")
-    seeds = episode_seeds(split, seed, episodes)
+    seeds = episode_seeds(split, seed, (episodes if end is None else end) - first, first)
     kinds: dict[str, Kind] = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
     models: dict[str, Model] = {}
@@ -403,26 +415,27 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         check_observation(model, competitors[name], name)
         if kinds[name] == "smoother":
             check_open_loop(model, f"smoother {name!r}")
-    first = next(iter(models.values()))
+    model = next(iter(models.values()))
     if chosen.recording is not None:
         _check_truth_available(kinds, chosen.name)
-        episodes = len(first.task.flights)  # nothing is random: each once
+        episodes = len(model.task.flights)  # nothing is random: each once
     flown, lengths = None, None
-    if first.task.flights:
-        seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
+    if model.task.flights:
+        seeds, flown, lengths = _flights_in_turn(model, split, seed, episodes)
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    if chosen.recording is None or flown is None:
-        tracks = {seed: str(i) for i, seed in enumerate(seeds)}
-    else:
-        tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}
     competitors = dict(competitors)
     for name, one in competitors.items():
         if hasattr(one, "of_tracks"):
             check_open_loop(models[name], repr(name))
-            competitors[name] = one.of_tracks(models[name].on_numpy().task, tracks)
-    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
+            named = map(str, range(first, first + len(seeds)))
+            if chosen.recording is not None and flown is not None:
+                named = (chosen.flights[i] for i in flown)
+            competitors[name] = one.of_tracks(
+                models[name].on_numpy().task, dict(zip(seeds, named, strict=True))
+            )
+    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, first, flown, lengths)
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:

@@ -316,17 +316,11 @@ class _Against:
     ) -> None:
         self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
         self.paper, self.reference, self.bootstrap = attrs["paper"], attrs["reference"], bootstrap
-        against = self.costs.get(self.paper)
-        with numpy.errstate(divide="ignore", invalid="ignore"):
-            self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
-            logs = [numpy.log(own) for own in self.costs.values()]
         self.bound = attrs.get("lost_cost", 0.0)
-        lost = [own > self.bound for own in self.costs.values()]
-        columns = [*self.costs.values(), *logs, *lost, *map(_wins, self.ratios.values())]
-        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else numpy.empty((0, 0))
-        parts = [means[i * len(logs) : (i + 1) * len(logs)] for i in range(4)]
+        means = bootstrap.means_of(self._columns) if self.costs else numpy.empty((1, 0))
+        parts = numpy.split(means.T, 4 if self._compared else 3)
         self.means, self.logs, self.lost = (dict(zip(self.costs, part, strict=True)) for part in parts[:3])
-        self.wins = dict(zip(self.ratios, parts[3], strict=True))
+        self.wins = dict(zip(self.costs, parts[3], strict=True)) if self._compared else {}
         self.ranked = [c.name for c in contenders if c.kind in RANKED and c.costs is not None]
         self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
         # Of equals the first, and so where none is a number, as of flights in which nobody was measured.
@@ -334,6 +328,22 @@ class _Against:
         places = numpy.argmax(own_logs <= own_logs.min(axis=0) + NEGLIGIBLE, axis=0) if self.ranked else []
         self.best = self.ranked[places[0]] if self.ranked else ""
         self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
+
+    @property
+    def _compared(self) -> bool:
+        """Whether there is the paper's algorithm to compare with."""
+        return self.paper in self.costs
+
+    def _columns(self, part: slice) -> numpy.ndarray:
+        """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
+        logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
+        """
+        costs = [own[part] for own in self.costs.values()]
+        with numpy.errstate(divide="ignore", invalid="ignore"):
+            columns = [*costs, *map(numpy.log, costs), *(own > self.bound for own in costs)]
+        if self._compared:
+            columns += [_wins(_divide(own, self.costs[self.paper][part])) for own in costs]
+        return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
         """Paired ratio of the cost to the best one's, less one, and how often other episodes would name this one."""
@@ -363,14 +373,15 @@ class _Against:
 
     def others(self, name: str) -> Iterator[Measure]:
         """Score and paired difference to the paper's algorithm, where there is what they need."""
-        if name not in self.ratios:
+        if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
+        ratios = _divide(self.costs[name], self.costs[self.paper])
         found = {
             "geometric_cost_difference": self._difference(name, self.paper),
             "cost_difference": bootstrap.interval(cost - paper),
             "relative_cost_difference": bootstrap.relative_difference(cost, paper),
-            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
+            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(ratios)),
             "win_rate": bootstrap.interval(self.wins[name]),
         }
         # A share of the room that a causal competitor has says nothing of one that uses later measurements.
@@ -404,6 +415,12 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
         size = stretch_interval(there, values, lambda means: numpy.sqrt(ratio(means)))
         yield Measure("prediction_error", group, "all", size, str(run["measured_unit"].values[chosen[0]]))
         yield Measure("innovation_correlation", group, "all", correlation(innovation, there), "1")
+
+
+def _divide(costs: numpy.ndarray, others: numpy.ndarray) -> numpy.ndarray:
+    """Ratio of two costs of every episode, ``(episodes,)``."""
+    with numpy.errstate(divide="ignore", invalid="ignore"):
+        return costs / others
 
 
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:

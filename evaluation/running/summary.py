@@ -175,7 +175,7 @@ def reduce_episodes(
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
-    plan = plan_of(asked.experiment, {asked.name: asked.maker})
+    plan = plan_of(asked.experiment, {asked.name: asked.maker}, asked.first, asked.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)

@@ -143,6 +143,7 @@ class Bootstrap:
 
     def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
         """Sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``; exact."""
+        numbers = numbers.astype(float)
         parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
         return numpy.concatenate([part.astype(float) @ numbers for part in parts])
 
@@ -202,7 +203,11 @@ class Bootstrap:
         Returns:
             ``(1 + resamples, ...)``; the first row is the data's own.
         """
-        parts = (self.sums([values[i : i + BLOCK]], i)[0] for i in range(0, len(values), BLOCK))
+        return self.means_of(lambda part: values[part])
+
+    def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
+        """Means as of :meth:`means`, of values that are made for some episodes at a time."""
+        parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
@@ -225,9 +230,9 @@ class Bootstrap:
         ordered, owners = values[order], self._resampled(order)
         # The segment first in which the quantile is, then its place there.
         length = -(-len(order) // SEGMENTS)
-        numbers = numpy.zeros((self._counts.shape[1], SEGMENTS), dtype=numpy.int64)
-        numpy.add.at(numbers, (owners, numpy.arange(len(order)) // length), 1)
-        sums = numpy.cumsum(self._weigh(numbers), axis=1)
+        cells = owners * SEGMENTS + numpy.arange(len(order)) // length
+        numbers = numpy.bincount(cells, minlength=self._counts.shape[1] * SEGMENTS)
+        sums = numpy.cumsum(self._weigh(numbers.reshape(-1, SEGMENTS)), axis=1)
         # Rounding must not move a share that is met exactly.
         needed = share * sums[:, -1:] * (1.0 - 1e-9)
         segment = (sums >= needed).argmax(axis=1)
