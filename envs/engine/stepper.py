@@ -72,6 +72,8 @@ class Stepper:
         handed_on = [ahead_of_filter + i in update.same for i in range(states)]
         stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)]
         stays = stays[self._shared :]
+        self._policy_memory: list[numpy.ndarray] = []
+        """After the last :meth:`run`; none before the first one of an episode."""
         self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
         self._going: list[numpy.ndarray] = []
         """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
@@ -153,6 +155,7 @@ class Stepper:
             normals: of the start of the track, ``(initial_normals, width)``.
             noise: of the measurements.
         """
+        self._policy_memory = []
         for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
             memory[...] = values
         for call in self._begin[self._now]:
@@ -254,8 +257,8 @@ class Stepper:
         Args:
             noise: of the measurements.
             steps: how many.
-            compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros, to
-                an action and the memory. None: the action stays as it is.
+            compiled_policy: function of what is shown, read lane by lane, and of a memory that begins with zeros in
+                each episode, to an action and the memory. None: the action stays as it is.
 
         Returns:
             The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
@@ -264,7 +267,8 @@ class Stepper:
         if self._given:
             self._show_in(self._shown.copy())
         reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
-        actions, memories = None, [self._blank_memory(compiled_policy), self._blank_memory(compiled_policy)]
+        blank = self._blank_memory(compiled_policy)
+        actions, memories = None, [self._policy_memory or blank, self._blank_memory(compiled_policy)]
         if compiled_policy is not None:
             actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
         draw = noise.call_of_each()
@@ -283,6 +287,7 @@ class Stepper:
                 memories.reverse()
         CallSequence(turns[0], turns[1], moving).run(steps, self.width, self._threads)
         self._now = (self._now + steps) % 2
+        self._policy_memory = memories[steps % 2]
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)

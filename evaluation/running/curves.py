@@ -17,7 +17,7 @@ from ..statistics.bootstrap import block_of, percentile_interval, ratio
 from ..statistics.statistic import ALL, Key, Statistic, reduce_run
 from ..storage.dataset import groups_of, windows_of, with_windows
 from .metrics import (
-    bootstrap_of,
+    bootstrap_of_episodes,
     chi_square_band,
     components_and_groups,
     consistency_degrees,
@@ -83,7 +83,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         windows as the dataset has them. Attributes environment, scenario, split, seed, episodes, paper, reference,
         cost, truth and recorded.
     """
-    bootstrap = bootstrap_of(dataset, resamples)
+    bootstrap = bootstrap_of_episodes(dataset, resamples)
     declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     found = [competitor_curves(reduce_run(run, declare, bootstrap).results()) for run in runs]
@@ -131,6 +131,7 @@ def curve_statistics(
         resamples: of the bands.
     """
     times = run.sizes["time"]
+    resamples = resamples if episodes > 1 else 0  # one episode has no other to differ from
     distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
     if run.attrs["truth"]:
         groups = groups_of(run)

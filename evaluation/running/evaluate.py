@@ -26,8 +26,10 @@ from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
+from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .kept import DRAWN_PREFIX, Kept, limits
+from .metrics import bootstrap_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
@@ -213,6 +215,8 @@ def run_experiment(
     for i, found in workers.run(run_piece, pieces, sizes, progress):
         kept.write(pieces[i].name, pieces[i].part, found)
     dataset = plan.dataset(kept, plan.seeds)
+    if isinstance(bootstrap := bootstrap_of(dataset), BlockBootstrap):
+        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
     return dataset

@@ -134,10 +134,12 @@ class StackedArrays:
         self._episodes, self._drawn = episodes, min(drawn, episodes)
         self._written: list[tuple[int, slice, set[str]]] = []
 
-    def write(self, name: str, part: slice, kept: Mapping[str, numpy.ndarray]) -> None:
-        """Write what was kept of some episodes of a competitor, ``(episodes, time, ...)`` by name."""
+    def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
+        """Write what was kept of some episodes of a competitor, ``(episodes, time, ...)`` by name, and empty it."""
         place = self._places[name]
-        for key, values in kept.items():
+        self._written.append((place, part, set(kept)))
+        while kept:
+            key, values = kept.popitem()
             shape = values.shape[1:]
             if key == "action":
                 shape = (*shape[:-1], len(self.action_names))
@@ -150,7 +152,6 @@ class StackedArrays:
             else:
                 rows[...] = numpy.nan
                 rows[..., [self.action_names.index(each) for each in self.actions[name]]] = values
-        self._written.append((place, part, set(kept)))
 
     def finished(self) -> dict[str, numpy.ndarray]:
         """Return the arrays ``(policy, episode, time, ...)`` by name, in its order; NaN where nothing was kept."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
-from ...compiler.functions import Specialised, round_up_lanes
+from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...compiler.native import optimised_code
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
@@ -32,6 +32,9 @@ from ..competitors.kinds import (
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
+
+AT_ONCE = 2**18
+"""Measurements of all episodes side by side that are run at once in native code."""
 
 Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
@@ -213,24 +216,35 @@ def run_episodes(
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
-    """Run compiled episodes as one call of native code."""
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements at a time, each from where the last was left."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
-    reports, actions = lanes.run(report, compiled_policy)
-    tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
-    found = {name: _episodes_first(values, count) for name, values in reports.items()}
-    return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
+    interval = looped.task.decision_interval
+    decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
+
+    def run(decisions: int, whole: bool) -> Flown:
+        """Run so many decisions; of whole episodes a view is returned."""
+        reports, actions = lanes.run(report, compiled_policy, decisions * interval)
+        tick(count * decisions * interval)
+        found = {name: _episodes_first(values, count) for name, values in reports.items()}
+        steered = None if actions is None else _checked_actions(looped, actions, count)
+        return Flown(found, steered) if whole else map_arrays(numpy.copy, Flown(found, steered))
+
+    parts = [run(min(most, decisions - i), decisions <= most) for i in range(0, decisions, most)]
+    return _one_after_another(parts, axis=1)
 
 
-def _one_after_another(parts: Sequence[Flown]) -> Flown:
-    """Join episodes; what is reported of some only is theirs alone."""
+def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
+    """Join episodes, or measurements of the same ones, and empty the parts on the way; what is reported of some
+    episodes only is theirs alone.
+    """
     if len(parts) == 1:
         return parts[0]
     found = {
-        name: numpy.concatenate([part.found[name] for part in parts if name in part.found])
-        for name in parts[0].found
+        name: numpy.concatenate([part.found.pop(name) for part in parts if name in part.found], axis)
+        for name in list(parts[0].found)
     }
     actions = [part.action for part in parts if part.action is not None]
-    return Flown(found, numpy.concatenate(actions) if actions else None)
+    return Flown(found, numpy.concatenate(actions, axis) if actions else None)
 
 
 def _step_episodes(
@@ -241,8 +255,9 @@ def _step_episodes(
     actions = []
     for found, action in steps:
         for name, values in found.items():
-            if more is not None and name.startswith(more.prefix):
-                values = values[..., : more.episodes].copy()  # a view would keep the numbers of all
+            kept = more.episodes if more is not None and name.startswith(more.prefix) else count
+            if kept < values.shape[-1]:
+                values = values[..., :kept].copy()  # a view would keep the numbers of all
             series.setdefault(name, []).append(values)
         actions.append(numpy.asarray(action))
         tick(count)

@@ -335,10 +335,10 @@ def run_requests(
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
-    if not whole:
+    first = asked[0]
+    if not whole and first.episodes > 1:
         found = dict(summaries(asked, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
-    first = asked[0]
     dataset = run_experiment(first.experiment, {one.name: one.maker for one in asked}, progress, workers)
     costs = {}
     for name in dataset["policy"].values.tolist() if "cost" in dataset else ():

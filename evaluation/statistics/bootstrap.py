@@ -56,7 +56,7 @@ def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Values and their 95 % percentile intervals; an interval is NaN where a resample is not finite.
+    """Values and their 95 % percentile intervals; NaN where a resample is not finite, or there is none.
 
     Args:
         samples: of the data and of every resample, ``(1 + resamples, ...)``.
@@ -64,6 +64,8 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
     Returns:
         ``(3, ...)``: value, lower and upper end.
     """
+    if len(samples) == 1:
+        return numpy.concatenate([samples, numpy.full((2, *samples.shape[1:]), numpy.nan)])
     tail = 50.0 * (1.0 - CONFIDENCE)
     with numpy.errstate(invalid="ignore"):
         ends = numpy.percentile(samples[1:], [tail, 100.0 - tail], axis=0)
@@ -248,7 +250,9 @@ class Bootstrap:
         return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""
+        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none of one episode."""
+        if self._counts.shape[1] == 1:
+            statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:
