@@ -227,7 +227,7 @@ def _run_compiled(
         tick(count * decisions * interval)
         found = {name: _episodes_first(values, count) for name, values in reports.items()}
         steered = None if actions is None else _checked_actions(looped, actions, count)
-        return Flown(found, steered) if whole else map_arrays(numpy.copy, Flown(found, steered))
+        return Flown(found, steered) if whole else map_arrays(numpy.ascontiguousarray, Flown(found, steered))
 
     parts = [run(min(most, decisions - i), decisions <= most) for i in range(0, decisions, most)]
     return _one_after_another(parts, axis=1)
