@@ -309,7 +309,6 @@ class Plan(NamedTuple):
     """Its scenario opened."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
-    controls: dict[str, str]
     models: dict[str, Model]
     scenario: Scenario
     seeds: list[int]
@@ -328,7 +327,7 @@ class Plan(NamedTuple):
             name,
             self.competitors[name],
             self.kinds[name],
-            self.controls[name],
+            model.control,
             self.seeds[first - self.first : first - self.first + count],
             first,
             model.task.horizon,
@@ -409,12 +408,10 @@ def plan_of(
         raise ValueError("name at least one policy")
     seeds = episode_seeds(split, seed, (episodes if end is None else end) - first, first)
     kinds: dict[str, Kind] = {name: kind_of(maker) for name, maker in competitors.items()}
-    controls: dict[str, str] = {}
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
-        controls[name] = control_of(maker, control, cls, name)
-        models[name] = experiment.make_model(maker, controls[name])
+        models[name] = experiment.make_model(maker, control_of(maker, control, cls, name))
     for name, model in models.items():
         check_observation(model, competitors[name], name)
         if kinds[name] == "smoother":
@@ -439,7 +436,7 @@ def plan_of(
             competitors[name] = one.of_tracks(
                 models[name].on_numpy().task, dict(zip(seeds, named, strict=True))
             )
-    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, first, flown, lengths)
+    return Plan(experiment, competitors, kinds, models, chosen, seeds, first, flown, lengths)
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:

@@ -178,8 +178,7 @@ def record_statistics(
         yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
     if CAUSES in run and not is_bound and judged:
         nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
-        of_units = functools.partial(_cause_sums_of_units, run, nees)
-        yield Statistic(("causes",), cause_sums(run, nees), of_units=of_units)
+        yield Statistic(("causes",), cause_sums(run, nees), of_units=functools.partial(cause_sums, run, nees))
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     if "lost" in run and not numpy.isnan(run["lost"].values).all():
@@ -204,12 +203,6 @@ def _mean_of_present(
 def _units(values: numpy.ndarray, times: slice) -> Callable[[BlockBootstrap], numpy.ndarray]:
     """Return what sums up values of one episode, ``(1, time)``, in units of time."""
     return functools.partial(BlockBootstrap.sums_of_present, values=values, times=times)
-
-
-def _cause_sums_of_units(
-    run: "xarray.Dataset", nees: numpy.ndarray | None, blocks: BlockBootstrap
-) -> numpy.ndarray:
-    return cause_sums(run, nees, blocks.cut)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:

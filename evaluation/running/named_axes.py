@@ -90,12 +90,13 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     return ["mode" if "mode" in key else key]
 
 
-def action_names(model: Model, count: int) -> tuple[str, ...]:
+def action_names(model: Model) -> tuple[str, ...]:
     """Names of the components of a box of actions.
 
     As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
     for each; else the control, with numbers from 1 on where there are several.
     """
+    count = math.prod(model.action_space.shape or ())
     shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
     for names in (*shown, model.task.modes):
         # A number alone says less than the hypothesis's name.
@@ -119,16 +120,14 @@ class StackedArrays:
     """
 
     def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
+        several = len({models[name].control for name in acting}) > 1
         self.actions = {
-            name: action_names(models[name], math.prod(models[name].action_space.shape or ()))
+            name: [
+                f"{models[name].control}: {part}" if several else part for part in action_names(models[name])
+            ]
             for name in acting
         }
-        if len({models[name].control for name in acting}) > 1:
-            self.actions = {
-                name: tuple(f"{models[name].control}: {part}" for part in parts)
-                for name, parts in self.actions.items()
-            }
-        self.action_names = list(dict.fromkeys(sum(self.actions.values(), ())))
+        self.action_names = list(dict.fromkeys(part for own in self.actions.values() for part in own))
         self._arrays: dict[str, numpy.ndarray] = {}
         self._places = {name: i for i, name in enumerate(models)}
         self._episodes, self._drawn = episodes, min(drawn, episodes)

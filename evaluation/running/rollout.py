@@ -84,29 +84,23 @@ def rollout(
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
-    if kind == "policy":
-        yield from _steer_by_python(model, competitor, seeds, report, name)
-        return
-    yield from _step_filter(_put_in_loop(model, competitor, kind, seeds, name), seeds, report)
+    looped = model if kind == "policy" else _put_in_loop(model, competitor, kind, seeds, name)
+    yield from _step(looped, competitor if kind == "policy" else None, seeds, report, name)
 
 
-def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
-    """Step a filter that needs nobody who steers it."""
-    lanes, action = start_lanes(looped, seeds, report=report), numpy.zeros(len(seeds), dtype=numpy.int64)
-    for _ in range(lanes.decisions_per_episode):
-        for found, _ in lanes.decide(action, report):
-            yield found, action
-
-
-def _steer_by_python(
-    model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
+def _step(
+    looped: Model, asked: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank, and ask its policy before every decision."""
-    lanes = start_lanes(model, seeds, report=report)
-    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
-    memory = policy.begin(seeds)
+    """Step a bank, whose policy is asked before every decision, or a filter that needs none, ``asked`` is None."""
+    lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
+    if asked is None:
+        action = numpy.zeros(len(seeds), dtype=numpy.int64)
+    else:
+        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(asked, looped), "policy"))
+        memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
-        action, memory = policy.predict(lanes.observe(), memory)
+        if policy is not None:
+            action, memory = policy.predict(lanes.observe(), memory)
         for found, _ in lanes.decide(action, report):
             yield found, action
 
@@ -205,10 +199,8 @@ def run_episodes(
         if more.episodes < count:
             parts.append(_run_compiled(looped, compiled_policy, seeds[more.episodes :], report, tick))
         return _one_after_another(parts)
-    steps = (
-        _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
-        if is_policy
-        else _step_filter(looped, seeds, report if more is None else more.report)
+    steps = _step(
+        looped, competitor if is_policy else None, seeds, report if more is None else more.report, name
     )
     return _step_episodes(steps, count, is_policy, tick, more)
 
@@ -353,11 +345,7 @@ def measure_time(
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
         spent = _time_compiled(looped, compiled_policy, seeds, decisions)
         return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
-    steps = (
-        _steer_by_python(model, competitor, seeds, _report_estimate, name)
-        if is_policy
-        else _step_filter(looped, seeds, _report_estimate)
-    )
+    steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
     with warnings.catch_warnings():
         if own:
             warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program

@@ -5,13 +5,14 @@ Causes are those that the environment declares (:mod:`.envs.causes`), the start 
 paired: both competitors have their means from the same resamples of the episodes.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
 
 from ...envs.contract.causes import RESERVED
 from .bootstrap import Bootstrap, IntervalEstimate, ratio
+from .time_blocks import BlockBootstrap
 
 if TYPE_CHECKING:
     import xarray
@@ -76,16 +77,14 @@ def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def cause_sums(
-    run: "xarray.Dataset",
-    nees: numpy.ndarray | None,
-    cut: Callable[[numpy.ndarray], numpy.ndarray] | None = None,
+    run: "xarray.Dataset", nees: numpy.ndarray | None, blocks: BlockBootstrap | None = None
 ) -> numpy.ndarray:
     """Sum what is split over the measurements in which each cause holds.
 
     Args:
         run: one policy's part of some episodes.
         nees: over its dimension, ``(episodes, time)``, NaN where there is none; None where nobody says it.
-        cut: of one episode, from ``(n, time)`` to its units of time, ``(n, units, unit)``, in the place of episodes.
+        blocks: of one episode, whose units of time stand in the place of episodes; None: episodes.
 
     Returns:
         ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
@@ -97,8 +96,8 @@ def cause_sums(
     if nees is not None:
         values[NEES] = numpy.where(judged, nees, 0.0)
     holding = (held for _, held in held_causes(run))
-    if cut is not None:
-        values, holding = cut(values[:, 0]), (cut(held)[0] for held in holding)
+    if blocks is not None:
+        values, holding = blocks.cut(values[:, 0]), (blocks.cut(held)[0] for held in holding)
     return numpy.stack([numpy.einsum("set,et->es", values, held) for held in holding], axis=1, dtype=float)
 
 
