@@ -28,11 +28,11 @@ from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .kept import DRAWN_PREFIX, Kept, limits
+from .kept import Kept, limits
 from .metrics import bootstrap_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
-from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
+from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
 from .threads import one_thread
 from .times import with_times
@@ -258,15 +258,21 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     report: Report = limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
-        drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
+        drawn = replace(kept, drawings=True), most
     # What is timed afterwards is optimised then: nothing need be compiled in two ways.
     with optimised_code() if experiment.timed else nullcontext():
         flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)
-    if experiment.strict and "lost" in arrays:
-        _refuse_losses(piece, arrays["lost"])
+    if experiment.strict and "lost" in arrays and arrays["lost"].any():
+        lost = arrays["lost"] > 0.0
+        k = int(numpy.argmax(lost.any(axis=0)))
+        i = int(numpy.argmax(lost[:, k]))
+        reason = FAULTS[int(arrays["lost"][i, k]) - 1]
+        raise ValueError(
+            f"estimator {piece.name!r}: {reason} in episode {piece.first + i} at measurement {k + 1}"
+        )
     if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
         box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
         arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
@@ -283,22 +289,6 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
         raise ValueError(
             f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
             "which actions were applied or episodes lost: call it something else"
-        )
-
-
-def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
-    """Raise ValueError if an episode is lost, for the first measurement at which one is.
-
-    Args:
-        piece: of the competitor.
-        faults: numbers of the reasons, ``(episodes, time)``.
-    """
-    if faults.any():
-        step = int(numpy.argmax((faults > 0.0).any(axis=0)))
-        i = int(numpy.argmax(faults[:, step] > 0.0))
-        raise ValueError(
-            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + i} at measurement "
-            f"{step + 1}"
         )
 
 

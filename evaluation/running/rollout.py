@@ -32,6 +32,7 @@ from ..competitors.kinds import (
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
+from .kept import DRAWN_PREFIX
 
 AT_ONCE = 2**18
 """Measurements of all episodes side by side that are run at once in native code."""
@@ -141,17 +142,6 @@ def _smoothed_estimates(
     return means[..., last], covariances[..., last]
 
 
-class More(NamedTuple):
-    """What is reported of the first episodes only; of all it would take much memory."""
-
-    report: Report
-    """Of all that is reported of them."""
-    episodes: int
-    """How many they are."""
-    prefix: str
-    """Begins the names of what is not reported of the others."""
-
-
 class Flown(NamedTuple):
     """What is reported of episodes that were run to their end."""
 
@@ -169,7 +159,7 @@ def run_episodes(
     report: Report,
     name: str = "competitor",
     tick: Progress | None = None,
-    more: More | None = None,
+    more: tuple[Report, int] | None = None,
 ) -> Flown:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -184,25 +174,25 @@ def run_episodes(
         report: of arrays ``(..., N)`` by name.
         name: of the competitor, in errors.
         tick: told of measurements done.
-        more: what is reported of the first episodes beside it.
+        more: report on the first episodes, and how many they are: of all it would take much memory. Names that begin
+            with :data:`.kept.DRAWN_PREFIX` are of them only.
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"
     looped = model if is_policy else _put_in_loop(model, competitor, kind, seeds, name)
     if is_policy:
         compiled_policy = _compiled_policy_of(model, competitor, name)
-    compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
+    compiled = can_step(looped, report) and (more is None or can_step(looped, more[0]))
     if compiled and (compiled_policy is not None or not is_policy):
         if more is None:
             return _run_compiled(looped, compiled_policy, seeds, report, tick)
-        parts = [_run_compiled(looped, compiled_policy, seeds[: more.episodes], more.report, tick)]
-        if more.episodes < count:
-            parts.append(_run_compiled(looped, compiled_policy, seeds[more.episodes :], report, tick))
+        parts = [_run_compiled(looped, compiled_policy, seeds[: more[1]], more[0], tick)]
+        if more[1] < count:
+            parts.append(_run_compiled(looped, compiled_policy, seeds[more[1] :], report, tick))
         return _one_after_another(parts)
-    steps = _step(
-        looped, competitor if is_policy else None, seeds, report if more is None else more.report, name
-    )
-    return _step_episodes(steps, count, is_policy, tick, more)
+    report, drawn = more or (report, 0)
+    steps = _step(looped, competitor if is_policy else None, seeds, report, name)
+    return _step_episodes(steps, count, is_policy, tick, drawn)
 
 
 def _run_compiled(
@@ -240,14 +230,14 @@ def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
 
 
 def _step_episodes(
-    steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, more: More | None
+    steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
 ) -> Flown:
     """Keep what is reported of episodes that are stepped."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
         for name, values in found.items():
-            kept = more.episodes if more is not None and name.startswith(more.prefix) else count
+            kept = drawn if name.startswith(DRAWN_PREFIX) else count
             if kept < values.shape[-1]:
                 values = values[..., :kept].copy()  # a view would keep the numbers of all
             series.setdefault(name, []).append(values)

@@ -188,19 +188,16 @@ def reduce_episodes(
         kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
         kept.write(asked.name, slice(count), run_piece(piece, tick))
         run = plan.dataset(kept, piece.seeds).isel(policy=0)
-        return Part(reduce_run(run, declare, bootstrap, first), _head(run))
+        reduction = reduce_run(run, declare, bootstrap, first)
+        others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
+        head = run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
+        return Part(reduction, head)
 
     parts = (part(first) for first in range(asked.first, asked.end, block))
     found = functools.reduce(Part.merge, parts)
     if asked.experiment.timed and asked.first == 0:
         return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
     return found
-
-
-def _head(run: xarray.Dataset) -> xarray.Dataset:
-    """Return an evaluation without what was kept of every episode; of the first, its seed."""
-    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
-    return run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
 
 
 def summaries(

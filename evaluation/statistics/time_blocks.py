@@ -5,9 +5,7 @@ Billard, Exploring the Limits of Bootstrap, 1992): a resample is made of blocks 
 go on at the start, until they are as long as the episode. The length of the blocks follows from the autocorrelation
 (Politis and White: Automatic block-length selection for the dependent bootstrap, Econometric Reviews 23, 2004, with the
 correction of Patton, Politis and White, Econometric Reviews 28, 2009). It supposes that what is averaged is stationary.
-
-Of long episodes blocks begin at every unit of a few measurements, at most ``UNITS`` of them, whose sums are all that is
-kept of the episode.
+Of long episodes blocks begin at every unit of a few measurements, whose sums are all that is kept of the episode.
 """
 
 import math
@@ -24,10 +22,7 @@ FEWEST = 16
 
 
 class BlockBootstrap(Bootstrap):
-    """Resampling of blocks of successive measurements of one episode.
-
-    Means over time have intervals, from the sums of every unit: the rows of :meth:`sums` are units. What is one number
-    of the whole episode has none.
+    """Resampling of blocks of successive measurements of one episode; the rows of :meth:`sums` are its units.
 
     Args:
         series: of the episode, ``(series, time)``; the one whose blocks are to be longest decides. NaN: not known.
@@ -121,9 +116,7 @@ def block_length(series: numpy.ndarray) -> int:
         series: ``(n,)``; NaN, which is not known, adds nothing to an autocovariance.
     """
     n, known = len(series), ~numpy.isnan(series)
-    if known.sum() < 2:
-        return 1
-    centred = numpy.where(known, series - series[known].mean(), 0.0)
+    centred = numpy.where(known, series - (series[known].mean() if known.any() else 0.0), 0.0)
     quiet = max(5, math.ceil(math.sqrt(math.log10(n))))
     most = min(n - 1, math.ceil(math.sqrt(n)) + quiet)
     size = 1 << (2 * n - 1).bit_length()
