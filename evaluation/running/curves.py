@@ -207,10 +207,10 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
                     stacked[i, [listed.index(name) for name in of]] = values
                 elif values is not None:
                     stacked[i] = values
-            if key in variables:  # a curve without a band has the ends of none
+            if (
+                key in variables or not numpy.isnan(stacked).all()
+            ):  # a curve without a band has NaN for its ends
                 variables[key + ending] = (("policy", *dims), stacked)
-            else:
-                variables |= _present(key + ending, ("policy", *dims), stacked)
     variables |= _consistency_bands(found)
     best = _cheapest(found, dataset)
     bases = {"paper": dataset.attrs["paper"], "best": best}

@@ -408,7 +408,12 @@ def plan_of(
             check_open_loop(model, f"smoother {name!r}")
     model = next(iter(models.values()))
     if chosen.recording is not None:
-        _check_truth_available(kinds, chosen.name)
+        for name, kind in kinds.items():
+            if kind in TOLD_MORE:
+                raise ValueError(
+                    f"{kind} {name!r} is told what recording {chosen.name!r} does not hold, more of the truth than the "
+                    "components: leave it out"
+                )
         episodes = len(model.task.flights)  # nothing is random: each once
     flown, lengths = None, None
     if model.task.flights:
@@ -448,16 +453,6 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name!r} cannot be sent to another process ({error}): give its class, or leave out jobs and cluster"
             ) from error
-
-
-def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
-    """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
-    for competitor, kind in kinds.items():
-        if kind in TOLD_MORE:
-            raise ValueError(
-                f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
-                "components: leave it out"
-            )
 
 
 def _flights_in_turn(

@@ -335,6 +335,7 @@ class _Against:
     ) -> None:
         self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
         self.paper, self.reference, self.bootstrap = attrs["paper"], attrs["reference"], bootstrap
+        self._compared = self.paper in self.costs
         self.bound = attrs.get("lost_cost", 0.0)
         means = bootstrap.means_of(self._columns) if self.costs else numpy.empty((1, 0))
         parts = numpy.split(means.T, 4 if self._compared else 3)
@@ -351,11 +352,6 @@ class _Against:
         self.best = self.ranked[places[0]] if self.ranked else ""
         self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
 
-    @property
-    def _compared(self) -> bool:
-        """Whether there is the paper's algorithm to compare with."""
-        return self.paper in self.costs
-
     def _columns(self, part: slice) -> numpy.ndarray:
         """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
         logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
@@ -363,8 +359,8 @@ class _Against:
         costs = [own[part] for own in self.costs.values()]
         with numpy.errstate(divide="ignore", invalid="ignore"):
             columns = [*costs, *map(numpy.log, costs), *(own > self.bound for own in costs)]
-        if self._compared:
-            columns += [_wins(_divide(own, self.costs[self.paper][part])) for own in costs]
+            if self._compared:
+                columns += [_wins(own / self.costs[self.paper][part]) for own in costs]
         return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
@@ -398,7 +394,8 @@ class _Against:
         if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
-        ratios = _divide(self.costs[name], self.costs[self.paper])
+        with numpy.errstate(divide="ignore", invalid="ignore"):
+            ratios = self.costs[name] / self.costs[self.paper]
         found = {
             "geometric_cost_difference": self._difference(name, self.paper),
             "cost_difference": bootstrap.interval(cost - paper),
@@ -437,12 +434,6 @@ def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
         size = stretch_interval(there, values, lambda means: numpy.sqrt(ratio(means)))
         yield Measure("prediction_error", group, "all", size, str(run["measured_unit"].values[chosen[0]]))
         yield Measure("innovation_correlation", group, "all", correlation(innovation, there), "1")
-
-
-def _divide(costs: numpy.ndarray, others: numpy.ndarray) -> numpy.ndarray:
-    """Ratio of two costs of every episode, ``(episodes,)``."""
-    with numpy.errstate(divide="ignore", invalid="ignore"):
-        return costs / others
 
 
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:

@@ -232,29 +232,22 @@ def summaries(
         if progress is not None:
             progress(one.measurements)
         yield i, found
-    for i, found in _summarise(asked, missing, workers, progress):
-        store.write(work[i], found)
-        yield i, found
-
-
-def _summarise(
-    asked: Sequence[EvaluationRequest], missing: Sequence[int], workers: Workers, progress: Progress | None
-) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
         for i in missing:
             check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
     pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
     batches = [[piece] for piece in pieces] if workers.alone else _batches(pieces)
-    work = [[piece for _, piece in batch] for batch in batches]
+    items = [[piece for _, piece in batch] for batch in batches]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}
     done = [0] * len(asked)
-    sizes = [sum(piece.measurements for piece in batch) for batch in work]
-    run = workers.run(functools.partial(_one_after_another, summarise), work, sizes, progress)
+    sizes = [sum(piece.measurements for piece in batch) for batch in items]
+    run = workers.run(functools.partial(_one_after_another, summarise), items, sizes, progress)
     for (i, piece), found in (
         (which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)
     ):
         if isinstance(found, Summary):
+            store.write(work[i], found)
             yield i, found
             continue
         # In the order of the episodes, whichever come first: sums of the same numbers in another order differ.
@@ -265,6 +258,7 @@ def _summarise(
         if done[i] == asked[i].episodes:
             with one_thread():
                 whole = added.pop(i).summary(asked[i])
+            store.write(work[i], whole)
             yield i, whole
 
 
