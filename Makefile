@@ -31,7 +31,7 @@ EXTRAS := agents,fast,tensorboard,report,render,flights,logs,ins,adapters,onnx,o
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests core-test-names test-processors test-parts test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests core-test-names test-processors test-parts test-lowest test-cluster test-extras test-pythons distributions publishable check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -108,6 +108,9 @@ distributions: $(VENV)/.dev  ## build what would be published; try the wheel, an
 	cd $(DISTRIBUTIONS) && mkdir source && tar -xzf *.tar.gz --strip-components 1 -C source
 	cd $(DISTRIBUTIONS)/source && ../venv/bin/python -m pip install --quiet --constraint constraints.txt \
 	  --editable . pytest hypothesis && OMP_NUM_THREADS=1 ../venv/bin/python -m pytest $(SOURCE_TESTS)
+
+publishable: $(VENV)/.dev  ## ask the field's own tools about packages, workflows, licences and types; needs an index
+	$(BIN)/python tests/check_publishable.py build/publishable
 
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)

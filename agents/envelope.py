@@ -12,16 +12,19 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..baselines.alarm import Alarm
-from ..envs.contract.model import Model
+from ..envs.contract.model import Episode, Model
+from ..envs.contract.observation import Array
 from ..envs.contract.parameters import freeze
 from ..envs.contract.task import Task
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import parameter_names
+from ..envs.engine.programs import Report
 from ..envs.engine.scenario_choice import find_mixture, make_task
-from ..evaluation.competitors.kinds import Kind, Policy, make_competitor
+from ..evaluation.competitors.kinds import Kind, make_competitor
 from ..evaluation.competitors.stepping import SteppingPolicy
 from ..evaluation.running.rollout import start_lanes
 from ..evaluation.running.seeds import episode_seeds
+from .learned_estimator import fill_missing
 
 EPISODES = 512
 """Of the training distribution that are flown: of few, an episode of the same distribution would often lie outside."""
@@ -78,37 +81,30 @@ class EnvelopeAlarm(Alarm):
         return numpy.where(outside, math.log(OFTEN / USUAL), math.log((1.0 - OFTEN) / (1.0 - USUAL)))
 
 
-class WatchedPolicy(Policy):
-    """A network that goes on answering, and keeps how much of what it is shown was not seen in training.
+class NetworkWatch:
+    """How much of what a network is shown was not seen in its training.
 
     Args:
-        policy: the network, with what is around it.
+        model: whose observations it is shown.
         range: of its training.
+        observe: as of :class:`~.online_state.Watch`.
 
     Attributes:
         memory: share of each field's values outside, over the last decisions, ``(tracks, fields)``; None before the
             first.
     """
 
-    def __init__(self, policy: Any, range: TrainingRange) -> None:
-        super().__init__(policy.model)
-        self.control = policy.model.control  # type: ignore[misc]  # made for it
-        self.policy, self.range = policy, range
-        self.columns = policy.model.columns(range.fields)
+    def __init__(self, model: Model, range: TrainingRange, observe: Report | None = None) -> None:
+        self.range, self.columns, self.observe = range, model.columns(range.fields), observe
         self.memory: numpy.ndarray | None = None
 
-    def begin(self, seeds: Sequence[int]) -> Any:
-        """Begin the policy's memory."""
-        return self.policy.begin(seeds)
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Look at what is shown, and let the network answer."""
+    def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
+        """Look at what is shown."""
         outside = self.range.is_outside(observation[:, self.columns])
         before = 0.0 * outside if self.memory is None else self.memory
-        before = numpy.where(start[:, None], 0.0, before)
+        if start.any():
+            before = numpy.where(start[:, None], 0.0, before)
         self.memory = before + (outside - before) / WINDOW
-        answer: tuple[numpy.ndarray, Any] = self.policy.predict(observation, state, start)
-        return answer
 
     def describe(self) -> list[str]:
         """Say for each track which field is outside too often; empty where none is."""
@@ -230,15 +226,17 @@ def _observations(
     return numpy.concatenate(found)
 
 
-def watch_live(model: Model, maker: Any, kind: Kind) -> tuple[Any, WatchedPolicy] | None:
-    """Return an agent that runs live, and what compares its observations with those of its training; None of others."""
+def observe_network(model: Model, episode: Episode) -> Array:
+    """Report what the network of a learned estimator in a loop is shown of a measurement that has come."""
+    own, received = model.filter.own, fill_missing(model.task.world.mask_missing(episode.measurement))
+    return own.model.observe(Episode(None, received, episode.filter.own.bank))
+
+
+def watch_live(model: Model, maker: Any, kind: Kind) -> NetworkWatch | None:
+    """Return what compares the observations of an agent that runs live with those of its training; None of others."""
     seen = training_range(type(model.task), maker)
     if seen is None:
         return None
     if kind == "estimator":
-        estimator = maker(model.task)
-        watch = WatchedPolicy(estimator.network, seen)
-        estimator.decider.ask = watch.act
-        return estimator, watch
-    watch = WatchedPolicy(SteppingPolicy(model, make_competitor(maker, model)), seen)
-    return watch, watch
+        return NetworkWatch(maker(model.task).model, seen, observe_network)
+    return NetworkWatch(model, seen)

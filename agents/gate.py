@@ -327,7 +327,7 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
         fallback: a filter.
     """
 
-    def __init__(self, agent: LearnedEstimator, fallback: Filter) -> None:
+    def __init__(self, agent: LearnedEstimator, fallback: Filter[Any, Any, Any]) -> None:
         super().__init__(agent.task)
         self.agent, self.fallback = agent, fallback
         self.network, self.decider = agent.network, agent.decider
@@ -496,7 +496,7 @@ class GatedMaker:
         agent = LearnedEstimator(model, ListeningPolicy(policy, trust, shown), interval)
         return GatedEstimator(agent, self._make_fallback(task))
 
-    def _make_fallback(self, task: Task) -> Filter:
+    def _make_fallback(self, task: Task) -> Filter[Any, Any, Any]:
         if kind_of(self._fallback) == "estimator":
             with explain_errors(f"fallback {self.fallback!r} cannot be made"):
                 return as_filter(task, make_competitor(self._fallback, task))

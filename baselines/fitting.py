@@ -92,7 +92,7 @@ class ScaledNoise(Filter[Task, Any, Any]):
         factor: a number, or ``(N,)``.
     """
 
-    def __init__(self, own: Filter, scaled: Callable[[Any, Any], Any], factor: Any) -> None:
+    def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], factor: Any) -> None:
         super().__init__(own.task)
         self.own, self.scaled, self.factor, self.in_python = own, scaled, factor, own.in_python
 
@@ -159,7 +159,7 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
         share: of outliers, a number, or ``(N,)``.
     """
 
-    def __init__(self, own: Filter, scaled: Callable[[Any, Any], Any], share: Any) -> None:
+    def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], share: Any) -> None:
         super().__init__(own.task)
         self.own, self.scaled, self.share, self.in_python = own, scaled, share, own.in_python
 

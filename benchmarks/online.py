@@ -1,7 +1,8 @@
 """Filters in a loop of one's own: the same bits as a replay, and the time of an update beside filterpy and Stone Soup.
 
 Tracks with scans that missed the target are written as a log. Each is replayed by an evaluation, and fed row by row to
-the running filter, which is saved and restored by pickle on the way. Then every filter takes the same plots, one track.
+the running filter, which is saved and restored by pickle on the way. Then every filter takes the same plots, one track,
+some updates after the others in turn; the times are of the processor. A peer that is not installed is left out.
 
 Example: python benchmarks/online.py --tracks 5 --plots 2000
 """
@@ -11,7 +12,8 @@ import gc
 import pickle
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy
@@ -23,7 +25,11 @@ from filtergym.papers.grid import markdown_table
 
 ID = "filtergym/ManeuveringTarget-v0"
 COMPETITORS = ("imm", "kalman-imm", "kalman-imm-turn", "adaptive-rearm", "sage-husa", "bptt", "kalman-net")
-PEER = "filterpy, IMM of two Kalman filters"
+PEER, PEER_OF_TWO = "filterpy, IMM of two Kalman filters", "filterpy, Kalman filter of two states"
+OF_TWO = "Kalman filter of two states"
+"""A model of one's own; what it is, beside filterpy's of the same."""
+ROUND = 100
+"""Updates of one filter before the next one's turn."""
 T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
 
 
@@ -41,7 +47,7 @@ def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
         rows.append(numpy.column_stack([numpy.full(plots, track), seconds, position]))
     table = numpy.round(numpy.concatenate(rows), 6)
     lines = [",".join("" if numpy.isnan(v) else repr(float(v)) for v in row) for row in table]
-    path.write_text("recording,time,x,y\n" + "\n".join(lines) + "\n")
+    path.write_text("recording,time,x,y,sigma_x,sigma_y\n" + f",{SIGMA},{SIGMA}\n".join([*lines, ""]))
     return table
 
 
@@ -50,7 +56,8 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
     replayed = filtergym.evaluate(
         ID, name, recording, episodes=len(recording.names), tracks=True, sampling_interval=T
     )
-    filter = filtergym.online(ID, name, sampling_interval=T)
+    parameters = {**recording.typical, **recording.parameters}
+    filter = filtergym.online(ID, name, **parameters)
     count = differing = 0
     for episode, track in enumerate(numpy.unique(table[:, 0])):
         rows = table[table[:, 0] == track]
@@ -59,12 +66,12 @@ def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> 
             0, list(replayed["flight"].values).index(recording.names[episode])
         ]
         for k, (_, seconds, x, y) in enumerate(rows[2:]):
-            estimate = filter.update(seconds, x=x, y=y)
+            estimate = filter.update(seconds, x=x, y=y, sigma_x=SIGMA, sigma_y=SIGMA)
             if k < len(wanted) and numpy.isfinite(wanted[k]).all():
                 count, differing = count + 1, differing + (not numpy.array_equal(estimate.mean, wanted[k]))
             if k % SAVED_EVERY == SAVED_EVERY - 1:
                 state = pickle.dumps(filter.save())
-                filter = filtergym.online(ID, name, sampling_interval=T)
+                filter = filtergym.online(ID, name, **parameters)
                 filter.restore(pickle.loads(state))
     return count, differing
 
@@ -74,6 +81,32 @@ def own_update(name: str, backend: str) -> Callable[[float, float, float], objec
     filter = filtergym.online(ID, name, backend=backend)
     filter.start([2e4, 3e4, 0.0, 0.0], numpy.diag([1e4, 1e4, 600.0, 600.0]))
     return lambda seconds, x, y: filter.update(seconds, x=x, y=y)
+
+
+def own_update_of_two() -> Callable[[float, float, float], object]:
+    """Return an update of a Kalman filter of a model of one's own."""
+    filtergym.state_space(
+        "mine/OfTwo-v0", f=[[1, 1.0], [0, 1]], h=[[1, 0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[25.0]],
+        mean=[0, 10], covariance=[[100, 0], [0, 25]],
+    )  # fmt: skip
+    filter = filtergym.online("mine/OfTwo-v0", "kalman")
+    filter.start(mean=[0, 10], covariance=[[100, 0], [0, 25]])
+    return lambda seconds, x, y: filter.update(values=[x])
+
+
+def filterpy_update_of_two() -> Callable[[float, float, float], object]:
+    """Return an update of filterpy's Kalman filter of the same model."""
+    from filterpy.kalman import KalmanFilter
+
+    one = KalmanFilter(dim_x=2, dim_z=1)
+    one.F, one.H = numpy.array([[1.0, 1.0], [0.0, 1.0]]), numpy.array([[1.0, 0.0]])
+    one.Q, one.R = numpy.array([[0.25, 0.5], [0.5, 1.0]]), numpy.array([[25.0]])
+
+    def update(seconds: float, x: float, y: float) -> None:
+        one.predict()
+        one.update(x)
+
+    return update
 
 
 def filterpy_update() -> Callable[[float, float, float], object]:
@@ -130,18 +163,22 @@ def stone_soup_update() -> Callable[[float, float, float], object]:
     return update
 
 
-def latencies(update: Callable[[float, float, float], object], updates: int) -> numpy.ndarray:
-    """Return seconds of each update, after some that are not counted."""
+def latencies(
+    cases: Mapping[str, Callable[[float, float, float], object]], updates: int
+) -> dict[str, numpy.ndarray]:
+    """Return processor seconds of each update of each filter, after some that are not counted."""
     rng = numpy.random.default_rng(1)
-    plots = numpy.array([2e4, 3e4]) + SIGMA * rng.standard_normal((updates + 100, 2))
-    found = numpy.empty(len(plots))
+    plots = numpy.array([2e4, 3e4]) + SIGMA * rng.standard_normal((updates + ROUND, 2))
+    found = {name: numpy.empty(len(plots)) for name in cases}
     gc.disable()
-    for k, (x, y) in enumerate(plots):
-        begin = time.perf_counter()
-        update(T * (k + 1), x, y)
-        found[k] = time.perf_counter() - begin
+    for first in range(0, len(plots), ROUND):
+        for name, update in cases.items():
+            for k, (x, y) in enumerate(plots[first : first + ROUND].tolist(), first):
+                begin = time.process_time()
+                update(T * (k + 1), x, y)
+                found[name][k] = time.process_time() - begin
     gc.enable()
-    return found[100:]
+    return {name: seconds[ROUND:] for name, seconds in found.items()}
 
 
 def main() -> None:
@@ -160,15 +197,20 @@ def main() -> None:
             count, differing = differing_updates(name, recording, table)
             print(f"{name}: {count:,} updates, {differing:,} with other bits than the replay", flush=True)
     print()
-    cases = {f"`{name}`": own_update(name, "auto") for name in COMPETITORS}
+    cases = {f"`kalman`, {OF_TWO}": own_update_of_two()}
+    cases |= {f"`{name}`": own_update(name, "auto") for name in COMPETITORS}
     cases |= {'`kalman-imm` with `backend="numpy"`': own_update("kalman-imm", "numpy")}
-    cases |= {PEER: filterpy_update(), "Stone Soup, one Kalman filter": stone_soup_update()}
-    found = {name: latencies(update, asked.updates) for name, update in cases.items()}
+    peers = {PEER_OF_TWO: filterpy_update_of_two, PEER: filterpy_update}
+    for name, make in {**peers, "Stone Soup, one Kalman filter": stone_soup_update}.items():
+        with suppress(ImportError):
+            cases[name] = make()
+    found = latencies(cases, asked.updates)
     rows = []
     for name, seconds in found.items():
         median, late = numpy.median(seconds), numpy.quantile(seconds, 0.999)
-        ratio = numpy.median(found[PEER]) / median
-        rows.append((name, f"{1e6 * median:.0f}", f"{1e6 * late:.0f}", f"{ratio:.1f}"))
+        peer = found.get(PEER_OF_TWO if OF_TWO in name else PEER)
+        ratio = "" if peer is None else f"{numpy.median(peer) / median:.1f}"
+        rows.append((name, f"{1e6 * median:.0f}", f"{1e6 * late:.0f}", ratio))
     print("\n".join(markdown_table(("", "median, µs", "99.9 %, µs", "filterpy's median over it"), rows)))
 
 

@@ -23,8 +23,8 @@ other competitors of it, that returns a :class:`.evaluation.competitors.kinds.Co
 SOURCES: Sequence[str] = ("baselines.fitted_filters:ADVISED", "agents.named_policies:LEARNED")
 """Each a :class:`.evaluation.competitors.kinds.CompetitorFiles`, of competitors in files and folders."""
 WATCHES: Sequence[str] = ("agents.envelope:watch_live",)
-"""Functions of a model, of the maker of a competitor and of its kind, which return what runs live in its place and what
-watches it (:class:`.evaluation.competitors.online_state.Watch`), or None."""
+"""Functions of a model, of the maker of a competitor and of its kind, which return what watches it where it runs live
+(:class:`.evaluation.competitors.online_state.Watch`), or None."""
 DEPARTURES: Sequence[str] = ("agents.envelope:departure",)
 """Functions of the class of a task, of the maker of an agent, of a scenario's data and of parameters, which return a
 sentence on how these depart from what the agent was trained on, or None."""

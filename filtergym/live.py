@@ -80,8 +80,5 @@ def online(
     )
     own = control_of(maker, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)
-    for watch_of in load_present(WATCHES):
-        watched = watch_of(model, maker, kind)
-        if watched is not None:
-            return OnlineFilter(model, watched[0], name, tracks, watched[1], lag)
-    return OnlineFilter(model, maker, name, tracks, lag=lag)
+    watches = (watch_of(model, maker, kind) for watch_of in load_present(WATCHES))
+    return OnlineFilter(model, maker, name, tracks, next(filter(None, watches), None), lag)

@@ -23,5 +23,5 @@ def cartesian_variances(position: Array, range_sigma: Array, bearing_sigma: Arra
     xp = namespace(position)
     squares = position * position
     squared_range = xp.clip(squares[0] + squares[1], SMALLEST_RANGE**2, None)
-    along = squares * (range_sigma**2 / squared_range)
-    return along + (squared_range - squares) * bearing_sigma**2
+    along = squares * (range_sigma * range_sigma / squared_range)
+    return along + (squared_range - squares) * (bearing_sigma * bearing_sigma)

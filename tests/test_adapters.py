@@ -1,6 +1,8 @@
 """Filters of other libraries as estimators: filterpy and Stone Soup against ours, and every example of the page."""
 
 import importlib.util
+import re
+import runpy
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -276,3 +278,15 @@ def test_a_library_that_is_not_installed_is_a_sentence(library, adapter, monkeyp
         ValueError, match=f"cannot load policy 'wants_library:Mine': ImportError: {adapter} needs"
     ):
         filtergym.evaluate(ID, ["wants_library:Mine"], episodes=1)
+
+
+def test_calls_of_filterpy_and_ours_agree(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("filterpy", reason="filterpy is in filtergym[adapters]")
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "from_filterpy.py"))
+    differences = dict(re.findall(r"^(.*?) +differ by (\S+)$", capsys.readouterr().out, re.MULTILINE))
+    assert len(differences) == 11
+    # FilterPy's unscented filter does not draw its points anew after the prediction.
+    assert 1e-4 < float(differences.pop("unscented")) < 1e-2
+    # Twenty steps of states of some 200 m: rounding of one, 3e-14, grows a little.
+    assert max(map(float, differences.values())) < 1e-12

@@ -128,61 +128,6 @@ def test_a_cheat_is_worth_everything_beside_the_truth_and_nothing_apart(cheats):
     np.testing.assert_allclose(found[3:], honest, rtol=1e-12)  # a sum in another order
 
 
-PROBE = '''
-import ctypes, importlib, os, signal, socket, subprocess, sys
-import numpy as np
-
-ATTEMPTS = {
-    "the package": lambda: importlib.import_module("filtergym.envs"),
-    "its files": lambda: open(PACKAGE).read(),
-    "what runs it": lambda: open(f"/proc/{os.getppid()}/cmdline").read(),
-    "its memory": lambda: open(f"/proc/{os.getppid()}/mem", "rb"),
-    "another folder": lambda: os.listdir(FOLDER),
-    "a file of one's own": lambda: open("written", "w"),
-    "another program": lambda: subprocess.run(["/bin/true"], check=True),
-    "a connection": lambda: socket.create_connection(("127.0.0.1", PORT), timeout=1.0),
-}
-
-
-class Probe:
-    """Answers which of its attempts succeed."""
-
-    def start(self, initial, N):
-        return 0
-
-    def update(self, memory, measurement):
-        found = np.zeros(len(ATTEMPTS))
-        for i, attempt in enumerate(ATTEMPTS.values()):
-            try:
-                attempt()
-                found[i] = 1.0
-            except (OSError, ImportError):
-                pass
-        N = measurement.position.shape[-1]
-        mean = np.tile(found.reshape(2, 4)[memory % 2][:, None], (1, N))
-        return mean, np.tile(np.eye(4)[:, :, None], (1, 1, N)), memory + 1
-'''
-
-
-@pytest.mark.skipif(landlock_version() < 4, reason="this system has no Landlock that knows of connections")
-def test_nothing_can_be_reached_from_inside(tmp_path):
-    import socket
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        head = (
-            f"PACKAGE, FOLDER, PORT = {filtergym.__file__!r}, {str(tmp_path)!r}, {server.getsockname()[1]}\n"
-        )
-        apart = isolate_source(head + PROBE, "Probe", "probe")
-        model = make_model(ID, horizon=2)
-        reached = [e.filter.mean[:, 0].copy() for e, _ in rollout(model, apart, [0])]
-        space = {}
-        exec(head + PROBE, space)
-        here = [attempt() for name, attempt in space["ATTEMPTS"].items() if name != "a file of one's own"]
-    assert len(here) == 7  # outside each of them succeeds
-    names = np.array(list(space["ATTEMPTS"]))
-    assert names[np.concatenate(reached) > 0.0].tolist() == []
-
-
 BESIDE = """
 import beside
 import linked
@@ -318,6 +263,28 @@ def test_nothing_of_a_module_runs_here(tmp_path, monkeypatch, command):
     assert "'isolated:spring:Spring' takes no part: OSError: no" in errors
     assert "spring" not in sys.modules
     assert "leave one of them out" in command(*words, "--trust")[2]
+
+
+@pytest.mark.parametrize("isolated", [(), ("--isolated",)])
+def test_a_competitor_that_fails_costs_its_own_row(isolated, tmp_path, monkeypatch, command):
+    """Of one that raises, or cannot be made, or ends itself; what the others have done is written."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    words = "def start(self, initial, N): raise SystemExit(3)\n    def update(self, memory, m): pass\n"
+    unmade = "def __init__(self): raise OSError('full')\n    "
+    (tmp_path / "wretched.py").write_text(f"class Ends:\n    {words}\nclass Unmade:\n    {unmade}{words}")
+    mine = ("--policy", "wretched:Ends", "--policy", "wretched:Unmade", "--policy", "imm")
+    options = ("--episodes", 2, "--set", "horizon=5", "--json", "records.json", *isolated)
+    code, shown, errors = command("evaluate", ID, *mine, *options)
+    sys.modules.pop("wretched", None)
+    prefix = "isolated:" if isolated else ""
+    assert {own["policy"] for own in json.loads((tmp_path / "records.json").read_text())} >= {"imm"}
+    assert "imm" in shown
+    assert code == 2
+    assert f"'{prefix}wretched:Unmade'" in errors
+    assert "OSError: full" in errors
+    assert errors.rstrip().endswith("the others are in the table")
+    assert isolated or "SystemExit: 3" in errors  # a process that ends is a row of lost episodes
 
 
 def test_a_wrong_shape_is_no_answer():

@@ -26,7 +26,7 @@ PARTS = {
     "problems": rf"(envs|baselines)/{PROBLEM}/|filters/({'|'.join(OF_PROBLEMS)})\.py",
     "learning": r"agents/|filtergym/commands/training\.py|filtergym/reports/tables/standing\.py",
     "crash test": r"evaluation/stress/|filtergym/commands/stress\.py|filtergym/reports/pages/crash_report\.py",
-    "programs of others": r"evaluation/competitors/(programs|program_process|isolation)\.py",
+    "programs of others": r"evaluation/competitors/(programs|program_process|isolation|isolated_estimator)\.py",
     "export": r"filtergym/exports/",
     "data sets": r"filtergym/offline\.py",
     "publication": r"filtergym/(submission|protocol)\.py|filtergym/commands/(submit|protocol)\.py",

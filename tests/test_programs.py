@@ -1,5 +1,6 @@
 """Programs as competitors: what they are told, what becomes of their mistakes, and that nothing is left of them."""
 
+import contextlib
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from models import make_model
+from test_wall import without
 
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
@@ -287,17 +289,17 @@ def running(pid):
     return True
 
 
-def adopted_zombie(pid):
-    """Whether a process has ended, and whoever adopted it has yet to bury it."""
-    stat = Path(f"/proc/{pid}/stat")
-    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] == "Z"
-
-
-def test_nothing_is_left_of_a_process_that_hangs(monkeypatch):
-    """Nor of what it has begun, nor where Ctrl-C ends the wait for its answer."""
-    monkeypatch.setattr(program_process, "END_SECONDS", 0.1)
-    process = ProgramProcess(["sh", "-c", "read question; sleep 100 & echo $!; sleep 100"], Limits())
-    inner = int(process.exchange(b"?\n", None, 100))
+@pytest.mark.parametrize("apart", [True, False])
+def test_nothing_is_left_of_a_process_that_hangs(apart, monkeypatch, tmp_path):
+    """Nor of what it has begun, even in sessions of its own, nor where Ctrl-C ends the wait for its answer."""
+    monkeypatch.setattr(program_process, "END_SECONDS", 0.5)
+    if not apart:
+        monkeypatch.setattr(program_process, "LAUNCHER", without(tmp_path, "enter_namespaces"))
+    os.mkfifo(tmp_path / "alive")
+    alive = os.open(tmp_path / "alive", os.O_RDONLY | os.O_NONBLOCK)
+    words = f"read question; exec 3> {tmp_path}/alive; sleep 99 & setsid sh -c 'sleep 99 & sleep 99' & echo; sleep 99"
+    process = ProgramProcess(["sh", "-c", words], Limits())
+    process.exchange(b"?\n", None, 100)
     own = process._process.pid
     alarm = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.1)
@@ -307,12 +309,17 @@ def test_nothing_is_left_of_a_process_that_hangs(monkeypatch):
     finally:
         signal.signal(signal.SIGALRM, alarm)
     assert running(own)
+    with pytest.raises(BlockingIOError):
+        os.read(alive, 1)
     del process
     assert not running(own)
-    until = time.monotonic() + 5.0
-    while running(inner) and not adopted_zombie(inner) and time.monotonic() < until:
+    until, left = time.monotonic() + 5.0, True
+    while left and time.monotonic() < until:
+        with contextlib.suppress(BlockingIOError):
+            left = os.read(alive, 1) != b""
         time.sleep(0.01)
-    assert not running(inner) or adopted_zombie(inner)
+    os.close(alive)
+    assert not left
 
 
 def test_a_process_ends_with_its_rollout(hold):

@@ -130,3 +130,12 @@ def test_a_name_is_no_path(tmp_path):
         Store(tmp_path / "unfinished").write(Work(name, ""), 1.0)
     assert [path.name for path in tmp_path.iterdir()] == ["unfinished"]
     assert all(path.is_file() for path in (tmp_path / "unfinished").iterdir())
+
+
+def test_what_cannot_be_kept_is_a_warning(tmp_path):
+    """The work goes on: space for its result may be there."""
+    (tmp_path / "full").touch()
+    store = Store()
+    store.folder = tmp_path / "full"
+    with pytest.warns(UserWarning, match="cannot write .*after an interruption it is computed again"):
+        assert store.result(WORK, float, lambda: 1.0) == 1.0

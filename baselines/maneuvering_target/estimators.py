@@ -18,7 +18,7 @@ from ...filters.ordered_sums import weighted_sum
 DEGREE = math.pi / 180.0
 
 
-class KalmanModel(ConstantVelocityModel, Filter):
+class KalmanModel(ConstantVelocityModel, Filter[Any, Any, Any]):
     """The constant-velocity model with what estimators share."""
 
     def start(self, initial: Initial) -> Any:

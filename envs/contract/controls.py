@@ -15,7 +15,7 @@ from .filter import Bank, Filter, FilterInput, Measurement, State, TaskT
 from .observation import Array
 
 
-def bank_action_space(control: str, count: int) -> gymnasium.Space:
+def bank_action_space(control: str, count: int) -> gymnasium.Space[Any]:
     """Action space of a control over a bank of ``count`` hypotheses.
 
     ``mode``: the one hypothesis that is believed. ``weights``: absolute weights, normalised by the task (all
@@ -102,7 +102,7 @@ class SettingsBank(Bank[Any, Any, Any]):
         self.log_reach = task.constant([math.log(factor) for factor in factors])[:, None]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number for each setting."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.own.settings),), numpy.float32)
 

@@ -41,5 +41,5 @@ def explain_errors(what: str) -> Iterator[None]:
         yield
     except NotTraceable:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"{what}: {type(error).__name__}: {error}{own_line(error)}") from error

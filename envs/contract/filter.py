@@ -114,7 +114,7 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         self.xp = task.xp  # type: ignore[attr-defined]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """What the action may be; here there is none to choose."""
         return gymnasium.spaces.Discrete(1)
 
@@ -199,7 +199,7 @@ class Bank(Filter[TaskT, Measurement, State]):
 
     @property
     @abstractmethod
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """What the action may be."""
 
     @property

@@ -47,14 +47,14 @@ class Model:
 
     filter: Any
     fields: tuple[Field, ...]
-    action_space: gymnasium.Space
+    action_space: gymnasium.Space[Any]
 
     def __init__(self, task: Task, control: str) -> None:
         self.task = task
         self.control = control
         self._take_filter({**task.banks, **trained_banks(task)}[control](task, control))
 
-    def _take_filter(self, filter: Filter) -> None:
+    def _take_filter(self, filter: Filter[Any, Any, Any]) -> None:
         self.filter = filter
         self._blocks = Blocks(filter.blocks, filter.quantities, self.task.xp)
         self.fields = self._blocks.fields
@@ -98,7 +98,7 @@ class Model:
         """Return the same problem on NumPy arrays, not compiled."""
         return Model(self.task if self.task.xp is numpy else self.task.on(numpy), self.control)
 
-    def with_filter(self, make: Callable[["Model"], Filter]) -> "Model":
+    def with_filter(self, make: Callable[["Model"], Filter[Any, Any, Any]]) -> "Model":
         """Return the same problem with another filter in place of the bank.
 
         Args:

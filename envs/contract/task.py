@@ -123,9 +123,9 @@ class Task(TaskBase):
     before are then refused."""
     Parameters: ClassVar[type]
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
-    World: ClassVar[type[World]]
+    World: ClassVar[type[World[Any, Any, Any]]]
     """Truth and sensors."""
-    banks: ClassVar[Mapping[str, type[Bank]]]
+    banks: ClassVar[Mapping[str, type[Bank[Any, Any, Any]]]]
     """What the action can steer, and the bank that it steers; the first is the default."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"

@@ -82,7 +82,7 @@ class CompiledModel(Model):
         """Return the same problem on NumPy arrays, not compiled."""
         return self._plain
 
-    def with_filter(self, make: Callable[[Model], Filter]) -> "CompiledModel":
+    def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "CompiledModel":
         """Return the same problem with another filter in place of the bank.
 
         Args:

@@ -102,7 +102,7 @@ class Programs:
         self._with_filter: dict[Any, Programs] = {}
         self._kept: dict[Any, Any] = {}
 
-    def with_filter(self, make: Callable[[Model], Filter]) -> "Programs":
+    def with_filter(self, make: Callable[[Model], Filter[Any, Any, Any]]) -> "Programs":
         """Return what is traced of the task with another filter; kept for the next time.
 
         Raises:

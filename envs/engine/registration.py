@@ -46,7 +46,7 @@ def _check_contract(cls: Any) -> None:
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise ValueError(f"an environment is a subclass of filtergym.envs.contract.task.Task, got {cls!r}")
     name = cls.__name__
-    declared = [n for n, hint in Task.__annotations__.items() if get_origin(hint) is ClassVar]
+    declared = [n for n, hint in Task.__annotations__.items() if get_origin(hint) is ClassVar]  # type: ignore[comparison-overlap]
     missing = [n for n in declared if not hasattr(cls, n)]
     if missing:
         raise ValueError(f"{name} lacks the class attributes {', '.join(missing)} of a task")

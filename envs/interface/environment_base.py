@@ -177,7 +177,7 @@ class EnvBase:
 
     # --- what is shown
 
-    def _observation_space(self) -> gymnasium.Space:
+    def _observation_space(self) -> gymnasium.Space[Any]:
         dtype = numpy.dtype(self.options.dtype).type
         low, high = (limits.astype(dtype) for limits in self.model.observation_limits)
         measured = gymnasium.spaces.Box(low, high, dtype=dtype)

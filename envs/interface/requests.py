@@ -52,7 +52,7 @@ def _all_finite(values: Array) -> bool:
         return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
 
 
-def check_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
+def check_action(space: gymnasium.Space[Any], action: Any, count: int | None) -> Array:
     """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
     if is_tensor(action):
         array, values = action, action.detach()

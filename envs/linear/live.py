@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 
+from ...compiler.vector_functions import VectorFunction
 from ..contract.live_input import LiveInput, Memory
 from .equations import StateSpaceProblem, find_invalid_noise
 
@@ -25,6 +26,8 @@ class StateSpaceInput(LiveInput):
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
         self.fuses = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
+        self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
+        self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Return what the sensors and inputs say; the interval follows from the times."""
@@ -37,12 +40,12 @@ class StateSpaceInput(LiveInput):
         )
         return {**names, **held, **found}, at_start
 
-    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start with inputs that nobody knows yet."""
         initial, memory = super().start(time, given)
-        return initial, {**memory, "inputs": numpy.full((len(self.inputs), self.tracks), numpy.nan)}
+        return initial, {**memory, "inputs": self.same_of_all(numpy.nan, (len(self.inputs),))}
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Make the measurement; refuse an interval that the model does not know."""
         interval, own = time - memory["time"], self.parameters.sampling_interval
         values = self._by_name(values)
@@ -51,20 +54,23 @@ class StateSpaceInput(LiveInput):
             values["inputs"] = memory["inputs"]
         if self.measurement.interval is not None:
             return self._checked(super().measure(memory, time, {**values, "interval": interval}), interval)
-        wrong = numpy.abs(interval - own) > UNEVEN * own
-        if wrong.any():
+        wrong = abs(interval - own) > UNEVEN * own
+        if numpy.count_nonzero(wrong):
             raise ValueError(
                 f"the model of {self.task.id} moves by {own:g} s from one measurement to the next, got "
-                f"{float(interval[wrong][0]):g} s: call update once in every interval, without values where nothing "
-                "came, or write f(x, dt) and Q(dt)"
+                f"{float(numpy.extract(wrong, interval)[0]):g} s: call "
+                "update once in every interval, without values where nothing came, or write f(x, dt) and Q(dt)"
             )
         return self._checked(super().measure(memory, time, values), interval)
 
-    def _checked(self, made: tuple[Any, Memory], interval: numpy.ndarray) -> tuple[Any, Memory]:
+    def _checked(self, made: tuple[Any, Memory], interval: Any) -> tuple[Any, Memory]:
         """Return a measurement; raise ValueError where its inputs make R of a sensor no covariance."""
-        measurement = made[0]
-        inputs = measurement.inputs if self.inputs else numpy.zeros((0, self.tracks))
-        found = find_invalid_noise(self.definition, measurement.available, interval, inputs)
+        if not self._noise_varies:
+            return made
+        measurement, N = made[0], self.tracks
+        inputs = numpy.reshape(measurement.inputs if self.inputs else (), (len(self.inputs), N))
+        there = numpy.reshape(measurement.available, (-1, N))
+        found = find_invalid_noise(self.definition, there, numpy.atleast_1d(interval), inputs)
         if found is not None:
             said = ", ".join(f"{name}={inputs[j, found.place]:g}" for j, name in enumerate(self.inputs))
             raise ValueError(
@@ -74,16 +80,15 @@ class StateSpaceInput(LiveInput):
         return made
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values with what the sensors say in one array, ``(m, N)``.
+        """Values with what the sensors say in one array, ``(m, N)``, of one track ``(m,)``.
 
         Raises:
             ValueError: where it is said twice.
         """
-        whole = ["values", *(channel.name for channel in self.groups), *self.measured]
-        named = [name for name in whole if values.get(name) is not None]
+        named = [name for name in self._names if values.get(name) is not None]
         if named in ([], ["values"]):
             return dict(values)
-        rows = numpy.stack([self.read(values, name) for name in self.measured])
+        rows = numpy.array([self.read(values, name) for name in self.measured])
         for channel in self.groups:
             given, own = self.read(values, channel.name, (channel.size,)), rows[channel.places]
             if (numpy.isfinite(given) & numpy.isfinite(own)).any():
@@ -96,15 +101,15 @@ class StateSpaceInput(LiveInput):
         return {**values, "values": rows}
 
     def _hold(self, before: numpy.ndarray, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Inputs, ``(p, N)``: what came, and else what came before.
+        """Inputs, ``(p, N)``, of one track ``(p,)``: what came, and else what came before.
 
         Raises:
             ValueError: where nothing has come so far.
         """
-        given = numpy.stack([self.read(values, name) for name in self.inputs])
+        given = numpy.array([self.read(values, name) for name in self.inputs])
         found = numpy.where(numpy.isfinite(given), given, before)
         if not numpy.isfinite(found).all():
-            lacking = self.inputs[int((~numpy.isfinite(found)).any(axis=1).argmax())]
+            lacking = self.inputs[int((~numpy.isfinite(found)).reshape(len(found), -1).any(axis=1).argmax())]
             raise ValueError(
                 f"{self.task.id} needs {lacking} at the first measurement; later the last one holds on"
             )

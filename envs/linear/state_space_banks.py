@@ -82,7 +82,7 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         self.states, self.sensors = own.f.size, own.h.size
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number from -1 to 1 for each entry of the action."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 
@@ -373,7 +373,7 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         self.sensor_factors = measurement_noise, of_sensors
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number of evidence for each hypothesis."""
         return bank_action_space(self.control, self.count)
 

@@ -453,5 +453,7 @@ def receiver_columns(file: Path, suffix: str, most_rows: int) -> tuple["pandas.D
     except Exception as error:  # libraries raise whatever a broken file makes them stumble over
         if isinstance(error, ValueError) and not isinstance(error, UnicodeError):
             raise
-        raise ValueError(f"it cannot be read as a log {suffix}: {error or type(error).__name__}") from error
+        raise ValueError(
+            f"it cannot be read as a log {suffix}: {str(error) or type(error).__name__}"
+        ) from error
     return pandas.DataFrame(dict(found.columns)), found.notes

@@ -258,7 +258,7 @@ NOISES = ("receiver", "coloured", "white")
 class NoiseBank(KalmanBucyBank):
     """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
 
-    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
     @property
     def reach(self) -> float:
@@ -366,7 +366,7 @@ class GainBank(KalmanBucyBank):
         """Logarithm of the gain at action 0: of the paper's, where that leaves room on both sides."""
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number for each axis."""
         return gymnasium.spaces.Box(-1.0, 1.0, (self.parameters.axes,), numpy.float32)
 
@@ -452,7 +452,7 @@ class SchemeBank(KalmanBucyBank):
         self.plain_growth = task.constant(growth)[:, None, None]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """One filter, or a weight for each."""
         return bank_action_space(self.control, len(SCHEMES))
 

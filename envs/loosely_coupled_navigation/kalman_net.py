@@ -15,6 +15,7 @@ All zero is the augmented filter. Without a fix K is zero. References and readin
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import gymnasium
 import numpy
@@ -35,7 +36,7 @@ GAINS = ("caution", "drift_gain", "coloured_gain")
 class KalmanNetBank(NoiseBank):
     """The augmented filter, whose noises and gain the action sets."""
 
-    action_space: gymnasium.Space = gymnasium.spaces.Box(
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(
         -1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32
     )
     reach: float = 1.0  # it learns through the filter, and does not explore

@@ -18,13 +18,13 @@ class PositionInput(LiveInput):
         values = {name: COLUMNS[name].live_text for name in ("ins", "fix", "sigma")}
         return values, {"ins": "m, position by the INS at the start; default: the mean"}
 
-    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start where INS and track are."""
         initial, memory = super().start(time, {n: v for n, v in given.items() if n != "ins"})
-        ins = self.read(given, "ins", (self.parameters.axes,)) if "ins" in given else initial.mean
+        ins = self.read({"ins": initial.mean, **given}, "ins", (self.parameters.axes,))
         return initial, {**memory, "ins": ins}
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Take increment and fix; a fix of some axes is none."""
         p = self.parameters
         values = {

@@ -182,7 +182,7 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
 class GainBank(RadarBank):
     """Control ``gain``: one filter, whose position gain the action sets."""
 
-    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     least_interval = LEAST_INTERVAL
 
     @property
@@ -343,7 +343,7 @@ class FilterBank(RadarBank):
         self.transition = task.constant(p.transition)
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """One hypothesis, or a number for each."""
         return bank_action_space(self.control, self.count)
 
@@ -489,7 +489,7 @@ class GainsBank(FilterBank):
         self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number for each filter."""
         return gymnasium.spaces.Box(-1.0, 1.0, (self.count,), numpy.float32)
 

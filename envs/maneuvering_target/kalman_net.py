@@ -175,7 +175,7 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
     """An extended Kalman filter whose noises, gain and motion the action sets."""
 
     parameters: ManeuveringTargetParameters
-    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)

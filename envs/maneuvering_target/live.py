@@ -1,5 +1,6 @@
 """Radar plots as they come, as measurements of ManeuveringTarget; columns as of :mod:`.logs`."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,18 @@ from .world import Measurement, Odometry
 SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
 PLACE = ("latitude", "longitude", "altitude")
 VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "azimuth_sigma")
+
+
+def choose(condition: Any, first: Any, second: Any) -> Any:
+    """One of two numbers where a condition is a bool, else one of two in every place, as NumPy's ``where``."""
+    if condition.__class__ is bool:
+        return first if condition else second
+    return numpy.where(condition, first, second)
+
+
+def is_finite(number: Any) -> Any:
+    """Whether a float, or every number of an array, is finite."""
+    return math.isfinite(number) if number.__class__ is float else numpy.isfinite(number)
 
 
 class PlotInput(LiveInput):
@@ -33,7 +46,7 @@ class PlotInput(LiveInput):
         at_start = {name: COLUMNS[name].live_text for name in SECOND_SENSOR[2:]}
         return {name: COLUMNS[name].live_text for name in (*names, *SECOND_SENSOR)}, at_start
 
-    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start as if a scan had just seen the target."""
         initial, memory = super().start(
             time, {name: given[name] for name in ("mean", "covariance") if name in given}
@@ -41,25 +54,23 @@ class PlotInput(LiveInput):
         velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(given)}
         return initial, {**memory, "last_plot": time, **velocity}
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Take a plot for what it is, and its variances at the measured position."""
-        position = self._position(values)
-        there = numpy.isfinite(position).all(axis=0)
-        scan = memory["count"] + 1.0
+        x, y = self._position(values)
+        there, position, scan = is_finite(x) & is_finite(y), numpy.array((x, y)), memory["count"] + 1.0
         measurement = Measurement(
             scan,
-            numpy.where(there, position, 0.0),
-            numpy.where(there, self._variance(position, values), self.parameters.range_sigma**2),
-            there.astype(float),
+            choose(there, position, 0.0),
+            choose(there, self._variance(position, values), self.parameters.range_sigma**2),
+            there * 1.0,
             time - memory["time"],
             time - memory["last_plot"],
         )
-        last_plot = numpy.where(there, time, memory["last_plot"])
-        after = {"time": time, "count": scan, "last_plot": last_plot}
+        after = {"time": time, "count": scan, "last_plot": choose(there, time, memory["last_plot"])}
         if self.measurement.odometry is None:
             return measurement, after
         velocity = self._velocity(values)
-        moved = numpy.stack([self.read(values, "odometry_x"), self.read(values, "odometry_y")])
+        moved = numpy.array([self.read(values, "odometry_x"), self.read(values, "odometry_y")])
         between = 0.5 * measurement.interval * (memory["velocity"] + velocity)
         moved = numpy.where(numpy.isfinite(moved), moved, between)
         says = numpy.isfinite(moved).all(axis=0)
@@ -67,24 +78,26 @@ class PlotInput(LiveInput):
         return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
 
     def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        """Velocity by the second sensor, ``(2, N)``, m/s; NaN where it says none."""
+        """Velocity by the second sensor, ``(2, N)``, of one track ``(2,)``, m/s; NaN where it says none."""
         heading = numpy.radians(self.read(values, "odometry_heading"))
         return east_north(self.read(values, "odometry_speed"), heading)
 
-    def _position(self, values: Mapping[str, Any]) -> numpy.ndarray:
-        if any(name in values for name in PLACE[:2]):
+    def _position(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Position of a plot, x and y; NaN where there is none."""
+        if "latitude" in values or "longitude" in values:
             return self._project(values)
         if "range" not in values:
-            return numpy.stack([self.read(values, "x"), self.read(values, "y")])
+            return self.read(values, "x"), self.read(values, "y")
         distance, azimuth = self.read(values, "range"), numpy.radians(self.read(values, "azimuth"))
-        return east_north(distance, azimuth)
+        x, y = east_north(distance, azimuth)
+        return (x, y) if self.lanes else (float(x), float(y))
 
-    def _project(self, values: Mapping[str, Any]) -> numpy.ndarray:
+    def _project(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
         """Position of latitude and longitude, around the origin of the log that the filter was advised for."""
         twice = [name for name in VALUES[:4] if name in values]
         if twice:
             raise ValueError(f"a plot has {twice[0]} and latitude or longitude: leave one of them out")
-        latitude, longitude, altitude = (self.read(values, name) for name in PLACE)
+        latitude, longitude, altitude = (numpy.atleast_1d(self.read(values, name)) for name in PLACE)
         check_degrees("latitude", latitude, 90.0)
         check_degrees("longitude", longitude, 360.0)
         origin: Any = self.task.recording.origin
@@ -96,20 +109,25 @@ class PlotInput(LiveInput):
                 f"{origin.longitude:g}, around which the log was that the filter is advised for, and the plane there "
                 f"ends at {FARTHEST_RANGE / 1e3:,.0f} km: write another origin into the file"
             )
-        return position
+        return tuple(position) if self.lanes else tuple(position[:, 0].tolist())
 
     def start_from(self, first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, numpy.ndarray]:
         """Start a track as a log's starts: the second plot, and the difference of both over the time between them."""
         plots = [{name: value for name, value in plot.items() if name != "time"} for plot in (first, second)]
-        position = numpy.stack([self._position(plot) for plot in plots])
+        position = numpy.reshape([self._position(plot) for plot in plots], (2, 2, self.tracks))
         lasted = second["time"] - first["time"]
         if not numpy.isfinite(position).all() or not 0.0 < lasted < numpy.inf:
             raise ValueError(
                 f"a track starts from two plots, the second later, got {first!r:.200} and {second!r:.200}"
             )
-        variance = numpy.stack([self._variance(p, plot) for p, plot in zip(position, plots, strict=True)])
+        variance = [
+            numpy.reshape(self._variance(p.reshape(2, *self.lanes), plot), p.shape)
+            for p, plot in zip(position, plots, strict=True)
+        ]
         begun = two_plot_start(
-            numpy.moveaxis(position, -1, 0), numpy.moveaxis(variance, -1, 0), numpy.array([[lasted]])
+            numpy.moveaxis(position, -1, 0),
+            numpy.moveaxis(numpy.stack(variance), -1, 0),
+            numpy.array([[lasted]]),
         )
         return {name: numpy.moveaxis(values, 0, -1) for name, values in begun.items()}
 
@@ -117,16 +135,19 @@ class PlotInput(LiveInput):
         """Variances of a plot: as stated with it, else as the file of the filter says, else the radar's."""
         p, usual = self.parameters, dict(self.task.recording.deviations)
         readings = LiveValues(self, values)
-        stated = numpy.stack([readings.deviations("sigma_x"), readings.deviations("sigma_y")])
+        stated = [readings.deviations("sigma_x"), readings.deviations("sigma_y")]
         distance, bearing = readings.deviations("range_sigma"), readings.deviations("azimuth_sigma")
         if "sigma_x" in usual:  # unless the plot itself states those of a radar
-            default = numpy.array([[usual["sigma_x"]], [usual["sigma_y"]]])
-            stated = numpy.where(numpy.isfinite(stated) | numpy.isfinite(distance), stated, default)
-        distance = numpy.where(numpy.isfinite(distance), distance, usual.get("range_sigma", p.range_sigma))
-        bearing = numpy.where(numpy.isfinite(bearing), bearing, usual.get("azimuth_sigma", p.bearing_sigma))
-        with numpy.errstate(invalid="ignore"):
-            polar_variance = polar.cartesian_variances(position, distance, numpy.radians(bearing))
-        return numpy.where(numpy.isfinite(stated), stated**2, polar_variance)
+            radar = is_finite(distance)
+            stated = [
+                choose(is_finite(one) | radar, one, usual[name])
+                for one, name in zip(stated, ("sigma_x", "sigma_y"), strict=True)
+            ]
+        distance = choose(is_finite(distance), distance, usual.get("range_sigma", p.range_sigma))
+        bearing = choose(is_finite(bearing), bearing, usual.get("azimuth_sigma", p.bearing_sigma))
+        variance = polar.cartesian_variances(position, distance, numpy.radians(bearing))
+        both = zip(stated, variance, strict=True)
+        return numpy.array([choose(is_finite(one), one * one, other) for one, other in both])
 
 
 LIVE_READER = LiveReader(PlotInput)

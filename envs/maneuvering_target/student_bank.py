@@ -108,7 +108,7 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
         """What is shown of the measurement beside the innovation, relative to the frame."""
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """Gains, offsets, the Cholesky factor and the motion."""
         count = self.size * (self.measured + 1) + self.size * (self.size + 1) // 2 + len(self.motions)
         return gymnasium.spaces.Box(-1.0, 1.0, (count,), numpy.float32)

@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -109,7 +109,7 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
         self.log_prior = imm.log_probabilities(constant(p.prior))[:, None]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """One class, or a number for each."""
         return bank_action_space(self.control, self.task.classes)
 

@@ -86,7 +86,7 @@ class KalmanNetBank(ClassBank):
         )
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """Evidence, noises, and what the gain alone takes for them."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 

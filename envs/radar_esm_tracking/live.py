@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 
+from ...compiler.functions import map_arrays
 from ..contract.live_input import LiveInput, LiveReader, LiveValues, Memory
 from .logs import COLUMNS, read_decisions, start_track
 from .world import Measurement, Start
@@ -23,27 +24,33 @@ class ScanInput(LiveInput):
         texts = {name: column.live_text for name, column in COLUMNS.items()}
         return texts, texts
 
-    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start the track on its first scan; mean and covariance follow from it unless they are given."""
         first = self._scan(numpy.zeros(self.tracks), {n: v for n, v in given.items() if n in COLUMNS})
         measured = {name: numpy.moveaxis(array, -1, 0)[:, None] for name, array in first._asdict().items()}
         twice = {name: numpy.repeat(array, 2, axis=1) for name, array in measured.items()}
-        found = start_track(twice, time[:, None], self.parameters).initial
+        found = start_track(twice, numpy.reshape(time, (-1, 1)), self.parameters).initial
         initial = {name: numpy.moveaxis(found[name], 0, -1) for name in ("mean", "covariance")}
         for name, array in initial.items():
             if given.get(name) is not None:
-                initial[name] = self.read(given, name, array.shape[:-1])
-        return Start(**initial, first=first), {"time": time, "count": numpy.zeros(self.tracks)}
+                initial[name] = self.read(given, name, array.shape[:-1]).reshape(array.shape)
+        return Start(**initial, first=first), {"time": time, "count": self.same_of_all(0.0)}
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Take a scan."""
         scan = memory["count"] + 1.0
-        return self._scan(scan, values), {"time": time, "count": scan}
+        found = self._scan(numpy.atleast_1d(scan), values)
+        return found if self.lanes else map_arrays(_first, found), {"time": time, "count": scan}
 
     def _scan(self, scan: numpy.ndarray, values: Mapping[str, Any]) -> Measurement:
-        radar = self.read_all(values, ("range", "range_rate"), "at every scan")
+        """Scan of its numbers, ``(N,)``, also of one track."""
+        radar = self.read_all(values, ("range", "range_rate"), "at every scan").reshape(2, -1)
         found = read_decisions(LiveValues(self, values), scan, self.parameters)
         return Measurement(scan=scan.astype(numpy.int64), radar=radar, **found)
+
+
+def _first(array: numpy.ndarray) -> Any:
+    return array[..., 0]
 
 
 LIVE_READER = LiveReader(ScanInput)

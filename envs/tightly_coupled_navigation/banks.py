@@ -181,7 +181,7 @@ class HypothesisBank(SatelliteBank):
     """Controls ``evidence``, ``mode`` and ``weights``: the action weighs the hypotheses."""
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """One hypothesis, or a number for each."""
         return bank_action_space(self.control, len(self.hypotheses))
 
@@ -353,7 +353,7 @@ class NoiseBank(HypothesisBank):
     adapts_covariance = True
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """A number for each group of sensors."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.actions),), numpy.float32)
 

@@ -35,7 +35,7 @@ class ReceiverInput(LiveInput):
     def _count(sensor: Any) -> int:
         return int(sensor.readings.stop - sensor.readings.start)
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Put the readings of all sensors one after another."""
         names = {sensor.name for sensor in self._sensors}
         readings = [self.read(values, sensor.name, (self._count(sensor),)) for sensor in self._sensors]

@@ -309,7 +309,7 @@ class _KalmanBank(AutopilotBank):
 class GainBank(_KalmanBank):
     """Control ``gain``: the action scales the process noise."""
 
-    action_space: gymnasium.Space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
     action_block = last_action_block(name="action")
     no_action = (0.0,)
 
@@ -338,7 +338,7 @@ class NoiseBank(_KalmanBank):
         self.nominal_variances = task.constant(task.sensor_variances)[:, None]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """The process noise, then each sensor."""
         return gymnasium.spaces.Box(-1.0, 1.0, (1 + len(self.task.sensors),), numpy.float32)
 
@@ -363,7 +363,7 @@ class NoiseBank(_KalmanBank):
 class ModeBank(_KalmanBank):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
-    action_space: gymnasium.Space = gymnasium.spaces.Discrete(len(MODES))
+    action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(MODES))
     action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
     no_action = (1.0, 0.0, 0.0, 0.0)
 

@@ -84,7 +84,7 @@ class KalmanNetBank(NoiseBank):
         return [reading if block.name == reading.name else block for block in super().blocks]
 
     @property
-    def action_space(self) -> gymnasium.Space:
+    def action_space(self) -> gymnasium.Space[Any]:
         """Parts of the process noise, sensors, and what the gain alone takes for them."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.answers),), numpy.float32)
 

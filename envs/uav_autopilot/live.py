@@ -21,18 +21,17 @@ class SensorInput(LiveInput):
         }
         return values, {"command": "at the start, in the unit of the output"}
 
-    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def start(self, time: Any, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start with no reading; nothing is commanded unless it is said."""
         initial, memory = super().start(time, {"command": 0.0, **given})
-        sensors = self.measurement.reading.shape[0]
-        return initial, {**memory, "reading": numpy.zeros((sensors, self.tracks))}
+        return initial, {**memory, "reading": self.same_of_all(0.0, self.measurement.reading.shape[:-1])}
 
-    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+    def measure(self, memory: Memory, time: Any, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Take the readings that came."""
         measurement, after = super().measure(memory, time, values)
         return measurement, {**after, "reading": measurement.reading}
 
-    def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
+    def replace_missing(self, memory: Memory, received: Any, there: Any) -> Any:
         """Hold the last reading."""
         return numpy.where(there, received, memory["reading"])
 

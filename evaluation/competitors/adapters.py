@@ -4,16 +4,16 @@ One object an episode, each asked in turn: honest, and slow. An estimator in a p
 (:data:`.isolation.SHARED`), so it imports nothing else of the package.
 """
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy
 
 if TYPE_CHECKING:
     from ...envs.contract.task import Task
-    from .kinds import Kind
 
 Array = Any
 """A NumPy array."""
@@ -33,6 +33,28 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     return part[..., lanes]
 
 
+def takes_problem(maker: Any) -> bool:
+    """Whether a class or function is given the problem: its first argument has no default, or is called so."""
+    try:
+        first = next(iter(inspect.signature(maker).parameters.values()), None)
+    except ValueError:  # of a class that is compiled
+        return True
+    return first is not None and (first.default is first.empty or first.name in ("task", "model"))
+
+
+def check_update_order(found: Any) -> None:
+    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement."""
+    try:
+        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
+    except (AttributeError, TypeError, ValueError):  # without one, or compiled
+        return
+    if "memory" in names[1:]:
+        raise ValueError(
+            f"update takes the memory first, as update({', '.join(['memory', *(n for n in names if n != 'memory')])}), "
+            f"but this one is update({', '.join(names)}): change the order of its arguments"
+        )
+
+
 class SingleTrackEstimator(ABC):
     """Base of estimators that know one track only: an :class:`.Estimator` that keeps an object for each episode.
 
@@ -46,7 +68,7 @@ class SingleTrackEstimator(ABC):
         ValueError: if ``state`` lacks a component of the task.
     """
 
-    kind: ClassVar["Kind"] = "estimator"
+    kind: ClassVar[Literal["estimator"]] = "estimator"
     state: Sequence[str] = ()
     """Names of the numbers of the estimator's state, in its order: the task's components in any order, and whatever
     else there is. Default: the task's components in theirs."""

@@ -124,7 +124,7 @@ class BoundAdapter(ReferenceAdapter):
         return limit, None, memory
 
 
-def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter:
+def as_filter(task: Task, own: Any, kind: Kind = "estimator") -> Filter[Any, Any, Any]:
     """Return what was made for a task as a filter: itself, if it is one."""
     if isinstance(own, Filter):
         return own
@@ -261,7 +261,7 @@ class CheckedFilter(Filter[Task, Any, Checked]):
     that losing an episode is no advantage.
     """
 
-    def __init__(self, task: Task, own: Filter) -> None:
+    def __init__(self, task: Task, own: Filter[Any, Any, Any]) -> None:
         super().__init__(task)
         self.own, self.in_python, self.stated = own, own.in_python, own.stated
 
@@ -408,7 +408,7 @@ class BoundFilter(AroundBank[LimitState]):
         bank: what flies the loop.
     """
 
-    def __init__(self, task: Task, own: Filter, bank: Any) -> None:
+    def __init__(self, task: Task, own: Filter[Any, Any, Any], bank: Any) -> None:
         super().__init__(task)
         self.own, self.bank, self.in_python = own, bank, own.in_python
         self.knows = own.knows or "the truth"
@@ -434,7 +434,7 @@ class BoundFilter(AroundBank[LimitState]):
         return {"mean_square": self.own.mean(state.own)}
 
 
-def surround(kind: Kind, model: Model, own: Filter) -> Filter:
+def surround(kind: Kind, model: Model, own: Filter[Any, Any, Any]) -> Filter[Any, Any, Any]:
     """Return what runs in a model's loop: a competitor checked, a bound beside the bank, a reference as it is."""
     if kind == "bound":
         return BoundFilter(model.task, own, model.filter)
@@ -451,7 +451,7 @@ class _Maker:
     stated: Stated | None = None
     """Of one that runs in Python."""
 
-    def __call__(self, model: Model) -> Filter:
+    def __call__(self, model: Model) -> Filter[Any, Any, Any]:
         """Make it, on any arrays."""
         task = model.task
         own = (
@@ -462,7 +462,7 @@ class _Maker:
         return surround(self.kind, model, as_filter(task, own, self.kind))
 
 
-def _can_be_traced(maker: Any, own: Filter) -> bool:
+def _can_be_traced(maker: Any, own: Filter[Any, Any, Any]) -> bool:
     if own.in_python or not callable(maker):
         return False
     try:

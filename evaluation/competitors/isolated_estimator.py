@@ -1,21 +1,32 @@
-"""A Python estimator in a process of its own, which speaks the protocol of programs (docs/programs.md).
+"""A process that cannot reach the one that runs it: of a program, or of a Python estimator behind a wall.
 
-:mod:`.isolation` starts this file with the interpreter's ``-I -S``. Its first line of input is a request in JSON: the
-source text of the estimator, or its file; the folders where libraries are; and what may be read at all. Then comes the
-hello. Of the package there is only what the request carries as text, ``filtergym.adapters``, which knows no world and
-no seed, so it does not matter how the package was installed. The rest cannot be imported: on Linux, Landlock
-(landlock(7)) lets the process read the libraries and the folder of the estimator, write nothing, begin no other
-program, open no TCP connection, and look into no other process. Elsewhere the package is only not on the path.
+:mod:`.program_process` starts this file with the interpreter's ``-I -S``, the bytes of memory that it may take, and
+the words of a program (docs/programs.md), which is executed in a PID namespace: it sees no other process and ends with
+its first one, with all that it has begun. Without one, this process adopts what is left and ends that.
+
+Without words it serves an estimator. Its first line of input is a request in JSON: the source text of the estimator,
+or its file; the folders where libraries are; and what may be read at all. Then comes the hello. Of the package there
+is only what the request carries as text, ``filtergym.adapters``, which knows no world and no seed, so it does not
+matter how the package was installed. The rest cannot be imported. On Linux each layer closes what it can:
+
+* namespaces (namespaces(7)) of the network, of System V and POSIX memory, and of processes;
+* Landlock (landlock(7)): it reads libraries and the folder of the estimator, and writes nothing;
+* a filter of system calls (seccomp(2)): what no table here names is refused, above all new processes.
+
+Elsewhere the package is only not on the path.
 """
 
+from __future__ import annotations
+
 import ctypes
-import json
 import os
 import sys
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
-from types import ModuleType, SimpleNamespace
-from typing import Any, BinaryIO
+
+TYPE_CHECKING = False  # and further imports below, where they are needed: a program waits for those here
+if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+    from typing import Any, BinaryIO
 
 LANES = 8
 """The number of episodes is filled up to a multiple, as the package does: rounding depends on it."""
@@ -23,11 +34,111 @@ READ, LIST = 1 << 2, 1 << 3
 """Rights of Landlock to read a file and to list a folder; those handled are all that a version knows."""
 RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 4: (1 << 15) - 1, 5: (1 << 16) - 1}
 """Rights over files, by the version of Landlock; later ones have as many as the last."""
-OPEN = "no wall here, this system has no Landlock: it could read any file, the package's among them"
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """System calls."""
-END_WITH_PARENT, NO_NEW_PRIVILEGES = 1, 38
+NEW_USER, NEW_PID, NEW_OTHERS = 0x10000000, 0x20000000, 0x48000000
+"""Namespaces of unshare(2); the last are those of the network and of IPC."""
+KILL, TERMINATE = 9, 15
+"""Signals."""
+END_WITH_PARENT, SET_FILTER, ADOPT, NO_NEW_PRIVILEGES = 1, 22, 36, 38
 """Of prctl(2)."""
+MACHINES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
+"""Column of the table below, and number of the architecture, by the name of a machine."""
+CALLS = """
+read 0 63, write 1 64, readv 19 65, writev 20 66, pread64 17 67, lseek 8 62, close 3 57, close_range 436 436,
+dup 32 23, dup2 33 -, dup3 292 24, pipe 22 -, pipe2 293 59, poll 7 -, ppoll 271 73, select 23 -, pselect6 270 72,
+fcntl 72 25, open 2 -, openat 257 56, fstat 5 80, stat 4 -, lstat 6 -, newfstatat 262 79, statx 332 291, access 21 -,
+faccessat 269 48, faccessat2 439 439, readlink 89 -, readlinkat 267 78, getcwd 79 17, getdents64 217 61,
+statfs 137 43, fstatfs 138 44, fadvise64 221 223, eventfd2 290 19, mmap 9 222, munmap 11 215, mprotect 10 226,
+mremap 25 216, madvise 28 233, brk 12 214, membarrier 324 283, clone 56 220, clone3 435 435, futex 202 98,
+set_robust_list 273 99, rseq 334 293, set_tid_address 218 96, prctl 157 167, sched_yield 24 124,
+sched_getaffinity 204 123, sched_getparam 143 121, sched_getscheduler 145 120, getcpu 309 168, get_mempolicy 239 236,
+getpid 39 172, getppid 110 173, gettid 186 178, getuid 102 174, geteuid 107 175, getgid 104 176, getegid 108 177,
+uname 63 160, sysinfo 99 179, times 100 153, getrusage 98 165, getrlimit 97 163, prlimit64 302 261,
+clock_gettime 228 113, clock_getres 229 114, clock_nanosleep 230 115, nanosleep 35 101, gettimeofday 96 169, time 201 -,
+getrandom 318 278, rt_sigaction 13 134, rt_sigprocmask 14 135, rt_sigreturn 15 139, sigaltstack 131 132,
+restart_syscall 219 128, kill 62 129, tgkill 234 131, exit 60 93, exit_group 231 94
+"""
+"""All that an estimator may call, with its numbers on both machines: reading, memory, threads, time and its own end."""
+ANY, WRITING, THREAD = 0xFFFFFFFF, os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0x10000
+"""Bits of arguments: all, to open a file for writing, and to begin a thread instead of a process."""
+FORBIDDEN, MISSING, PERMITTED = 0x50001, 0x50026, 0x7FFF0000
+"""Answers of a filter: EPERM, ENOSYS, and the call."""
+
+
+def enter_namespaces(libc: Any, wanted: int) -> bool:
+    """Give this process namespaces of its own, in one of users unless it may without; returns whether the system does.
+
+    Its children are the first in one of processes.
+    """
+    user, group = os.getuid(), os.getgid()
+    if libc.unshare(wanted) == 0:
+        return True
+    if libc.unshare(NEW_USER | wanted):
+        return False
+    for name, words in (
+        ("setgroups", "deny"),
+        ("uid_map", f"{user} {user} 1"),
+        ("gid_map", f"{group} {group} 1"),
+    ):
+        try:
+            with open(f"/proc/self/{name}", "w") as file:
+                file.write(words)
+        except OSError:  # it keeps its rights over files without
+            pass
+    return True
+
+
+def leave_to_child(libc: Any, apart: bool) -> None:
+    """Go on as a child; this process waits for it, ends what it leaves behind, and then itself in the same way."""
+    libc.prctl(ADOPT, 1, 0, 0, 0)
+    if (child := os.fork()) == 0:
+        libc.prctl(END_WITH_PARENT, KILL, 0, 0, 0)
+        return
+    for pipe in (0, 1, 2):
+        os.close(pipe)
+    if not apart:  # the first process of a namespace ends with its parent, and all others with that one
+        import signal
+
+        signal.signal(signal.SIGTERM, lambda *_: os._exit(end_children()))
+    ended = status = 0
+    while ended != child:
+        ended, status = os.wait()
+    code = os.waitstatus_to_exitcode(status)
+    if os.getpid() == 1:  # which no signal ends
+        os._exit(128 - code if code < 0 else code)
+    end_children()
+    if 0 < (number := -code if code < 0 else code - 128) < 32:
+        limit_own("RLIMIT_CORE", 0)
+        libc.signal(number, None)
+        os.kill(os.getpid(), number)
+    os._exit(code)
+
+
+def limit_own(name: str, most: int) -> None:
+    """Limit a resource of this process, unless a lower limit is in force."""
+    import resource
+
+    kind = getattr(resource, name)
+    lowest = min([most, *(own for own in resource.getrlimit(kind) if own != resource.RLIM_INFINITY)])
+    resource.setrlimit(kind, (lowest, lowest))
+
+
+def end_children() -> int:
+    """End the children of this process, and theirs, which become its own; returns zero."""
+    own = os.getpid()
+    while True:
+        try:
+            os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            return 0
+        for name in filter(str.isdigit, os.listdir("/proc")):
+            try:
+                with open(f"/proc/{name}/stat", "rb") as file:
+                    if int(file.read().rpartition(b")")[2].split()[1]) == own:
+                        os.kill(int(name), KILL)
+            except OSError:  # it has ended meanwhile
+                pass
 
 
 def landlock_version() -> int:
@@ -38,18 +149,15 @@ def landlock_version() -> int:
     return version
 
 
-def wall(readable: list[str], listable: list[str]) -> bool:
-    """Close this process in, for good; returns whether the system can.
+def restrict_files(libc: Any, version: int, readable: list[str], listable: list[str]) -> None:
+    """Let this process read some files and write none, by Landlock.
 
     Args:
+        libc: the C library.
+        version: of Landlock.
         readable: files and folders that may be read, with all below them.
         listable: folders of which the names may be read, with those of all folders below them.
     """
-    version = landlock_version()
-    if version < 1:
-        return False
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(END_WITH_PARENT, 9, 0, 0, 0)  # whoever is killed cannot end this process
     rights = RIGHTS[min(version, max(RIGHTS))]
     # Files; to bind and to connect, from version 4 on; abstract sockets and signals, from 6 on.
     handled = (ctypes.c_uint64 * 3)(rights, 3 if version >= 4 else 0, 3 if version >= 6 else 0)
@@ -65,13 +173,77 @@ def wall(readable: list[str], listable: list[str]) -> bool:
         if libc.syscall(ADD_RULE, rules, 1, rule, 0):
             raise OSError(ctypes.get_errno(), f"landlock refuses {path}")
         os.close(place)
-    if libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0) or libc.syscall(RESTRICT_SELF, rules, 0):
+    if libc.syscall(RESTRICT_SELF, rules, 0):
         raise OSError(ctypes.get_errno(), "landlock restricts nothing")
     os.close(rules)
-    return True
 
 
-class SharedModules(MetaPathFinder, Loader):
+def filter_calls(libc: Any) -> bool:
+    """Refuse this process all system calls but those of the table, for good; returns whether the system does."""
+    import struct
+
+    column, machine = MACHINES.get(os.uname().machine, (0, 0))
+    if not machine or sys.maxsize < 1 << 32:
+        return False
+    calls = {name: numbers[column] for name, *numbers in map(str.split, CALLS.split(","))}
+    own = (os.getpid(),)
+    # Of some calls words of their arguments: which, the bits that count, and what those may be.
+    checks: dict[str, list[tuple[int, int, tuple[int, ...]]]] = {
+        "clone": [(0, THREAD, (THREAD,))],
+        "fcntl": [(2, ANY, (0, 1, 2, 3, 4, 1030))],  # to duplicate, and flags; the others watch and signal
+        "kill": [(0, ANY, own)],
+        "open": [(2, WRITING, (0,))],
+        "openat": [(4, WRITING, (0,))],
+        "prctl": [(0, ANY, (15, 16))],  # names of threads
+        "prlimit64": [(0, ANY, (0,)), (4, ANY, (0,)), (5, ANY, (0,))],  # its own, and no new one
+        "tgkill": [(0, ANY, own)],
+    }
+    # Of struct sock_filter: code, jumps if true and if false, value. Load is 0x20, and 0x54, jump if equal 0x15, end 6.
+    code = [(0x20, 0, 0, 4), (0x15, 1, 0, machine), (6, 0, 0, FORBIDDEN), (0x20, 0, 0, 0)]
+    for name, number in calls.items():
+        block = []
+        for word, bits, values in checks.get(name, []):
+            block += [(0x20, 0, 0, 16 + 4 * word), (0x54, 0, 0, bits)]
+            block += [(0x15, len(values) - i, 0, value) for i, value in enumerate(values)]
+            block += [(6, 0, 0, FORBIDDEN)]
+        block += [(6, 0, 0, MISSING if name == "clone3" else PERMITTED)]
+        code += [(0x15, 0, len(block), int(number)), *block] if number != "-" else []
+    code += [(6, 0, 0, FORBIDDEN)]
+    content = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *one) for one in code))
+    return bool(libc.prctl(SET_FILTER, 2, struct.pack("HP", len(code), ctypes.addressof(content)), 0, 0) == 0)
+
+
+def wall(readable: list[str], listable: list[str], apart: bool) -> str:
+    """Close this process in, for good, and return what stays open, in one sentence; empty if nothing does.
+
+    Args:
+        readable: as of :func:`restrict_files`, likewise what follows.
+        listable: likewise.
+        apart: whether it is in namespaces of its own.
+    """
+    version, filtered = landlock_version(), False
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0)
+        if version > 0:
+            restrict_files(libc, version, readable, listable)
+        filtered = filter_calls(libc)
+        if not (apart or filtered):
+            limit_own("RLIMIT_NPROC", 0)
+    missing = {"Landlock": version > 0, "a filter of system calls": filtered, "namespaces": apart or filtered}
+    gaps = {
+        "read any file, the package's among them": version > 0,
+        "write files": version > 0 or filtered,
+        "leave notes in times and modes of files and in keyrings": filtered,
+        "leave notes in shared memory, connect, and end or slow this process": filtered or apart,
+    }
+    without, could = ([name for name, closed in own.items() if not closed] for own in (missing, gaps))
+    return (
+        f"no whole wall here, without {' and '.join(without)}: it could {', '.join(could)}" if could else ""
+    )
+
+
+class SharedModules:
     """Finds the modules of the package that a request carries as text, with the packages around them.
 
     Args:
@@ -79,12 +251,18 @@ class SharedModules(MetaPathFinder, Loader):
     """
 
     def __init__(self, texts: dict[str, str]) -> None:
+        from importlib.machinery import ModuleSpec
+
         self.texts = texts
+        self.new: Any = ModuleSpec
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """Find a module that is shared, or a package around one."""
         around = any(shared.startswith(name + ".") for shared in self.texts)
-        return ModuleSpec(name, self, is_package=around) if around or name in self.texts else None
+        return self.new(name, self, is_package=around) if around or name in self.texts else None
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Leave it to Python to make a module."""
 
     def exec_module(self, module: ModuleType) -> None:
         """Run the text of a module; that of a package is empty."""
@@ -107,8 +285,11 @@ def nested(values: dict[str, Any], name: str) -> Any:
     return namedtuple(name.capitalize(), list(held))(**held)
 
 
-class Parameters(SimpleNamespace):
+class Parameters:
     """The constants of the task."""
+
+    def __init__(self, **values: Any) -> None:
+        self.__dict__.update(values)
 
     def value(self, name: str) -> Any:
         """Value of a constant."""
@@ -117,6 +298,8 @@ class Parameters(SimpleNamespace):
 
 def make_task(hello: dict[str, Any], numpy: ModuleType) -> Any:
     """Return what the constructor of an estimator is given in place of the task."""
+    from types import SimpleNamespace
+
     parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in hello["parameters"].items()}
     components = tuple(SimpleNamespace(**own) for own in hello["components"])
     groups = {name: tuple(parts) for name, parts in hello["groups"].items()}
@@ -161,6 +344,8 @@ class Frames:
 
 def load(request: dict[str, Any]) -> Any:
     """Return the class that a request names."""
+    from types import ModuleType
+
     module = ModuleType(request["module"])
     module.__dict__["__file__"] = request["file"]
     sys.modules[request["module"]] = module
@@ -173,46 +358,54 @@ def load(request: dict[str, Any]) -> Any:
     return found
 
 
-def takes_problem(maker: Any) -> bool:
-    """Whether a class or function is given the problem: its first argument has no default, or is called so."""
-    import inspect
-
-    try:
-        first = next(iter(inspect.signature(maker).parameters.values()), None)
-    except ValueError:  # of a class that is compiled
-        return True
-    return first is not None and (first.default is first.empty or first.name in ("task", "model"))
-
-
-def check_update_order(found: Any) -> None:
-    """Raise ValueError if the names of what ``update`` takes put the memory behind the measurement."""
-    import inspect
-
-    try:
-        names = [name for name in inspect.signature(found.update).parameters if name != "self"]
-    except (AttributeError, TypeError, ValueError):  # without one, or compiled
-        return
-    if "memory" in names[1:]:
-        raise ValueError(
-            f"update takes the memory first, as update({', '.join(['memory', *(n for n in names if n != 'memory')])}), "
-            f"but this one is update({', '.join(names)}): change the order of its arguments"
-        )
-
-
 def make(found: Any, task: Any) -> Any:
     """Make an estimator of its class, for the task if the constructor takes it."""
+    from filtergym.evaluation.competitors.adapters import check_update_order, takes_problem
+
     check_update_order(found)
     if not isinstance(found, type):
         return found
     return found(task) if takes_problem(found) else found()
 
 
-def main() -> None:
-    """Serve one estimator."""
+def run_program(words: list[str]) -> None:
+    """Become a program."""
+    for number in (13, 25):  # SIGPIPE and SIGXFSZ, which Python ignores
+        ctypes.CDLL(None).signal(number, None)
+    try:
+        os.execvp(words[0], words)
+    except OSError as error:
+        os.write(2, f"{words[0]}: {error.strerror}\n".encode())
+        os._exit(127)
+
+
+def main(memory: str, *words: str) -> None:
+    """Run a program, or serve one estimator.
+
+    Args:
+        memory: bytes of address space; 0: as many as there are. Only Linux limits them.
+        words: of the program.
+    """
+    apart = False
+    if sys.platform == "linux":
+        if int(memory):
+            limit_own("RLIMIT_AS", int(memory))
+        libc = ctypes.CDLL(None, use_errno=True)
+        apart = enter_namespaces(libc, NEW_PID if words else NEW_PID | NEW_OTHERS)
+        libc.prctl(END_WITH_PARENT, TERMINATE, 0, 0, 0)
+        for _ in range(1 + apart):  # the first one of a namespace only waits
+            leave_to_child(libc, apart)
+    run_program([*words]) if words else serve(apart)
+
+
+def serve(apart: bool) -> None:
+    """Serve one estimator, in namespaces of its own or not."""
+    import json
+
     questions, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what an estimator prints is no answer
     request, hello = json.loads(questions.readline()), json.loads(questions.readline())
-    closed = wall(request["readable"], request["listable"])
+    gaps = wall(request["readable"], request["listable"], apart)
     sys.path[:] = request["path"]
     sys.meta_path.insert(0, SharedModules(request["shared"]))
     import numpy
@@ -222,7 +415,7 @@ def main() -> None:
     except Exception as error:  # a module is a program: it can raise anything
         said: dict[str, Any] = {"error": f"{type(error).__name__}: {error}"}
     else:
-        said = {"filtergym": 1, "format": "float64"} | ({} if closed else {"warning": OPEN})
+        said = {"filtergym": 1, "format": "float64"} | ({"warning": gaps} if gaps else {})
     answers.write(json.dumps(said).encode() + b"\n")
     answers.flush()
     frames = Frames(hello, numpy, questions)
@@ -242,4 +435,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

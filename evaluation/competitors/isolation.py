@@ -16,7 +16,6 @@ from typing import Any
 
 from ...envs.engine.catalogue import find_user_module
 from ..storage.code import package_folders
-from . import isolated_estimator
 from .kinds import Competitor
 from .programs import LIMITS, Program
 
@@ -92,7 +91,7 @@ def isolate_source(text: str, attribute: str, name: str, file: Path | None = Non
     return Program(
         name,
         LIMITS.get(),
-        (sys.executable, "-I", "-S", "-B", isolated_estimator.__file__),
+        (),
         json.dumps(request).encode() + b"\n",
         (*ONE_THREAD, ("PATH", os.defpath), ("LANG", "C.UTF-8")),
     )

@@ -20,7 +20,7 @@ from ...envs.contract.filter import Filter
 from ...envs.contract.model import Model
 from ...envs.contract.task import Array, Task
 from ...filters.array_namespace import host_array
-from .isolated_estimator import check_update_order, takes_problem
+from .adapters import check_update_order, takes_problem
 
 Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")

@@ -148,7 +148,7 @@ def _update(
     return _step(as_filter(task, own), measurement, memory)
 
 
-def _step(filter: Filter, measurement: Any, state: Any) -> tuple[Any, Array]:
+def _step(filter: Filter[Any, Any, Any], measurement: Any, state: Any) -> tuple[Any, Array]:
     received = filter.task.world.mask_missing(measurement)
     after = filter.step(state, FilterInput(received))
     return after, filter.records(after, received).get("log_likelihood")

@@ -5,7 +5,7 @@ It is what competes in an evaluation, run by the same code: of the same measurem
 
 import copy
 import importlib.metadata
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from datetime import timedelta
@@ -20,15 +20,15 @@ from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
 from ...envs.data.clock import SINCE_1970, time_unit
-from ...envs.engine.episode_noise import MeasurementRow
-from ...envs.engine.lanes import make_stepper
+from ...envs.engine.compiled import can_step
 from ...filters.array_namespace import select_nested
 from ..storage.dataset import FAULTS
 from .adapters import select_lanes
 from .filters import find_fault, put_in_loop
 from .kinds import check_competitor, kind_of, make_competitor
 from .online_state import Estimate, History, OnlineState, Taken, Watch
-from .stepping import SteppingPolicy
+from .steered_filter import compile_policy, trace_policy
+from .stepping import CompiledUpdate, MeasurementMemory, ModelUpdate, SteppingPolicy
 
 LEAST_INTERVAL = 1e-6
 """Of the sampling interval: measurements that are closer in time are the same moment, written twice."""
@@ -46,7 +46,7 @@ class OnlineFilter:
         competitor: policy or estimator, or what makes it.
         name: of it, in errors.
         tracks: how many are followed side by side.
-        watch: looks at what a network inside is shown; None where there is none.
+        watch: compares what a network inside is shown with its training; None where there is none.
         lag: how many measurements, or how much time, a measurement may come late; see :meth:`update`. For each of those
             kept, the filter's state is, and what the policy or estimator remembers.
 
@@ -73,28 +73,42 @@ class OnlineFilter:
         self.task = model.task
         world: Any = self.task.world
         self.input = LiveReader.of(self.task).input(self.task, world.initial, world.measurement, tracks)
+        self._is_policy, interval = kind == "policy", self.task.decision_interval
+        self._interval, self._means = interval, DecisionMeans(model.fields, interval)
+        self.model = model if self._is_policy else put_in_loop(model, competitor, kind, name, tracks)
+        observe, traced = None if watch is None else watch.observe, None
+        is_compiled = can_step(self.model, report_estimate)
         self._policy: SteppingPolicy | None = None
-        if kind == "policy":
-            self._policy = SteppingPolicy(
-                model, check_competitor(name, make_competitor(competitor, model), kind)
-            )
-            self.model = model
-        else:
-            self.model = put_in_loop(model, competitor, kind, name, tracks)
+        """Asked in Python."""
+        if self._is_policy:
+            policy = check_competitor(name, make_competitor(competitor, model), kind)
+            if is_compiled and not (watch and self._means.columns):  # means over a decision are not written
+                traced = compile_policy(model, policy, trace_policy)
+            self._policy = None if traced else SteppingPolicy(model, policy)
         self.names = tuple(component.name for component in self.task.components)
         self.units = tuple(component.unit for component in self.task.components)
-        interval = self.task.decision_interval
-        self._interval, self._means = interval, DecisionMeans(self.model.fields, interval)
+        blank = Estimate(None, self.names, self.units, numpy.empty(0), numpy.empty(0))
+        self._same_of_estimates = dict(vars(blank))
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
-        self._stepper = make_stepper(self.model, report_estimate, len(self._pad))
-        self._stepper.take(numpy.zeros((len(self._pad), *(self.model.action_space.shape or ()))))
-        self._measured = MeasurementRow(world.measurement, len(self._pad))
+        self._is_asked = self._policy is not None or not is_compiled
+        self._no_action = numpy.zeros((len(self._pad), *(self.model.action_space.shape or ())))
+        own: Any = self.model
+        self._update: CompiledUpdate | ModelUpdate = (
+            CompiledUpdate(own, report_estimate, tracks, traced, self._is_asked, observe)
+            if is_compiled
+            else ModelUpdate(own, report_estimate, tracks, world.measurement, observe)
+        )
+        usual = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
+        self._usual = None if usual is None else float(usual)
+        """Interval of measurements, s; None: any."""
+        self._least = 0.0 if usual is None else max(LEAST_INTERVAL, self.model.filter.least_interval) * usual
+        self._scan_interval = getattr(self.task.recording, "scan_interval", None)
         of_tracks = f"{tracks} track{'s' * (tracks > 1)}"
         version = f"filtergym {importlib.metadata.version('filtergym')}"
         self._owner = (self.task.id, f"interface {self.task.interface}", name, of_tracks, version)
         self._state: OnlineState | None = None
         self._valid: Estimate | None = None  # the last one that no track has lost
-        """Without the filter's, which the stepper holds."""
+        """Without those of the filter and of a traced policy, which the update holds."""
 
     def __repr__(self) -> str:
         takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
@@ -132,13 +146,15 @@ class OnlineFilter:
         self._check_covariance(initial)
         if tracks is not None:
             self._check_restart()
+        begun = self._begin(initial, memory)
+        self._go_on(begun if tracks is None else self._merge(begun, tracks))
+
+    def _begin(self, initial: Any, memory: Any) -> OnlineState:
+        """State at the start of all tracks."""
+        own = self._policy
+        policy = self._update.blank_policy if own is None else own.begin(range(self.tracks))
         state = self.model.start_filter(self._padded(initial))
-        begun = OnlineState(state, memory, fresh=numpy.ones(self.tracks, dtype=bool))
-        if tracks is not None:
-            begun = self._merge(begun, tracks)
-        elif self._policy is not None:
-            begun = begun._replace(policy=self._policy.begin(range(self.tracks)))
-        self._go_on(begun)
+        return OnlineState(state, memory, policy, numpy.ones(self.tracks, dtype=bool))
 
     def start_from(self, first: dict[str, Any], second: dict[str, Any]) -> None:
         """Start the track from its first two measurements, as that of a log starts.
@@ -154,7 +170,7 @@ class OnlineFilter:
             self.input.check_names(measured, {**self.input.values, "time": "s"})
             if measured.get("time") is None:
                 raise ValueError("each of the two measurements needs its time")
-        times = [self._times(measured["time"]) for measured in (first, second)]
+        times = [numpy.atleast_1d(self._times(measured["time"])) for measured in (first, second)]
         if any((time != time[0]).any() for time in times):
             raise ValueError("several tracks start from two measurements of one time each")
         first, second = (
@@ -183,7 +199,7 @@ class OnlineFilter:
         """
         at = self._time_of(time)
         self.input.check_names(values, self.input.values)
-        if self._lag and (at <= self._running().input["time"]).any():
+        if self._lag and _any(at <= self._running().input["time"]):
             return self._take_late(at, values)
         return self._take(at, values)
 
@@ -192,23 +208,23 @@ class OnlineFilter:
         """Measurements since the start that were refused because ``lag`` does not reach back to them."""
         return self._running().too_late
 
-    def _take(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
+    def _take(self, at: Any, values: Mapping[str, Any]) -> Estimate:
         """Take in a measurement that is not older than the last."""
         before = self._running()
         last = before.input["time"]
-        if ((at >= SINCE_1970) & (last < SINCE_1970)).any():
+        if _any((at >= SINCE_1970) & (last < SINCE_1970)):
             raise ValueError(
                 f"time {quote_shortened(_plain(at))} s is since 1970, and the last one, {_plain(last)} s, is not: "
                 "start the track with start(time=...) of the same clock"
             )
-        together = self.input.fuses and before.measurements > 0 and bool((at == last).all())
-        if not ((at > last).all() or together):
+        together = self.input.fuses and before.measurements > 0 and not _any(at != last)
+        if _any(at <= last) and not together:
             raise ValueError(
                 f"time must increase: the last measurement was at {_plain(last)} s, got {quote_shortened(_plain(at))}"
             )
-        if not together:
-            self._check_interval(at - last, at)
-        scans = [] if together else self._missed_scans(last, at)
+        if not together and self._usual is not None and _any(at - last < self._least):
+            self._refuse_interval(at)
+        scans = () if together or self._scan_interval is None else self._missed_scans(last, at)
         kept = self._snapshot() if self._lag or together or scans else None
         try:
             for scan in scans:
@@ -227,25 +243,25 @@ class OnlineFilter:
             self._remember(Taken(at, copy.deepcopy(values), kept._replace(history=History())))
         return found
 
-    def _take_late(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
+    def _take_late(self, at: Any, values: Mapping[str, Any]) -> Estimate:
         """Take a measurement in where it belongs, and again what came after it."""
         state = self._running()
         taken = state.history.taken
         oldest = taken[0].before.input["time"] if taken else state.input["time"]
-        if not (at > oldest).all():
+        if _any(at <= oldest):
             self._state = state._replace(too_late=state.too_late + 1)
             raise ValueError(
                 f"the measurement of {_plain(at)} s comes too late: what came until {_plain(oldest)} s is settled; "
                 f"{state.too_late + 1:,} were refused so far, and a longer lag takes more"
             )
-        place = sum(bool((one.time <= at).all()) for one in taken)
+        place = sum(not _any(one.time > at) for one in taken)
         before, after = taken[:place], taken[place:]
-        if not all((one.time > at).all() for one in after):
+        if any(_any(one.time <= at) for one in after):
             raise ValueError(
                 f"a measurement of several tracks is late for all of them alike, got {quote_shortened(at.tolist())}"
             )
         again = [(at, values), *((one.time, one.values) for one in after)]
-        if before and (before[-1].time == at).all():
+        if before and not _any(before[-1].time != at):
             both = _supply(before[-1].values, values)
             if both is not None:
                 again[0] = at, both
@@ -265,18 +281,16 @@ class OnlineFilter:
         taken = (*state.history.taken, one)
         if isinstance(self._lag, timedelta):
             first = one.time - self._lag.total_seconds()
-            taken = tuple(old for old in taken if (old.time >= first).any())
+            taken = tuple(old for old in taken if _any(old.time >= first))
         else:
             taken = taken[-self._lag :]
         self._state = state._replace(history=History(taken))
 
-    def _missed_scans(self, last: numpy.ndarray, at: numpy.ndarray) -> list[numpy.ndarray]:
-        """Times of the scans between that missed the target, as a log that is read has them; none where the filter was
-        not advised for a log.
+    def _missed_scans(self, last: Any, at: Any) -> list[Any]:
+        """Times of the scans between that missed the target, as a log that is read has them, of a filter that was
+        advised for a log.
         """
-        interval = getattr(self.task.recording, "scan_interval", None)
-        if interval is None:
-            return []
+        interval = self._scan_interval
         scans = int(max(numpy.rint((at - last) / interval).max(), 1))
         if scans > MOST_MISSED:
             raise ValueError(
@@ -285,7 +299,7 @@ class OnlineFilter:
             )
         return [last + (at - last) * number / scans for number in range(1, scans)]
 
-    def _step(self, at: numpy.ndarray, values: Mapping[str, Any]) -> Estimate:
+    def _step(self, at: Any, values: Mapping[str, Any]) -> Estimate:
         """Advance to a time and take in what came."""
         measurement, memory = self.input.measure(self._running().input, at, values)
         found = self._estimate(at, self._advance(measurement, memory))
@@ -296,7 +310,7 @@ class OnlineFilter:
 
     def _explain(self, found: Estimate, measurement: Any) -> Any:
         """Reasons why tracks are lost, with what the task finds near their last valid estimates."""
-        near = found if self._policy is None else self._valid
+        near = self._valid if self._is_policy else found
         if near is None:
             return found.lost
         n = len(near.mean)
@@ -307,25 +321,38 @@ class OnlineFilter:
             return found.lost
         for i, fault in enumerate(words):
             track = numpy.array([i])
-            given = select_lanes(measurement, track)
+            given = self._received_of(measurement, track)
             reason = fault and lost.explain(self.task, mean[..., track], covariance[..., track], given)
             words[i] = f"the estimate is not finite: {reason}" if reason else fault
         return self._each(words)
 
-    def _advance(self, measurement: Any, memory: Any) -> dict[str, numpy.ndarray]:
-        """Take in a measurement of the task, and report on it in arrays ``(..., width)``."""
-        before = self._running()
-        after = before._replace(input=memory, measurements=before.measurements + 1)
-        stepper = self._stepper
-        self._measured.put(self._padded(measurement))
-        stepper.arrive(self._measured)
+    def _received_of(self, measurement: Any, track: numpy.ndarray) -> Any:
+        """Return what a track has received, in arrays ``(..., 1)`` of the task's types."""
+        memory = MeasurementMemory(self.input.measurement, self.tracks)
+        memory.put(measurement)
+        return select_lanes(memory.copy(), track)
+
+    def _advance(self, measurement: Any, memory: Any) -> dict[str, Any]:
+        """Take in a measurement of the task, and report on it in arrays ``(..., N)``, of one track ``(...)``."""
+        before: Any = self._running()
+        update = self._update
+        # As of _replace, which takes longer than the filter: other input, one more measurement.
+        after = OnlineState._make((None, memory, *before[2:4], before.measurements + 1, *before[5:]))
+        update.arrive(measurement)
         if self._policy is not None:
-            after = self._decide(after, stepper.observation_by_field())
-            stepper.take(after.action[self._pad])
-        stepper.answer()
+            after = self._decide(after, update.shown)
+        elif self.watch is not None and before.measurements % self._interval == 0:
+            after = self._look(after, update.observed[: self.tracks])
+        if self._is_asked:
+            update.answer(self._no_action if self._policy is None else after.action[self._pad])
         self._state = after
-        report: dict[str, numpy.ndarray] = stepper.report()
-        return report
+        return update.report()
+
+    def _look(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
+        """Compare what a network is shown, ``(N, fields)``, with its training."""
+        if self.watch is not None and state.fresh is not None:
+            self.watch.look(observation, state.fresh)
+        return state._replace(fresh=numpy.zeros(self.tracks, dtype=bool))
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
         """Estimate of a time at which nothing is received; the filter stays where it is.
@@ -347,18 +374,15 @@ class OnlineFilter:
 
     def save(self) -> OnlineState:
         """Return all that it remembers, to go on from it later, also in another process."""
-        return self._snapshot()._replace(owner=self._owner)
+        return copy.deepcopy(self._snapshot()._replace(owner=self._owner))
 
     def _snapshot(self) -> OnlineState:
-        state = self._running()
+        state, update = self._running(), self._update
+        state = state._replace(filter=update.state, watch=None if self.watch is None else self.watch.memory)
+        if not self._is_asked:
+            return state._replace(policy=update.policy_state)
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
-        return copy.deepcopy(
-            state._replace(
-                filter=self._stepper.filter_state,
-                python=None if own is None else (own.memory, own.step_number),
-                watch=None if self.watch is None else self.watch.memory,
-            )
-        )
+        return copy.deepcopy(state._replace(python=None if own is None else (own.memory, own.step_number)))
 
     def restore(self, state: OnlineState) -> None:
         """Go on from what :meth:`save` has returned.
@@ -395,10 +419,12 @@ class OnlineFilter:
         """
         taken = state.history.taken
         first_track = lambda array: array[..., [0] * self.tracks]  # noqa: E731
-        begun = self.model.start_filter(self._padded(map_arrays(first_track, self.input.initial)))
+        begun = self._begin(map_arrays(first_track, self.input.initial), {})
         for one in (state, *(own.before for own in taken)):
-            if not self.model.filter.in_python and _shapes(one.filter) != _shapes(begun):
+            if not self.model.filter.in_python and _shapes(one.filter) != _shapes(begun.filter):
                 raise ValueError("filter must be arrays of the shapes that this filter has")
+            if self._policy is None and _shapes(one.policy) != _shapes(begun.policy):
+                raise ValueError("policy must be arrays of the shapes that this policy has")
             self._resume(one)
             check_integer("measurements", one.measurements, 0)
             check_integer("too_late", one.too_late, 0)
@@ -406,7 +432,8 @@ class OnlineFilter:
                 raise ValueError(f"fresh must say which of {self.tracks} tracks have just begun")
             self._check_input(one.input)
             if not self.model.filter.in_python:
-                example = map_arrays(first_track, self.input.measurement)
+                track = first_track if self.tracks > 1 else lambda array: array[..., 0]
+                example = map_arrays(track, self.input.measurement)
                 self._estimate(numpy.zeros(self.tracks), self._advance(example, one.input))
         for own in taken:
             self._times(own.time)
@@ -416,14 +443,14 @@ class OnlineFilter:
         """Raise an error where the memory of the input is none."""
         self._times(memory["time"])
         for name, values in memory.items():
-            if numpy.ndim(values) and numpy.shape(values)[-1] != self.tracks:
+            if self.tracks > 1 and numpy.ndim(values) and numpy.shape(values)[-1] != self.tracks:
                 raise ValueError(f"{name} of the measurements before must be of {self.tracks} tracks")
         with suppress(ValueError):  # nothing came, which some environments refuse
             self.input.measure(memory, memory["time"] + self._default_interval(), {})
 
     def _resume(self, state: OnlineState) -> None:
         """Go on from a snapshot, which stays as it is."""
-        state = copy.deepcopy(state)
+        state = copy.deepcopy(state) if self._is_asked else state
         if self.model.filter.in_python:
             self.model.filter.own.memory, self.model.filter.own.step_number = state.python
         if self.watch is not None:
@@ -431,15 +458,15 @@ class OnlineFilter:
         self._go_on(state)
 
     def _go_on(self, state: OnlineState) -> None:
-        self._stepper.filter_state = state.filter
-        self._state = state._replace(filter=None)
+        self._update.go_on(state.filter, state.policy)
+        self._state = state._replace(filter=None, policy=state.policy if self._policy else None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> OnlineState:
-        """Ask the policy where a decision is due."""
+    def _decide(self, state: OnlineState, shown: numpy.ndarray) -> OnlineState:
+        """Ask the policy where a decision is due, of what is shown, ``(width, fields)``."""
         assert self._policy is not None
-        number = state.measurements - 1
+        number, observation = state.measurements - 1, shown.T
         if number:
             state = state._replace(total=self._means.add(state.total, observation))
         if number and number % self._interval == 0:
@@ -448,21 +475,17 @@ class OnlineFilter:
         if number % self._interval == 0:
             shown = numpy.ascontiguousarray(observation[:, : self.tracks].T)
             action, memory = self._policy.predict(shown, state.policy, state.fresh)
-            state = state._replace(policy=memory, action=action, fresh=numpy.zeros(self.tracks, dtype=bool))
+            state = self._look(state._replace(policy=memory, action=action), shown)
         return state
 
-    def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
-        cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
-        if self.tracks == 1:
-            cut = lambda array: array[..., 0]  # noqa: E731
-        answer = {name: cut(array) for name, array in found.items()}
-        if "lost" not in answer:  # a policy and an agent steer a filter that nobody else looks at
-            answer["lost"] = cut(_fault_of(found["mean"], found["covariance"]))
-        answer["lost"] = self._each(
-            [FAULTS[int(i) - 1] if i else "" for i in numpy.atleast_1d(answer["lost"])]
-        )
-        departure = [""] * self.tracks if self.watch is None else self.watch.describe()[: self.tracks]
-        return Estimate(_plain(time), self.names, self.units, **answer, departure=self._each(departure))
+    def _estimate(self, time: Any, found: dict[str, Any]) -> Estimate:
+        lost, count = found.pop("lost"), self.tracks
+        words = [FAULTS[int(i) - 1] if i else "" for i in (lost if count > 1 else (lost,))]
+        departure = self._each([""] * count if self.watch is None else self.watch.describe())
+        said = {"time": _plain(time), "lost": self._each(words), "departure": departure}
+        estimate = object.__new__(Estimate)  # whose __init__ takes twice as long as the filter
+        estimate.__dict__.update(self._same_of_estimates, **found, **said)
+        return estimate
 
     def _each(self, words: list[str]) -> Any:
         return words[0] if self.tracks == 1 else words
@@ -474,41 +497,43 @@ class OnlineFilter:
             raise ValueError("the track has not been started: call start first")
         return self._state
 
-    def _times(self, time: Any) -> numpy.ndarray:
+    def _times(self, time: Any) -> Any:
+        """Return times that were given, s, ``(N,)``, of one track a float.
+
+        Raises:
+            ValueError: for what is no time.
+        """
         found = read_numbers("time", time)
         if found.shape not in ((), (self.tracks,)) or not numpy.isfinite(found).all():
             raise ValueError(
                 f"time must be finite seconds, a number or ({self.tracks},) numbers, got {quote_shortened(time)}"
             )
-        return numpy.broadcast_to(found / time_unit(found.flat[0]), (self.tracks,)).copy()
-
-    def _has_interval(self) -> bool:
-        return bool(getattr(self.task.parameters, "sampling_interval", None) or self.task.interval)
+        found = found / time_unit(found.flat[0])
+        return found.item() if self.tracks == 1 else numpy.broadcast_to(found, (self.tracks,)).copy()
 
     def _default_interval(self) -> float:
-        interval = getattr(self.task.parameters, "sampling_interval", None) or self.task.interval
-        if interval is None:
+        if self._usual is None:
             raise ValueError(f"{self.task.id} has no sampling interval: give update the time")
-        return float(interval)
+        return self._usual
 
-    def _time_of(self, time: Any) -> numpy.ndarray:
-        """Return the time of a measurement, ``(N,)``, s."""
-        return self._running().input["time"] + self._default_interval() if time is None else self._times(time)
+    def _time_of(self, time: Any) -> Any:
+        """Return the time of a measurement, s, as of :meth:`_times`."""
+        if time is None:
+            return self._running().input["time"] + self._default_interval()
+        if self.tracks == 1 and isinstance(time, float | int) and 0.0 <= time < SINCE_1970:
+            return float(time)
+        return self._times(time)
 
-    def _check_interval(self, interval: numpy.ndarray, at: numpy.ndarray) -> None:
+    def _refuse_interval(self, at: Any) -> None:
         """Raise ValueError for times that are closer than any sensor is read, where motion is rounding, or than the
         gains of the filter allow.
         """
-        if not self._has_interval():
-            return
-        usual, share = self._default_interval(), self.model.filter.least_interval
-        least = max(LEAST_INTERVAL, share) * usual
-        if (interval < least).any():
-            why = f": the gains of {self.name!r} are made for {usual:g} s and make speeds of noise below"
-            raise ValueError(
-                f"measurements of {self.task.id} are at least {least:.2g} s apart, got {quote_shortened(_plain(at))} s "
-                f"after {_plain(self._running().input['time'])} s{why if share > LEAST_INTERVAL else ''}"
-            )
+        last, share = self._running().input["time"], self.model.filter.least_interval
+        why = f": the gains of {self.name!r} are made for {self._usual:g} s and make speeds of noise below"
+        raise ValueError(
+            f"measurements of {self.task.id} are at least {self._least:.2g} s apart, got {quote_shortened(_plain(at))} "
+            f"s after {_plain(last)} s{why if share > LEAST_INTERVAL else ''}"
+        )
 
     def _check_covariance(self, initial: Any) -> None:
         """Raise ValueError for an initial covariance that is none."""
@@ -558,10 +583,13 @@ class OnlineFilter:
             raise ValueError(
                 f"tracks are numbers from 0 to {self.tracks - 1}, got {quote_shortened(tracks)}"
             ) from None
-        old = self._running()
+        old, padded = self._snapshot(), chosen[self._pad]
+        policy = old.policy if self._policy else select_nested(padded, begun.policy, old.policy)
+        one_track = begun.input if chosen[0] else old.input
         return old._replace(
-            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.filter_state),
-            input=select_nested(chosen, begun.input, old.input),
+            filter=select_nested(padded, begun.filter, old.filter),
+            input=one_track if self.tracks == 1 else select_nested(chosen, begun.input, old.input),
+            policy=policy,
             fresh=chosen | old.fresh,
             history=History(),
         )
@@ -575,11 +603,12 @@ def _shapes(part: Any) -> list[tuple[int, ...]]:
 def report_estimate(model: Model, episode: Episode) -> dict[str, Any]:
     """Report the estimate, and what the filter says of the measurement."""
     records = model.filter.records(episode.filter, episode.measurement)
-    return {
-        "mean": model.filter.mean(episode.filter),
-        "covariance": model.filter.covariance(episode.filter),
-        **{name: records[name] for name in REPORTED if name in records},
-    }
+    mean, covariance = model.filter.mean(episode.filter), model.filter.covariance(episode.filter)
+    known = {name: records[name] for name in REPORTED if name in records}
+    if "lost" not in known:  # a policy and an agent steer a filter that nobody else looks at
+        nothing = 0.0 * model.task.xp.ones_like(mean[0])
+        known["lost"] = find_fault(mean, covariance, nothing, nothing, model.task.xp)
+    return {"mean": mean, "covariance": covariance, **known}
 
 
 def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
@@ -588,9 +617,14 @@ def _fault_of(mean: numpy.ndarray, covariance: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray(find_fault(mean, covariance, nothing, nothing, numpy))
 
 
-def _plain(values: numpy.ndarray) -> Any:
+def _any(condition: Any) -> bool:
+    """Whether a condition holds of one track at least."""
+    return condition if condition.__class__ is bool else bool(numpy.count_nonzero(condition))
+
+
+def _plain(values: Any) -> Any:
     """A number where all are the same."""
-    return float(values[0]) if (values == values[0]).all() else values
+    return values if values.__class__ is float or (values != values[0]).any() else float(values[0])
 
 
 def _check_lag(lag: Any) -> int | timedelta:

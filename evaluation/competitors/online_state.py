@@ -6,12 +6,21 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy
 
+from ...envs.engine.programs import Report
+
 
 class Watch(Protocol):
-    """Says whether what a network is shown looks like its training."""
+    """Compares what a network is shown with its training."""
 
     memory: Any
     """What it has seen so far."""
+    observe: Report | None
+    """Function of model and episode: what the network of an estimator is shown, ``(fields, N)``; None: the network is a
+    policy, and is shown what policies are."""
+
+    def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:
+        """Look at what is shown, ``(N, fields)``; ``start`` where the track has just begun."""
+        ...
 
     def describe(self) -> list[str]:
         """Return what is unusual, in words, for each track; empty where nothing is."""
@@ -92,7 +101,7 @@ class OnlineState(NamedTuple):
     filter: Any
     """Of the filter, arrays ``(..., N)``."""
     input: Any
-    """Of the measurements before."""
+    """Of the measurements before: ``time`` and whatever else."""
     policy: Any = None
     """What a policy remembers."""
     fresh: numpy.ndarray | None = None

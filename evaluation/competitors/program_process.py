@@ -14,8 +14,16 @@ import time
 import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib.util import cache_from_source
 from typing import NamedTuple
 
+from . import isolated_estimator
+
+LAUNCHER = isolated_estimator.__file__
+if (compiled := cache_from_source(LAUNCHER)) and os.path.exists(
+    compiled
+):  # which takes half the time to start
+    LAUNCHER = compiled
 ENDED, LATE, WRONG = 6, 7, 8
 """Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
 START_SECONDS = 30.0
@@ -50,7 +58,7 @@ class ProgramProcess:
     """A program that runs.
 
     Args:
-        command: its words; nothing of it is given to a shell.
+        command: its words; nothing of it is given to a shell. None: an estimator, see :mod:`.isolated_estimator`.
         limits: that it has.
         environment: variables; None: those of this process.
 
@@ -62,8 +70,10 @@ class ProgramProcess:
         self, command: Sequence[str], limits: Limits, environment: Mapping[str, str] | None = None
     ) -> None:
         self.limits = limits
+        memory, linux = str(int(limits.memory * 1e6)), sys.platform == "linux"
+        launch = [sys.executable, "-I", "-S", "-B", LAUNCHER, memory]
         self._process = process = subprocess.Popen(
-            list(command),
+            [*launch, *command] if linux or not command else list(command),
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -82,12 +92,6 @@ class ProgramProcess:
         self._answers.register(self._errors, selectors.EVENT_READ)
         self._buffer, self._last_words = bytearray(), b""
         self._seconds = max(limits.seconds, START_SECONDS)
-        if limits.memory and sys.platform == "linux":
-            import resource
-
-            most = int(limits.memory * 1e6)
-            with suppress(ProcessLookupError):
-                resource.prlimit(process.pid, resource.RLIMIT_AS, (most, most))
 
     def exchange(self, question: bytes, size: int | None, most: int = 0) -> bytes:
         """Write a question, and return the answer.
@@ -210,14 +214,36 @@ class ProgramProcess:
         return Failure(ENDED, f"{words}: {last}" if last else words)
 
     @property
+    def apart(self) -> bool:
+        """Whether it is in a PID namespace of its own, once it has answered; True where only Linux could say."""
+        try:
+            return os.readlink(f"/proc/{self._process.pid}/ns/pid_for_children") != os.readlink(
+                "/proc/self/ns/pid"
+            )
+        except OSError:
+            return sys.platform != "linux"
+
+    @property
     def processor_seconds(self) -> float:
-        """Processor time of the process, s, of all its threads; NaN where the system does not say."""
+        """Processor time of the process and of all that it has begun, s; NaN where the system does not say."""
         if sys.platform != "linux":
             return float("nan")
-        try:
-            return time.clock_gettime((~self._process.pid << 3) | 2)  # clock_getcpuclockid(3)
-        except OSError:
-            return float("nan")
+        children: dict[int, list[int]] = {}
+        ended = {}
+        for name in filter(str.isdigit, os.listdir("/proc")):
+            with suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
+                state = file.read().rpartition(b")")[2].split()
+                children.setdefault(int(state[1]), []).append(int(name))
+                ended[int(name)] = int(state[13]) + int(state[14])
+        seconds, processes = 0.0, [self._process.pid]
+        for process in processes:  # which grow, each with those of its children that have ended
+            processes += children.get(process, [])
+            try:
+                seconds += time.clock_gettime((~process << 3) | 2)  # clock_getcpuclockid(3)
+            except OSError:  # it has ended meanwhile
+                seconds += float("nan") if process == self._process.pid else 0.0
+            seconds += ended.get(process, 0) / os.sysconf("SC_CLK_TCK")
+        return seconds
 
 
 def _widen(pipe: int) -> None:
@@ -237,6 +263,9 @@ def _end(process: "subprocess.Popen[bytes]", answers: selectors.BaseSelector) ->
             stream.close()
     with suppress(subprocess.TimeoutExpired):
         process.wait(END_SECONDS)  # a program ends when its standard input does
+    process.terminate()  # what waits for it ends what it has begun
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(END_SECONDS)
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -44,6 +44,8 @@ LONGEST_HELLO = 10_000
 """Bytes of the answer to the hello."""
 BYTES_OF_NUMBER = 40
 """Of JSON, at most, with what stands around it."""
+NO_NAMESPACES = "no PID namespace here: it could end or slow this process"
+"""What a system without them cannot close, before a program runs."""
 USUAL = Limits()
 LIMITS: ContextVar[Limits] = ContextVar("limits", default=USUAL)
 """Of the programs that are named while it is in force."""
@@ -92,8 +94,8 @@ class Program:
 
     command: str
     limits: Limits = field(default_factory=LIMITS.get)
-    words: tuple[str, ...] = ()
-    """Of the command; default: what a shell would make of it."""
+    words: tuple[str, ...] | None = None
+    """Of the command; default: what a shell would make of it; none: of an estimator in Python."""
     preface: bytes = field(default=b"", repr=False)
     """What is written before the hello."""
     environment: tuple[tuple[str, str], ...] | None = None
@@ -104,7 +106,7 @@ class Program:
     def __post_init__(self) -> None:
         if os.name != "posix":
             raise ValueError("programs compete on Linux and macOS: here pipes cannot be waited for")
-        if self.words:
+        if self.words is not None:
             return
         try:
             words = tuple(shlex.split(self.command))
@@ -229,7 +231,7 @@ class ProgramEstimator:
         try:
             own = self.program.environment
             variables = {**os.environ, "PATH": search_path()} if own is None else dict(own)
-            self._process = ProgramProcess(self.program.words, self.program.limits, variables)
+            self._process = ProgramProcess(self.program.words or (), self.program.limits, variables)
         except OSError as error:
             raise ValueError(f"{self.program.command!r} cannot be started: {error.strerror}") from None
         return 0
@@ -324,8 +326,9 @@ class ProgramEstimator:
                 WRONG,
                 f'it has not answered the hello with {{"filtergym": {VERSION}, "format": "json" or "float64"}}',
             )
-        if isinstance(answer.get("warning"), str):
-            warnings.warn(f"program {self.program.command!r}: {answer['warning'][:500]}", stacklevel=2)
+        gaps = answer.get("warning", "" if self._process.apart or not self.program.words else NO_NAMESPACES)
+        if isinstance(gaps, str) and gaps:
+            warnings.warn(f"program {self.program.command!r}: {gaps[:500]}", stacklevel=2)
         self._format = answer["format"]
         if answer.get("feedback") is not True:
             self._feedback_field = None

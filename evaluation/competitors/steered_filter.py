@@ -11,7 +11,7 @@ import numpy
 
 from ...compiler import namespace
 from ...compiler.block import LANES
-from ...compiler.functions import CompiledFunction, Specialised, leaves, map_arrays
+from ...compiler.functions import Specialised, leaves, map_arrays
 from ...compiler.namespace import NotTraceable
 from ...compiler.program import Graph
 from ...envs.contract.filter import FilterInput
@@ -181,38 +181,24 @@ def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredF
     return SteeredFilter(model, decider_of(model, policy, interval))
 
 
-def trace_policy(model: CompiledModel, policy: Policy) -> Specialised:
-    """Return what a policy decides, for :meth:`.Lanes.run`: a function of what is shown and of :class:`Decisions`.
+def trace_policy(model: CompiledModel, policy: Policy, interval: int | None = None) -> Specialised:
+    """Return what a policy decides: a function of what is shown, read lane by lane, and of :class:`Decisions`, zero
+    before the first one, to an action and :class:`Decisions`.
 
     Args:
         model: compiled, in which it acts.
         policy: made for it.
+        interval: as of :func:`decider_of`; 1 where the policy is asked only when a decision is due.
 
     Raises:
         NotTraceable: if its arithmetic cannot be traced.
     """
-    decider, graph, given = _trace_decider(model, policy, None)
-    return Specialised(decider.decide, graph, given, unchanged=0, given_turned=True)
-
-
-def trace_decision(model: CompiledModel, policy: Policy) -> tuple[CompiledFunction, Decisions]:
-    """Return the same of a policy that is asked only where a decision is due, and its memory before the first one.
-
-    Raises:
-        NotTraceable: if its arithmetic cannot be traced.
-    """
-    decider, graph, given = _trace_decider(model, policy, 1)
-    function = CompiledFunction(decider.decide, graph, unchanged=0)
-    function.specialise(*given)
-    return function, given[1]
-
-
-def _trace_decider(model: CompiledModel, policy: Policy, interval: int | None) -> tuple[Decider, Graph, Any]:
     graph = Graph(loops=True)
     with namespace.tracing(graph):
         decider = decider_of(model.programs.traced, policy, interval)
         nothing = decider_of(model, policy, interval).start(numpy.zeros(LANES))
-    return decider, graph, (numpy.zeros((len(model.fields), LANES)), nothing)
+    shown = numpy.zeros((len(model.fields), LANES))
+    return Specialised(decider.decide, graph, (shown, nothing), unchanged=0, given_turned=True)
 
 
 def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
@@ -222,7 +208,7 @@ def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Po
     Args:
         model: in which it acts.
         policy: made for it.
-        trace: :func:`trace_policy` or :func:`trace_decision`.
+        trace: :func:`trace_policy`.
     """
     if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and says_traceable(policy)):
         return None

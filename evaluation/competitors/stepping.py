@@ -1,15 +1,35 @@
-"""A policy that is asked step by step, about any number of episodes, as an evaluation asks it."""
+"""Filters and policies in loops of one's own, one measurement at a time, with the numbers of an evaluation.
 
+A filter of a compiled model takes in a measurement by one native call (:class:`CompiledUpdate`), any other by the
+functions of its model (:class:`ModelUpdate`). A policy is asked about any number of episodes (:class:`SteppingPolicy`).
+"""
+
+import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
 
-from ...compiler.functions import map_arrays, round_up_lanes
-from ...envs.contract.model import Model
+from ...compiler.functions import (
+    DTYPES,
+    UNCOUNTED,
+    Call,
+    Leaf,
+    Specialised,
+    empty_lanes,
+    leaves,
+    map_arrays,
+    round_up_lanes,
+    run_over,
+)
+from ...compiler.sequence import CallList
+from ...envs.contract.model import Episode, Model
+from ...envs.engine.compiled import CompiledModel
+from ...envs.engine.programs import Report
 from ...envs.interface.requests import check_action
 from .kinds import Policy
-from .steered_filter import compile_policy, trace_decision
+from .steered_filter import compile_policy, trace_policy
 
 MODEL_ROWS = 128
 """Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
@@ -45,8 +65,10 @@ class SteppingPolicy(Policy):
         self.policy = policy
         self.control = model.control  # type: ignore[misc]  # made for it
         self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
-        self._traced: Any = None
+        self._traced: Specialised | None = None
         self._is_traced = False
+        self._bound: dict[int, tuple[list[numpy.ndarray], list[numpy.ndarray], Call]] = {}
+        """What the traced policy reads and writes, and the call, by the number of observations."""
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -114,21 +136,30 @@ class SteppingPolicy(Policy):
     ) -> tuple[Any, Any]:
         """Ask the policy, in code of the processor where it can be traced."""
         if not self._is_traced:
-            self._traced, self._is_traced = compile_policy(self.model, self.policy, trace_decision), True
-        if self._traced is None:
+            trace = functools.partial(trace_policy, interval=1)
+            self._traced, self._is_traced = compile_policy(self.model, self.policy, trace), True
+        traced = self._traced
+        if traced is None:
             answer: tuple[Any, Any] = self.policy.predict(
                 observation, memory, start, deterministic=deterministic
             )
             return answer
-        decide, nothing = self._traced
         width = len(observation)
-        before = memory or map_arrays(lambda array: numpy.zeros((*array.shape[:-1], width)), nothing)
-        action, after = decide(observation.T, before._replace(count=numpy.where(start, 0.0, 1.0)))
+        if width not in self._bound:
+            read = [numpy.zeros(observation.shape), *memory_of(traced.inputs[1:], width)]
+            written = memory_of(traced.outputs, width)
+            self._bound[width] = read, written, traced.bound(read, written)
+        read, written, call = self._bound[width]
+        before = leaves(memory and memory._replace(count=numpy.where(start, 0.0, 1.0)))
+        for array, values in zip(read, [observation, *(before or [0.0] * (len(read) - 1))], strict=True):
+            array[...] = values
+        call(0, width)
+        action, after = copy_arrays(traced.template, written, [leaf.kind for leaf in traced.outputs])
         return action.T, after
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the code: a copy makes its own."""
-        return {**self.__dict__, "_traced": None, "_is_traced": False}
+        return {**self.__dict__, "_traced": None, "_is_traced": False, "_bound": {}}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
         """Episodes that each call of the policy is shown."""
@@ -136,3 +167,208 @@ class SteppingPolicy(Policy):
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
         ]
+
+
+def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
+    """Memory for the arrays that a program reads or writes."""
+    return [empty_lanes(leaf.shape, width) for leaf in arrays]
+
+
+def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Any) -> Any:
+    """Copies of arrays in their own types, in the places of a template of their numbers."""
+    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
+
+
+class MeasurementMemory:
+    """Fixed memory of a measurement.
+
+    Args:
+        like: a measurement, for its shapes and types.
+        tracks: how many come side by side; the last one is repeated up to a multiple of eight, as rounding in products
+            of matrices must not depend on their number.
+
+    Attributes:
+        parts: its arrays, ``(..., width)``, of floats.
+    """
+
+    def __init__(self, like: Any, tracks: int) -> None:
+        width, self._like = round_up_lanes(tracks), like
+        self.parts = [empty_lanes(array.shape[:-1], width) for array in leaves(like)]
+        self._is_flat = not any(isinstance(part, tuple) for part in like)
+        self._pad = None if tracks == 1 else numpy.minimum(numpy.arange(width), tracks - 1)
+        self._places = self.parts if tracks > 1 else [numpy.moveaxis(part, -1, 0) for part in self.parts]
+
+    def put(self, measurement: Any) -> None:
+        """Write a measurement of tracks, ``(..., N)``, or of one track without this axis."""
+        found = [part for part in measurement if part is not None] if self._is_flat else leaves(measurement)
+        for place, values in zip(self._places, found, strict=True):
+            place[...] = values if self._pad is None else values[..., self._pad]
+
+    def copy(self) -> Any:
+        """Return the measurement in new arrays of its own types."""
+        parts = iter(self.parts)
+        return map_arrays(lambda array: next(parts).astype(array.dtype, order="C"), self._like)
+
+
+class CompiledUpdate:
+    """The filter of a compiled model, which takes in one measurement after another in memory of its own: by one native
+    call each, or by two where a policy answers in Python between them.
+
+    What the update hands on as it is stays where the prediction or the measurement was written, so there are two
+    memories of both, used by turns.
+
+    Args:
+        model: compiled, of a world that is live.
+        report: dictionary of arrays, made after a measurement was taken in.
+        tracks: how many are followed side by side.
+        policy: traced, see :func:`.steered_filter.trace_policy`; None without.
+        is_asked: whether a policy answers in Python.
+        observe: report ``(fields, N)`` made before a measurement is taken in; None: what is shown to a policy.
+
+    Attributes:
+        shown: to a policy, ``(width, fields)``.
+        observed: what ``observe`` reports, likewise.
+        blank_policy: memory of the traced policy before its first decision.
+    """
+
+    def __init__(
+        self,
+        model: CompiledModel,
+        report: Report,
+        tracks: int,
+        policy: Specialised | None = None,
+        is_asked: bool = False,
+        observe: Report | None = None,
+    ) -> None:
+        update, _, predict, episode = model.programs.later
+        tell, first = model.programs.report_program(report), model.programs.first.predict
+        watch = observe and model.programs.function(observe).specialise(episode)
+        self._width = width = round_up_lanes(tracks)
+        self._threads, count = model.threads, itertools.count()
+        self._template = map_arrays(lambda _: next(count), episode.filter)
+        self._kinds = [array.dtype.kind for array in leaves(episode.filter)]
+        self._policy_template = map_arrays(lambda i: i - 1, policy and policy.template[1])
+        self._policies = [memory_of(policy.outputs[1:] if policy else (), width) for _ in range(2)]
+        self.blank_policy = map_arrays(
+            lambda i: numpy.zeros_like(self._policies[0][i]), self._policy_template
+        )
+        self._received = [MeasurementMemory(episode.measurement, tracks) for _ in range(2)]
+        predicted = [memory_of(predict.outputs[:-1], width) for _ in range(2)]
+        written, reported = memory_of(update.outputs, width), memory_of(tell.outputs, width)
+        (self._action,), fields = (
+            memory_of(update.inputs[-1:], width),
+            memory_of(watch.outputs if watch else (), width),
+        )
+        self._action[...] = 0.0
+        self.shown = numpy.zeros((width, predict.outputs[-1].shape[0]))
+        self.observed = fields[0].T if fields else self.shown
+        self._states: list[list[numpy.ndarray]] = []
+        """After the update in each memory, and one that was put."""
+        looks, answers = [], []
+        for now, received in enumerate(self._received):
+            given = [*predicted[now], *received.parts, self._action]
+            after = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
+            self._states.append(after[: len(self._kinds)])
+            memories = [self.shown, *self._policies[1 - now]], [self._action, *self._policies[now]]
+            looks.append([watch.bound([*received.parts, *predicted[now]], fields)] if watch else [])
+            told = tell.bound([*received.parts, *self._states[now]], reported)
+            steer = [policy.bound(*memories)] if policy else []
+            answers.append([*steer, update.bound(given, written), told])
+        self._states.append(written[: len(self._kinds)])
+        arrivals = []
+        for before, program, now in ((0, predict, 1), (1, predict, 0), (2, first, 0)):
+            read, ahead = [*self._states[before], *self._received[now].parts], [*predicted[now], self.shown]
+            answered = [] if is_asked else answers[now]
+            arrivals.append([program.bound(read, ahead), *looks[now], *answered])
+        self._calls = list(itertools.chain(*arrivals, *answers))
+        self._arrivals, self._answers = [CallList(calls) for calls in arrivals], []
+        if is_asked:
+            self._answers = [CallList(calls) for calls in answers]
+        self._now, self._stepped = 2, 0
+        cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
+        self._report = [(name, reported[i][cut]) for name, i in tell.template.items()]
+
+    def arrive(self, measurement: Any) -> None:
+        """Predict to a measurement, and take it in where nothing is asked in Python."""
+        self._stepped += self._width
+        if self._stepped > UNCOUNTED:  # better code, where that has become worth its time
+            for call in self._calls:
+                call.expect(self._stepped // 2)
+            self._stepped = 0
+        before, now = self._now, int(self._now == 0)
+        self._received[now].put(measurement)
+        self._now = now
+        run_over(self._arrivals[before], self._width, self._threads)
+
+    def answer(self, action: numpy.ndarray) -> None:
+        """Take the measurement in with an action that was chosen in Python, ``(width, ...)``."""
+        self._action[...] = action.T
+        run_over(self._answers[self._now], self._width, self._threads)
+
+    def report(self) -> dict[str, Any]:
+        """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
+        return {name: array.copy() if array.ndim else array[()] for name, array in self._report}
+
+    @property
+    def state(self) -> Any:
+        """State of the filter, in arrays of the caller's own."""
+        return copy_arrays(self._template, self._states[self._now], self._kinds)
+
+    @property
+    def policy_state(self) -> Any:
+        """Memory of the traced policy, likewise."""
+        return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
+
+    def go_on(self, state: Any, policy: Any) -> None:
+        """Go on from a state of the filter, and from a memory of the traced policy."""
+        self._now = 2
+        arrays = leaves(state) + (leaves(policy) if self._policy_template else [])
+        for memory, values in zip([*self._states[2], *self._policies[1]], arrays, strict=True):
+            memory[...] = values
+
+
+class ModelUpdate:
+    """The same by the functions of a model, with an answer in Python or the action zero; arguments as of
+    :class:`CompiledUpdate`, and a measurement for its shapes and types.
+    """
+
+    blank_policy = policy_state = None
+
+    def __init__(self, model: Model, report: Report, tracks: int, like: Any, observe: Report | None) -> None:
+        self._model, self._make_report = model, report
+        self._observe: Any = observe
+        self._cut: Any = (..., 0) if tracks == 1 else (..., slice(tracks))
+        self._received = MeasurementMemory(like, tracks)
+        self.state: Any = None
+        """Of the filter, in arrays that never change."""
+
+    def arrive(self, measurement: Any) -> None:
+        """Predict to a measurement."""
+        self._received.put(measurement)
+        measured = self._received.copy()
+        self._episode = Episode((), measured, self._model.predict_filter(self.state, measured))
+
+    @property
+    def shown(self) -> numpy.ndarray:
+        """Shown to a policy, ``(width, fields)``."""
+        return numpy.asarray(self._model.observe(self._episode)).T
+
+    @property
+    def observed(self) -> numpy.ndarray:
+        """What ``observe`` reports, likewise."""
+        return numpy.asarray(self._model.run(self._observe, self._episode)).T
+
+    def answer(self, action: numpy.ndarray) -> None:
+        """Take the measurement in with an action, ``(width, ...)``."""
+        turned = numpy.asarray(action.T, dtype=float if self._model.action_space.shape else None)
+        self._episode = self._model.act(self._episode, turned)
+        self.state = self._episode.filter
+
+    def report(self) -> dict[str, Any]:
+        """Return the report in arrays ``(..., N)`` of the caller's own, of one track without this axis."""
+        reported = self._model.run(self._make_report, self._episode)
+        return {name: numpy.copy(array[self._cut])[()] for name, array in reported.items()}
+
+    def go_on(self, state: Any, policy: Any) -> None:
+        """Go on from a state of the filter."""
+        self.state = state

@@ -71,7 +71,7 @@ def transitions_of(
     return found
 
 
-def member(space: gymnasium.Space, action: numpy.ndarray) -> numpy.ndarray:
+def member(space: gymnasium.Space[Any], action: numpy.ndarray) -> numpy.ndarray:
     """Return actions of a policy, batch first, as the action space holds them: within its limits, in its type."""
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.clip(action, space.low, space.high)

@@ -9,6 +9,7 @@ A file is MessagePack of a declared type. Reading it executes and imports nothin
 import hashlib
 import io
 import re
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -79,14 +80,16 @@ class Store:
     def write(self, work: Work | None, result: Any) -> None:
         """Keep the result of a piece of work: numbers, words, arrays and datasets, in containers of declared types.
 
-        Raises:
-            ValueError: if it cannot be written.
+        What cannot be written, on a full disk, is made again after an interruption: a warning says so.
         """
         path = self._path(work)
         if path is not None:
             content = msgspec.msgpack.encode(result, enc_hook=_encode)
-            with whole_file(path) as partial:
-                partial.write_bytes(content)
+            try:
+                with whole_file(path) as partial:
+                    partial.write_bytes(content)
+            except ValueError as error:
+                warnings.warn(f"{error}: after an interruption it is computed again", stacklevel=2)
 
     def result(self, work: Work | None, kind: type[Result], make: Callable[[], Result]) -> Result:
         """Return the result of a piece of work, which is made and kept where there is none."""

@@ -22,9 +22,9 @@ from ...envs.data.recorded_world import Feed
 from ...envs.engine.backend import make_model
 from ...envs.engine.scenario_choice import find_scenario
 from ...filters.gaussian import log_density
+from ..competitors.adapters import select_lanes
 from ..competitors.filters import find_fault
 from ..competitors.online import OnlineFilter
-from ..competitors.online_state import OnlineState
 from ..running.evaluate import Experiment, control_of
 from ..running.seeds import episode_seeds
 from ..statistics.bootstrap import Bootstrap, IntervalEstimate
@@ -107,17 +107,17 @@ class StreamFilter(OnlineFilter):
 
     def begin(self, initial: Any) -> None:
         """Start the tracks from the task's own initial estimate."""
-        state = self.model.start_filter(self._padded(initial))
-        policy = None if self._policy is None else self._policy.begin(range(self.tracks))
-        self._go_on(OnlineState(state, {}, policy, numpy.ones(self.tracks, dtype=bool)))
+        self._go_on(self._begin(initial, {}))
 
     def _check_input(self, memory: Any) -> None:
         """Measurements are given as they are: there is no memory of an input."""
 
     def take(self, measurement: Any) -> dict[str, numpy.ndarray]:
         """Take a measurement in; return mean, covariance and what else is reported, arrays ``(..., N)``."""
-        found = self._advance(self._padded(measurement), {})
-        return {name: values[..., : self.tracks] for name, values in found.items()}
+        if self.tracks > 1:
+            return self._advance(measurement, {})
+        found = self._advance(select_lanes(measurement, 0), {})
+        return {name: numpy.asarray(values)[..., None] for name, values in found.items()}
 
 
 def _subtract(stream: Stream, means: numpy.ndarray) -> numpy.ndarray:

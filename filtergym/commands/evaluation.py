@@ -1,7 +1,10 @@
 """The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
 
 import math
+import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +24,7 @@ from ..envs.logs.flights import names_flights, read_flights
 from ..envs.logs.plausibility import LOUD
 from ..envs.logs.reading import read_recording
 from ..envs.logs.recording_files import is_recording
-from ..evaluation.competitors.kinds import Competitor, RandomPolicy
+from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.metrics import Record, flight_records
@@ -57,6 +60,8 @@ from .terminal import (
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
+RESERVE = 64_000_000
+"""Bytes that no competitor takes of the disk, for what is written at last."""
 MOST_PREDICTIONS = 2_000_000
 """Measurements of all competitors whose estimates are kept, some 200 bytes each."""
 TRACKS = ("truth", "estimate", "covariance")
@@ -105,6 +110,19 @@ class Outputs(NamedTuple):
         if self.estimates is not None:
             check_estimates(self.estimates)
             (writable_folder if self.estimates.suffix == ".tum" else writable_file)(self.estimates)
+
+    @contextmanager
+    def reserve_space(self, competitors: Sequence[Competitor]) -> Iterator[None]:
+        """Take the space of what is written at last, as much as there is, while programs run, which could fill it."""
+        place = self.folder or self.records or self.estimates
+        if place is None or not any(is_program(one.maker) for one in competitors):
+            yield
+            return
+        there = next(own for own in place.absolute().parents if own.is_dir())
+        with tempfile.TemporaryFile(dir=there) as held:
+            with suppress(OSError, AttributeError):  # a full disk, or a system that cannot
+                os.posix_fallocate(held.fileno(), 0, RESERVE)
+            yield
 
 
 def find_data(
@@ -274,8 +292,8 @@ def _without_comparison(paper: str) -> str:
 
 def run(
     requests: Sequence[EvaluationRequest], outputs: Outputs, workers: Workers, store: Store
-) -> tuple[Evaluation, str]:
-    """Run the competitors of an evaluation.
+) -> tuple[Evaluation, str, dict[str, str]]:
+    """Run the competitors of an evaluation; one that fails costs its own row.
 
     Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
 
@@ -286,7 +304,10 @@ def run(
         store: keeps what is done until all is written.
 
     Returns:
-        The evaluation, and why the whole of it is not written; empty where it is.
+        The evaluation, why the whole of it is not written, empty where it is, and the errors of those that failed.
+
+    Raises:
+        ValueError: if all of them fail, or one does and the experiment is strict.
     """
     task = requests[0].experiment.make_task()
     measurements = sum(one.measurements for one in requests)
@@ -294,13 +315,27 @@ def run(
     refusal = _size_warning(size, size, outputs.netcdf)
     written = outputs.folder is not None and not refusal
     whole = written or bool(task.flights) or outputs.estimates is not None
+    failures: dict[str, str] = {}
+    found = None
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
-        found = run_requests(requests, workers, lambda done: bar.update(line, advance=done), store, whole)
+        while found is None:
+            others = [one for one in requests if one.name not in failures]
+            try:
+                found = run_requests(
+                    others, workers, lambda done: bar.update(line, advance=done), store, whole
+                )
+            except ValueError as error:
+                words = (f"{one.name!r} {how}" for one in others for how in ("failed", "cannot be made"))
+                failed = [own.split("'")[1] for own in words if own in str(error)]
+                if len(others) == 1 or not failed or requests[0].experiment.strict:
+                    raise
+                failures[failed[0]] = str(error)
+                bar.update(line, completed=0)
     if outputs.estimates is None:
         tracks = [name for name in found.dataset if name in TRACKS or str(name).startswith("measurement_")]
         found = found._replace(dataset=found.dataset.drop_vars(tracks))
-    return found, refusal
+    return found, refusal, failures
 
 
 def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
@@ -333,11 +368,13 @@ def write(
     printed, in_file = (
         tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
     )
+    for table in printed:  # before anything is written, which can fail
+        print_table(table)
     records = [*found.records, *flights]
-    if outputs.estimates is not None:
-        write_estimates(outputs.estimates, found.dataset)
     if outputs.records is not None:
         write_records(outputs.records, records)
+    if outputs.estimates is not None:
+        write_estimates(outputs.estimates, found.dataset)
     results: list[Result] = []
     if outputs.folder is not None and found.curves is not None:
         if found.has_truth:
@@ -361,8 +398,6 @@ def write(
                     save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
-    for table in printed:
-        print_table(table)
     phrases = phrases_of(found.dataset)
     console.print()
     for name in worst:

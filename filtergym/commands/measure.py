@@ -238,9 +238,9 @@ def evaluate_policies(
     )
     store = Store(None if out is None else out / UNFINISHED)
     requests = requests_of(problem, experiment, competitors, curves=out is not None)
-    with limit_programs(time_limit, memory_limit):
+    with limit_programs(time_limit, memory_limit), outputs.reserve_space(competitors):
         with Workers(jobs, cluster) as workers:
-            found, refusal = run(requests, outputs, workers, store)
+            found, refusal, failures = run(requests, outputs, workers, store)
         paper = found.dataset.attrs["paper"]
         explained = why or explained_by_default(found.records, policy or [], paper)
         worst: dict[str, list[WorstTrack]] = {name: [] for name in explained}
@@ -250,6 +250,8 @@ def evaluate_policies(
     store.clear()
     for sentence in departure_lines(problem, data, learned, keywords):
         print_sentence(sentence)
+    if failures:
+        raise ValueError(f"{'; '.join(failures.values())}; the others are in the table")
 
 
 def record_scenario(

@@ -80,7 +80,7 @@ class FilterSteps:
 
     def __init__(
         self,
-        filter: Filter,
+        filter: Filter[Any, Any, Any],
         masked: Callable[[Any], Any] | None = None,
         decider: Decider | None = None,
         reports_feedback: bool = False,

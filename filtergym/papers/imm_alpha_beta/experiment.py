@@ -194,7 +194,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         polar=rivals(polar_measurements=True),
         later=rivals(maneuver_steps=(first + LATER, last + LATER)),
         readings={name: later(variant, recording, reading) for name, reading in VARIANTS.items()},
-        grids={kind: [later(grid_row, few, kind, low) for low in LOW_GAINS] for kind in LIKELIHOODS},  # type: ignore
+        grids={kind: [later(grid_row, few, kind, low) for low in LOW_GAINS] for kind in LIKELIHOODS},  # type: ignore[misc]
         recording=recording,
         schedule=schedule,
     )

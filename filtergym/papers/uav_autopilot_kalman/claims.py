@@ -28,7 +28,7 @@ from .experiment import (
 SCALES = (0.01, 1.0, 100.0)
 
 
-def _excess(datasets: dict) -> str:
+def _excess(datasets: dict[str, Any]) -> str:
     """Cost of the paper's filter above that of the filter told the noise, and its consistency."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
