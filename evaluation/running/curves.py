@@ -402,7 +402,3 @@ def _exceedance(squares: numpy.ndarray) -> Curve:
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
     """Mean NEES or NIS over its dimension, and the sum of the dimensions, from the means of both, ``(1, 2, time)``."""
     return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}
-
-
-def _present(name: str, dims: tuple[str, ...], values: numpy.ndarray) -> dict[str, Series]:
-    return {} if numpy.isnan(values).all() else {name: (dims, values)}
