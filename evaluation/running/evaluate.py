@@ -425,9 +425,9 @@ def plan_of(
     for name, one in competitors.items():
         if hasattr(one, "of_tracks"):
             check_open_loop(models[name], repr(name))
-            named = map(str, range(first, first + len(seeds)))
+            named = [str(first + i) for i in range(len(seeds))]
             if chosen.recording is not None and flown is not None:
-                named = (chosen.flights[i] for i in flown)
+                named = [chosen.flights[i] for i in flown]
             competitors[name] = one.of_tracks(
                 models[name].on_numpy().task, dict(zip(seeds, named, strict=True))
             )

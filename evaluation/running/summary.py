@@ -242,7 +242,7 @@ def summaries(
     added: dict[int, Part] = {}
     done = [0] * len(asked)
     sizes = [sum(piece.measurements for piece in batch) for batch in items]
-    run = workers.run(functools.partial(_one_after_another, summarise), items, sizes, progress)
+    run = workers.run(lambda batch, tick: [summarise(one, tick) for one in batch], items, sizes, progress)
     for (i, piece), found in (
         (which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)
     ):
@@ -260,14 +260,6 @@ def summaries(
                 whole = added.pop(i).summary(asked[i])
             store.write(work[i], whole)
             yield i, whole
-
-
-def _one_after_another(
-    function: Callable[[EvaluationRequest, Progress], Summary | Part],
-    batch: Sequence[EvaluationRequest],
-    tick: Progress,
-) -> list[Summary | Part]:
-    return [function(piece, tick) for piece in batch]
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:

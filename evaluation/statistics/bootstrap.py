@@ -126,9 +126,7 @@ class Bootstrap:
             number = int(self._clusters.max()) + 1
         counts = numpy.ones((1 + resamples, number), dtype=numpy.uint8)
         even = numpy.full(number, 1.0 / number)
-        for first in range(
-            1, 1 + resamples, 100
-        ):  # the numbers of one draw, without all of them in 64 bits at once
+        for first in range(1, 1 + resamples, 100):  # as one draw, never all of them in 64 bits
             drawn = generator.multinomial(number, even, size=min(100, 1 + resamples - first))
             if drawn.max() > numpy.iinfo(counts.dtype).max:
                 counts = counts.astype(numpy.min_scalar_type(int(drawn.max())))
