@@ -380,7 +380,7 @@ def plan_of(
         experiment: which episodes, and how.
         competitors: by name.
         first: number of the first episode that is planned; flights and recordings have the plan of all.
-        end: number after that of the last one; None: all that follow.
+        end: number after that of the last one; None, with a first of 0: all.
     """
     cls = experiment.task
     experiment = replace(
@@ -396,7 +396,7 @@ def plan_of(
         raise nearest("control", control, cls.controls)
     if not competitors:
         raise ValueError("name at least one policy")
-    seeds = episode_seeds(split, seed, (episodes if end is None else end) - first, first)
+    seeds = episode_seeds(split, seed, episodes if end is None else end - first, first)
     kinds: dict[str, Kind] = {name: kind_of(maker) for name, maker in competitors.items()}
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
