@@ -308,13 +308,15 @@ def replay_log(experiment: Experiment, competitors: Mapping[str, Any]) -> "xarra
     """Run competitors over a log, and return what pictures show of every measurement, as of an evaluation."""
     plan = plan_of(experiment, competitors)
     task = plan.models[next(iter(competitors))].task
-    kept: dict[str, dict[str, numpy.ndarray]] = {}
+    kept = plan.arrays(len(plan.seeds), len(plan.seeds))
     for name, run in zip(plan.competitors, _start_runs(plan, report_picture), strict=True):
-        arrays, done = kept.setdefault(name, {}), 0
+        arrays: dict[str, numpy.ndarray] = {}
+        done = 0
         for report in run:
             for key, each in report.items():
                 if key not in arrays:
                     arrays[key] = numpy.full((len(plan.seeds), task.horizon, *each.shape[1:-1]), math.nan)
                 arrays[key][:, done : done + len(each)] = numpy.moveaxis(each, -1, 0)
             done += len(each)
+        kept.write(name, slice(None), arrays)
     return plan.dataset(kept, plan.seeds)

@@ -170,7 +170,7 @@ def test_an_action_is_told_as_the_box_bounds_it():
 )
 def test_names_of_actions(env, control, expected):
     model = make_model(env, control)
-    found = action_names(model, model.action_space.shape[0])
+    found = action_names(model)
     assert len(found) == len(set(found)) == model.action_space.shape[0]
     assert found == expected
 

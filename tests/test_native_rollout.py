@@ -62,6 +62,21 @@ def test_whole_episodes_are_those_that_are_stepped(environment, scenario, keywor
             np.testing.assert_array_equal(action, actions, err_msg=name)
 
 
+@pytest.mark.parametrize("name", ["imm", "adaptive", "kalman-imm"])
+def test_episodes_go_on_from_where_they_were_left(name, monkeypatch):
+    """World, filter and the memory of a policy, over chunks of seven measurements."""
+    given = model_of("ManeuveringTarget", name, "random", horizon=24)
+    found, action = run_episodes(*given[:3], SEEDS, given[3])
+    monkeypatch.setattr(rollouts, "AT_ONCE", 16 * 7)
+    told = []
+    parts, actions = run_episodes(*given[:3], SEEDS, given[3], tick=told.append)
+    assert told == [11 * 7, 11 * 7, 11 * 7, 11 * 3]
+    for each, values in found.items():
+        np.testing.assert_array_equal(parts[each], values, err_msg=each)
+        assert parts[each].flags.c_contiguous
+    np.testing.assert_array_equal(actions, action)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_company_tiles_and_threads_change_no_bit(threads):
     """1600 lanes are several tiles, and enough for several threads."""

@@ -378,12 +378,12 @@ class Lanes:
     def run(
         self, report: Report, compiled_policy: Specialised | None = None, measurements: int | None = None
     ) -> tuple[Any, Any]:
-        """Run the episodes that have just begun to their end in native code, and report on every measurement.
+        """Run episodes on in native code, from where the last call left them, and report on every measurement.
 
         Args:
             report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
             compiled_policy: as of :meth:`.stepper.Stepper.run`; None: the action is zero.
-            measurements: after which they are left, a multiple of the decision interval; default: all.
+            measurements: after which they are left, a multiple of the decision interval; default: those of an episode.
 
         Returns:
             Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of the policy.

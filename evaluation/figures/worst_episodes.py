@@ -63,10 +63,10 @@ def run_episodes(
     """
     drawn = replace(experiment, tracks=False, drawn_episodes=len(numbers))
     plan = _with_episodes(plan_of(drawn, competitors), numbers)
-    kept = {
-        name: run_piece(plan.piece(name, 0, len(numbers), True), lambda measurements: None)
-        for name in competitors
-    }
+    kept = plan.arrays(len(numbers), len(numbers))
+    for name in competitors:
+        piece = plan.piece(name, 0, len(numbers), True)
+        kept.write(name, piece.part, run_piece(piece, lambda measurements: None))
     return plan.dataset(kept, plan.seeds)
 
 

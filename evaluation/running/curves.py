@@ -17,7 +17,7 @@ from ..statistics.bootstrap import block_of, percentile_interval, ratio
 from ..statistics.statistic import ALL, Key, Statistic, reduce_run
 from ..storage.dataset import groups_of, windows_of, with_windows
 from .metrics import (
-    bootstrap_of,
+    bootstrap_of_episodes,
     chi_square_band,
     components_and_groups,
     consistency_degrees,
@@ -83,7 +83,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         windows as the dataset has them. Attributes environment, scenario, split, seed, episodes, paper, reference,
         cost, truth and recorded.
     """
-    bootstrap = bootstrap_of(dataset, resamples)
+    bootstrap = bootstrap_of_episodes(dataset, resamples)
     declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     found = [competitor_curves(reduce_run(run, declare, bootstrap).results()) for run in runs]
@@ -131,6 +131,7 @@ def curve_statistics(
         resamples: of the bands.
     """
     times = run.sizes["time"]
+    resamples = resamples if episodes > 1 else 0  # one episode has no other to differ from
     distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
@@ -206,7 +207,10 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
                     stacked[i, [listed.index(name) for name in of]] = values
                 elif values is not None:
                     stacked[i] = values
-            variables |= _present(key + ending, ("policy", *dims), stacked)
+            if (
+                key in variables or not numpy.isnan(stacked).all()
+            ):  # a curve without a band has NaN for its ends
+                variables[key + ending] = (("policy", *dims), stacked)
     variables |= _consistency_bands(found)
     best = _cheapest(found, dataset)
     bases = {"paper": dataset.attrs["paper"], "best": best}
@@ -398,7 +402,3 @@ def _exceedance(squares: numpy.ndarray) -> Curve:
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
     """Mean NEES or NIS over its dimension, and the sum of the dimensions, from the means of both, ``(1, 2, time)``."""
     return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}
-
-
-def _present(name: str, dims: tuple[str, ...], values: numpy.ndarray) -> dict[str, Series]:
-    return {} if numpy.isnan(values).all() else {name: (dims, values)}

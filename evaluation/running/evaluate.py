@@ -26,11 +26,13 @@ from ..competitors.kinds import TOLD_MORE, Kind, kind_of
 from ..competitors.smoothers import check_open_loop
 from ..statistics.bootstrap import block_of
 from ..statistics.innovations import with_innovations
+from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
-from .kept import DRAWN_PREFIX, Kept, limits
-from .named_axes import recording_coords, with_named_axes
+from .kept import Kept, limits
+from .metrics import bootstrap_of
+from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
-from .rollout import More, ProcessorTime, Progress, measure_time, run_episodes
+from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
 from .threads import one_thread
 from .times import with_times
@@ -209,13 +211,12 @@ def run_experiment(
     if not workers.alone:
         check_sendable(experiment.task, competitors)
     sizes = [len(piece.seeds) * piece.horizon for piece in pieces]
-    chunks = workers.results(run_piece, pieces, sizes, progress)
-    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
-    count = len(chunks) // len(competitors)
-    for i, name in enumerate(competitors):
-        per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
-        chunks[i * count : (i + 1) * count] = [None] * count
-    dataset = plan.dataset(per_policy, plan.seeds)
+    kept = plan.arrays(len(plan.seeds), experiment.drawn_episodes)
+    for i, found in workers.run(run_piece, pieces, sizes, progress):
+        kept.write(pieces[i].name, pieces[i].part, found)
+    dataset = plan.dataset(kept, plan.seeds)
+    if isinstance(bootstrap := bootstrap_of(dataset), BlockBootstrap):
+        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
     return dataset
@@ -236,6 +237,11 @@ class Piece(NamedTuple):
     model: Model | None
     """That was made already, in this process."""
 
+    @property
+    def part(self) -> slice:
+        """Which episodes of the evaluation they are."""
+        return slice(self.first, self.first + len(self.seeds))
+
 
 LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
 """What few estimators and references say: how likely a measurement was."""
@@ -252,15 +258,21 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     report: Report = limits if kind == "bound" else kept
     if kind != "bound" and experiment.drawn_episodes > piece.first:
         most = experiment.drawn_episodes - piece.first
-        drawn = More(replace(kept, drawings=True), most, DRAWN_PREFIX)
+        drawn = replace(kept, drawings=True), most
     # What is timed afterwards is optimised then: nothing need be compiled in two ways.
     with optimised_code() if experiment.timed else nullcontext():
         flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)
-    if experiment.strict and "lost" in arrays:
-        _refuse_losses(piece, arrays["lost"])
+    if experiment.strict and "lost" in arrays and arrays["lost"].any():
+        lost = arrays["lost"] > 0.0
+        k = int(numpy.argmax(lost.any(axis=0)))
+        i = int(numpy.argmax(lost[:, k]))
+        reason = FAULTS[int(arrays["lost"][i, k]) - 1]
+        raise ValueError(
+            f"estimator {piece.name!r}: {reason} in episode {piece.first + i} at measurement {k + 1}"
+        )
     if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
         box, action = model.action_space, numpy.asarray(flown.action, dtype=numpy.float64)
         arrays["action"] = numpy.clip(action, box.low, box.high).reshape(*action.shape[:2], -1)
@@ -280,32 +292,6 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
         )
 
 
-def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
-    """Raise ValueError if an episode is lost, for the first measurement at which one is.
-
-    Args:
-        piece: of the competitor.
-        faults: numbers of the reasons, ``(episodes, time)``.
-    """
-    if faults.any():
-        step = int(numpy.argmax((faults > 0.0).any(axis=0)))
-        i = int(numpy.argmax(faults[:, step] > 0.0))
-        raise ValueError(
-            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + i} at measurement "
-            f"{step + 1}"
-        )
-
-
-def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
-    """Join what was kept of episodes; the chunks are emptied on the way, so that little is held twice."""
-    if len(chunks) == 1:
-        return chunks[0]
-    return {
-        key: numpy.concatenate([chunk.pop(key) for chunk in chunks if key in chunk])
-        for key in list(chunks[0])
-    }
-
-
 class Plan(NamedTuple):
     """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
 
@@ -313,10 +299,12 @@ class Plan(NamedTuple):
     """Its scenario opened."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
-    controls: dict[str, str]
     models: dict[str, Model]
     scenario: Scenario
     seeds: list[int]
+    """Of the episodes that are planned."""
+    first: int
+    """Number of the first of them."""
     flown: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
@@ -329,8 +317,8 @@ class Plan(NamedTuple):
             name,
             self.competitors[name],
             self.kinds[name],
-            self.controls[name],
-            self.seeds[first : first + count],
+            model.control,
+            self.seeds[first - self.first : first - self.first + count],
             first,
             model.task.horizon,
             model if here else None,
@@ -340,25 +328,24 @@ class Plan(NamedTuple):
         """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
         return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
-    def dataset(
-        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
-    ) -> "xarray.Dataset":
-        """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
-        experiment = self.experiment
-        dataset = with_named_axes(
-            per_policy, self.kinds, self.controls, self.models, self.scenario.windows, seeds
-        )
-        if self.flown is not None and self.lengths is not None:
-            import xarray
+    def arrays(self, episodes: int, drawn: int) -> StackedArrays:
+        """Return room for what is kept of so many episodes of every competitor; arguments as it has them."""
+        acting = [
+            name
+            for name, model in self.models.items()
+            if self.kinds[name] == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
+        ]
+        return StackedArrays(self.models, acting, episodes, drawn)
 
-            beyond = dataset["time"].values <= self.lengths[:, None]
-            there = xarray.DataArray(beyond, dims=("episode", "time"))
-            of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
-            present = {
-                name: values.where(of_drawn if "drawn_episode" in values.dims else there)
-                for name, values in dataset.data_vars.items()
-            }
-            dataset = dataset.assign(present).assign_coords(
+    def dataset(self, kept: StackedArrays, seeds: Sequence[int]) -> "xarray.Dataset":
+        """Return what was kept of some competitors or episodes as an evaluation."""
+        experiment = self.experiment
+        dataset = with_named_axes(kept, self.kinds, self.models, self.scenario.windows, seeds)
+        if self.flown is not None and self.lengths is not None:
+            beyond = dataset["time"].values > self.lengths[:, None]
+            for values in dataset.data_vars.values() if beyond.any() else ():
+                values.values[:, beyond[: values.shape[1]]] = numpy.nan
+            dataset = dataset.assign_coords(
                 flight=("episode", [self.scenario.flights[i] for i in self.flown]),
                 length=("episode", self.lengths),
             )
@@ -384,8 +371,17 @@ class Plan(NamedTuple):
         )
 
 
-def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
-    """Return the plan of an evaluation; refusals as of :func:`run_experiment`."""
+def plan_of(
+    experiment: Experiment, competitors: Mapping[str, Any], first: int = 0, end: int | None = None
+) -> Plan:
+    """Return the plan of an evaluation; refusals as of :func:`run_experiment`.
+
+    Args:
+        experiment: which episodes, and how.
+        competitors: by name.
+        first: number of the first episode that is planned; flights and recordings have the plan of all.
+        end: number after that of the last one; None, with a first of 0: all.
+    """
     cls = experiment.task
     experiment = replace(
         experiment,
@@ -400,38 +396,42 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         raise nearest("control", control, cls.controls)
     if not competitors:
         raise ValueError("name at least one policy")
-    seeds = episode_seeds(split, seed, episodes)
+    seeds = episode_seeds(split, seed, episodes if end is None else end - first, first)
     kinds: dict[str, Kind] = {name: kind_of(maker) for name, maker in competitors.items()}
-    controls: dict[str, str] = {}
     models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
-        controls[name] = control_of(maker, control, cls, name)
-        models[name] = experiment.make_model(maker, controls[name])
+        models[name] = experiment.make_model(maker, control_of(maker, control, cls, name))
     for name, model in models.items():
         check_observation(model, competitors[name], name)
         if kinds[name] == "smoother":
             check_open_loop(model, f"smoother {name!r}")
-    first = next(iter(models.values()))
+    model = next(iter(models.values()))
     if chosen.recording is not None:
-        _check_truth_available(kinds, chosen.name)
-        episodes = len(first.task.flights)  # nothing is random: each once
+        for name, kind in kinds.items():
+            if kind in TOLD_MORE:
+                raise ValueError(
+                    f"{kind} {name!r} is told what recording {chosen.name!r} does not hold, more of the truth than the "
+                    "components: leave it out"
+                )
+        episodes = len(model.task.flights)  # nothing is random: each once
     flown, lengths = None, None
-    if first.task.flights:
-        seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
+    if model.task.flights:
+        seeds, flown, lengths = _flights_in_turn(model, split, seed, episodes)
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    if chosen.recording is None or flown is None:
-        tracks = {seed: str(i) for i, seed in enumerate(seeds)}
-    else:
-        tracks = {seed: chosen.flights[i] for seed, i in zip(seeds, flown, strict=True)}
     competitors = dict(competitors)
     for name, one in competitors.items():
         if hasattr(one, "of_tracks"):
             check_open_loop(models[name], repr(name))
-            competitors[name] = one.of_tracks(models[name].on_numpy().task, tracks)
-    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
+            named = [str(first + i) for i in range(len(seeds))]
+            if chosen.recording is not None and flown is not None:
+                named = [chosen.flights[i] for i in flown]
+            competitors[name] = one.of_tracks(
+                models[name].on_numpy().task, dict(zip(seeds, named, strict=True))
+            )
+    return Plan(experiment, competitors, kinds, models, chosen, seeds, first, flown, lengths)
 
 
 def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
@@ -453,16 +453,6 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
             raise ValueError(
                 f"{name!r} cannot be sent to another process ({error}): give its class, or leave out jobs and cluster"
             ) from error
-
-
-def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
-    """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
-    for competitor, kind in kinds.items():
-        if kind in TOLD_MORE:
-            raise ValueError(
-                f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
-                "components: leave it out"
-            )
 
 
 def _flights_in_turn(

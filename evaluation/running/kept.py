@@ -12,19 +12,6 @@ DRAWN_PREFIX = "drawn_"
 """Begins the names of what is kept of the first episodes only."""
 
 
-def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
-    """What is kept of every measurement, arrays ``(..., N)``."""
-    error = model.error(episode)
-    return {
-        "error": error,
-        "cost": model.cost(episode),
-        "compressed_cost": compressed_cost(model, episode),
-        "causes": model.causes(episode),
-        **_normalised_error(model, error, model.covariance(episode)),
-        **model.records(episode),
-    }
-
-
 def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
     """Normalised squared error of the components whose truth is known, with their marginal covariance.
 
@@ -63,7 +50,17 @@ class Kept:
 
     def __call__(self, model: Model, episode: Episode) -> dict[str, Any]:
         """Report it, arrays ``(..., N)``; of the truth nothing where it is not known."""
-        found = _measurement_report(model, episode) if model.task.has_truth else model.records(episode)
+        found = {}
+        if model.task.has_truth:
+            error = model.error(episode)
+            found = {
+                "error": error,
+                "cost": model.cost(episode),
+                "compressed_cost": compressed_cost(model, episode),
+                "causes": model.causes(episode),
+                **_normalised_error(model, error, model.covariance(episode)),
+            }
+        found |= model.records(episode)
         if self.drawings:
             shown = model.picture_track(episode)
             found |= {f"{DRAWN_PREFIX}{name}": values for name, values in shown.items()}

@@ -6,7 +6,7 @@ Differences and ratios are paired: numerator and denominator are resampled toget
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
@@ -17,6 +17,7 @@ from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
 from ..statistics.statistic import ALL, Function, Key, Statistic, identity, reduce_run
+from ..statistics.time_blocks import FEWEST, BlockBootstrap
 from ..storage.dataset import (
     Losses,
     count_losses,
@@ -94,10 +95,20 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
 
-def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
+def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
     clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
     return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
+
+
+def bootstrap_of(dataset: "xarray.Dataset") -> Bootstrap:
+    """Resampling of the episodes of an evaluation; of one episode of blocks of time, whose length follows from the
+    costs of all competitors, without truth from their log-likelihoods.
+    """
+    known = [name for name in ("cost", "log_likelihood") if name in dataset]
+    if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST and known:
+        return BlockBootstrap(dataset[known[0]].values[:, 0])
+    return bootstrap_of_episodes(dataset)
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
@@ -135,8 +146,8 @@ def record_statistics(
     def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
         """Mean over every window."""
         for window, times in slices.items():
-            mean = mean_over_time(run, values[:, times])
-            yield Statistic(("record", metric, component, window, unit), mean, function)
+            key, mean = ("record", metric, component, window, unit), mean_over_time(run, values[:, times])
+            yield Statistic(key, mean, function, of_units=_units(values, times))
 
     for component, unit in components_and_groups(run).items() if judged else ():
         squares = squared_errors(run, component, groups)
@@ -159,7 +170,7 @@ def record_statistics(
         shape = (run.sizes["episode"], run.sizes["time"])
         log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
         for window, times in slices.items():
-            yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood[:, times])
+            yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood, times)
     if not is_bound and judged:
         yield from means("cost", "", "1", run["cost"].values)
         cost = run["compressed_cost"].values
@@ -167,7 +178,7 @@ def record_statistics(
         yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
     if CAUSES in run and not is_bound and judged:
         nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
-        yield Statistic(("causes",), cause_sums(run, nees))
+        yield Statistic(("causes",), cause_sums(run, nees), of_units=functools.partial(cause_sums, run, nees))
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     if "lost" in run and not numpy.isnan(run["lost"].values).all():
@@ -176,16 +187,22 @@ def record_statistics(
         yield Statistic(("record", "lost_episodes", "", "all", "1"), share)
         yield Statistic(("losses",), losses, count_losses, sample=ALL)
     if "missing" in run and not numpy.isnan(run["missing"].values).all():
-        yield _mean_of_present("missing", "", "all", "1", run["missing"].values)
+        yield _mean_of_present("missing", "", "all", "1", run["missing"].values, slice(None))
     if metrics is not None:
         yield from metrics.statistics(run)
 
 
-def _mean_of_present(metric: str, component: str, window: str, unit: str, values: numpy.ndarray) -> Statistic:
+def _mean_of_present(
+    metric: str, component: str, window: str, unit: str, values: numpy.ndarray, times: slice
+) -> Statistic:
     """Mean over episodes and times of what is there; a block of episodes may have nothing."""
-    return Statistic(
-        ("record", metric, component, window, unit), sums_of_present(values), ratio, optional=True
-    )
+    key, sums = ("record", metric, component, window, unit), sums_of_present(values[:, times])
+    return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
+
+
+def _units(values: numpy.ndarray, times: slice) -> Callable[[BlockBootstrap], numpy.ndarray]:
+    """Return what sums up values of one episode, ``(1, time)``, in units of time."""
+    return functools.partial(BlockBootstrap.sums_of_present, values=values, times=times)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
@@ -202,8 +219,8 @@ def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[
     inside = numpy.where(there, (values >= low) & (values <= high), numpy.nan)
     inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
     for window, times in slices_of(run).items():
-        yield _mean_of_present(f"a{metric}", component, window, "1", normalised[:, times])
-        yield _mean_of_present(f"{metric}_inside", component, window, "1", inside[:, times])
+        yield _mean_of_present(f"a{metric}", component, window, "1", normalised, times)
+        yield _mean_of_present(f"{metric}_inside", component, window, "1", inside, times)
         if metric == "nis":
             sums = numpy.stack([there[:, times].sum(axis=1), inverse[:, times].sum(axis=1)], axis=1)
             key = ("record", "anis_band", component, window, "1")
@@ -298,6 +315,8 @@ class Contender(NamedTuple):
     losses: Losses | None
     causes: CauseCosts | None = None
     """None of bounds, without truth, and of an evaluation that holds no causes."""
+    cost_over_time: numpy.ndarray | None = None
+    """Of one episode its mean cost in every resample of its measurements, ``(1 + resamples,)``; None of several."""
 
 
 def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
@@ -316,17 +335,15 @@ class _Against:
     ) -> None:
         self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
         self.paper, self.reference, self.bootstrap = attrs["paper"], attrs["reference"], bootstrap
-        against = self.costs.get(self.paper)
-        with numpy.errstate(divide="ignore", invalid="ignore"):
-            self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
-            logs = [numpy.log(own) for own in self.costs.values()]
+        self._compared = self.paper in self.costs
         self.bound = attrs.get("lost_cost", 0.0)
-        lost = [own > self.bound for own in self.costs.values()]
-        columns = [*self.costs.values(), *logs, *lost, *map(_wins, self.ratios.values())]
-        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else numpy.empty((0, 0))
-        parts = [means[i * len(logs) : (i + 1) * len(logs)] for i in range(4)]
+        means = bootstrap.means_of(self._columns) if self.costs else numpy.empty((1, 0))
+        parts = numpy.split(means.T, 4 if self._compared else 3)
         self.means, self.logs, self.lost = (dict(zip(self.costs, part, strict=True)) for part in parts[:3])
-        self.wins = dict(zip(self.ratios, parts[3], strict=True))
+        self.wins = dict(zip(self.costs, parts[3], strict=True)) if self._compared else {}
+        for c in contenders:
+            if c.name in self.costs and c.cost_over_time is not None:
+                self.means[c.name], self.logs[c.name] = c.cost_over_time, numpy.log(c.cost_over_time)
         self.ranked = [c.name for c in contenders if c.kind in RANKED and c.costs is not None]
         self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
         # Of equals the first, and so where none is a number, as of flights in which nobody was measured.
@@ -334,6 +351,17 @@ class _Against:
         places = numpy.argmax(own_logs <= own_logs.min(axis=0) + NEGLIGIBLE, axis=0) if self.ranked else []
         self.best = self.ranked[places[0]] if self.ranked else ""
         self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
+
+    def _columns(self, part: slice) -> numpy.ndarray:
+        """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
+        logarithm, whether it is lost, and whether it is less than the paper's algorithm's.
+        """
+        costs = [own[part] for own in self.costs.values()]
+        with numpy.errstate(divide="ignore", invalid="ignore"):
+            columns = [*costs, *map(numpy.log, costs), *(own > self.bound for own in costs)]
+            if self._compared:
+                columns += [_wins(own / self.costs[self.paper][part]) for own in costs]
+        return numpy.stack(columns, axis=1)
 
     def behind_best(self, name: str) -> Iterator[Measure]:
         """Paired ratio of the cost to the best one's, less one, and how often other episodes would name this one."""
@@ -363,14 +391,16 @@ class _Against:
 
     def others(self, name: str) -> Iterator[Measure]:
         """Score and paired difference to the paper's algorithm, where there is what they need."""
-        if name not in self.ratios:
+        if name not in self.wins:
             return
         bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
+        with numpy.errstate(divide="ignore", invalid="ignore"):
+            ratios = self.costs[name] / self.costs[self.paper]
         found = {
             "geometric_cost_difference": self._difference(name, self.paper),
             "cost_difference": bootstrap.interval(cost - paper),
             "relative_cost_difference": bootstrap.relative_difference(cost, paper),
-            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
+            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(ratios)),
             "win_rate": bootstrap.interval(self.wins[name]),
         }
         # A share of the room that a causal competitor has says nothing of one that uses later measurements.
@@ -424,7 +454,8 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
     """
     records = []
     for flight in sorted(set(dataset["flight"].values.tolist())):
-        part = dataset.isel(episode=numpy.flatnonzero(dataset["flight"].values == flight))
+        own = dataset["flight"].values == flight
+        part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # which copies them
         part = part.isel(time=slice(int(part["length"].max())))
         windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
         part = with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
@@ -506,8 +537,11 @@ def contender_of(
     if (time := time_of(run)) is not None:
         estimate = IntervalEstimate(time.nanoseconds, math.nan, math.nan)
         measures.append(Measure(METRIC, way_of(time), "all", estimate, "ns"))
+    costs, over_time = results.get(("cost",)), None
+    if costs is not None and isinstance(bootstrap, BlockBootstrap):
+        over_time = results["record", "cost", "", "all", "1"]
     return Contender(
-        name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
+        name, kind, control, measures, further, costs, results.get(("losses",)), causes, over_time
     )
 
 

@@ -1,5 +1,6 @@
 """What was kept of episodes as a dataset, whose axes have names and units."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -89,12 +90,13 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     return ["mode" if "mode" in key else key]
 
 
-def action_names(model: Model, count: int) -> tuple[str, ...]:
+def action_names(model: Model) -> tuple[str, ...]:
     """Names of the components of a box of actions.
 
     As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
     for each; else the control, with numbers from 1 on where there are several.
     """
+    count = math.prod(model.action_space.shape or ())
     shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
     for names in (*shown, model.task.modes):
         # A number alone says less than the hypothesis's name.
@@ -103,47 +105,74 @@ def action_names(model: Model, count: int) -> tuple[str, ...]:
     return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
 
 
-def _actions_named(
-    per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
-    controls: Mapping[str, str],
-    models: Mapping[str, Model],
-) -> dict[str, tuple[str, ...]]:
-    """Names of the actions of every policy that has any; of their control too, where they steer by several."""
-    acting = [name for name, series in per_policy.items() if "action" in series]
-    several = len({controls[name] for name in acting}) > 1
-    found = {name: action_names(models[name], per_policy[name]["action"].shape[-1]) for name in acting}
-    if several:
-        return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
-    return found
+class StackedArrays:
+    """What is kept of episodes, each piece of them written where it stays.
 
+    Args:
+        models: of every competitor, in which it acts.
+        acting: names of those whose action is a box.
+        episodes: of each.
+        drawn: number of the first episodes of which a picture is kept.
 
-def _actions_aligned(
-    per_policy: Mapping[str, Mapping[str, numpy.ndarray]], actions: Mapping[str, tuple[str, ...]]
-) -> numpy.ndarray:
-    """Actions side by side, ``(policy, episode, time, name)``; NaN where a policy does not steer by that."""
-    every = list(dict.fromkeys(sum(actions.values(), ())))
-    episodes, length = per_policy[next(iter(actions))]["action"].shape[:2]
-    aligned = numpy.full((len(per_policy), episodes, length, len(every)), numpy.nan)
-    for i, (name, series) in enumerate(per_policy.items()):
-        if name in actions:
-            aligned[i][..., [every.index(part) for part in actions[name]]] = series["action"]
-    return aligned
+    Attributes:
+        actions: names of the actions of each that is acting; of their control too, where they steer by several.
+        action_names: of all of them.
+    """
+
+    def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
+        several = len({models[name].control for name in acting}) > 1
+        self.actions = {
+            name: [
+                f"{models[name].control}: {part}" if several else part for part in action_names(models[name])
+            ]
+            for name in acting
+        }
+        self.action_names = list(dict.fromkeys(part for own in self.actions.values() for part in own))
+        self._arrays: dict[str, numpy.ndarray] = {}
+        self._places = {name: i for i, name in enumerate(models)}
+        self._episodes, self._drawn = episodes, min(drawn, episodes)
+        self._written: list[tuple[int, slice, set[str]]] = []
+
+    def write(self, name: str, part: slice, kept: dict[str, numpy.ndarray]) -> None:
+        """Write what was kept of some episodes of a competitor, ``(episodes, time, ...)`` by name, and empty it."""
+        place = self._places[name]
+        self._written.append((place, part, set(kept)))
+        while kept:
+            key, values = kept.popitem()
+            shape = values.shape[1:]
+            if key == "action":
+                shape = (*shape[:-1], len(self.action_names))
+            if key not in self._arrays:
+                count = self._drawn if key.startswith(DRAWN_PREFIX) else self._episodes
+                self._arrays[key] = numpy.empty((len(self._places), count, *shape))
+            rows = self._arrays[key][place, part]
+            if shape == values.shape[1:]:
+                rows[...] = values
+            else:
+                rows[...] = numpy.nan
+                rows[..., [self.action_names.index(each) for each in self.actions[name]]] = values
+
+    def finished(self) -> dict[str, numpy.ndarray]:
+        """Return the arrays ``(policy, episode, time, ...)`` by name, in its order; NaN where nothing was kept."""
+        for key, array in self._arrays.items():
+            for place, part, kept in self._written:
+                if key not in kept:
+                    array[place, part] = numpy.nan
+        return dict(sorted(self._arrays.items()))
 
 
 def with_named_axes(
-    per_policy: dict[str, dict[str, numpy.ndarray]],
+    kept: StackedArrays,
     kinds: Mapping[str, Kind],
-    controls: Mapping[str, str],
     models: Mapping[str, Model],
     windows: Mapping[str, tuple[int, int]],
     seeds: Sequence[int],
 ) -> "xarray.Dataset":
-    """Return what was kept of competitors as a dataset, and empty it on the way.
+    """Return what was kept of competitors as a dataset.
 
     Args:
-        per_policy: of every competitor, what was kept by its name, ``(episodes, time, ...)``.
+        kept: all of it.
         kinds: of every competitor.
-        controls: likewise.
         models: likewise, in which each acts.
         windows: of the scenario.
         seeds: of the episodes.
@@ -151,27 +180,17 @@ def with_named_axes(
     import xarray
 
     model = next(iter(models.values()))
-    names = list(per_policy)
     components = [c.name for c in model.task.components]
     times = numpy.arange(1, model.task.horizon + 1)
     variables: dict[str, Any] = {}
-    actions = _actions_named(per_policy, controls, models)
-    for key in sorted({key for series in per_policy.values() for key in series}):
-        if key == "action":
-            dims = ["policy", "episode", "time", "action_name"]
-            variables[key] = (dims, _actions_aligned(per_policy, actions), _attributes(key, ""))
-            continue
-        example = next(series[key] for series in per_policy.values() if key in series)
-        stacked = numpy.empty((len(names), *example.shape))
-        for i, name in enumerate(names):
-            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
+    for key, values in kept.finished().items():
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
-        dims += _further_dimensions(key, example.ndim - 3)
-        variables[key] = (dims, stacked, _attributes(key, model.task.reward.cost))
+        dims += ["action_name"] if key == "action" else _further_dimensions(key, values.ndim - 4)
+        variables[key] = (dims, values, _attributes(key, model.task.reward.cost))
     coords: dict[str, Any] = {
-        "policy": names,
-        "kind": ("policy", [kinds[n] for n in names]),
-        "control": ("policy", [controls[n] for n in names]),
+        "policy": list(models),
+        "kind": ("policy", [kinds[name] for name in models]),
+        "control": ("policy", [each.control for each in models.values()]),
         "episode": numpy.arange(len(seeds)),
         "episode_seed": ("episode", [str(seed) for seed in seeds]),
         "time": times,
@@ -195,6 +214,6 @@ def with_named_axes(
         coords["cause"] = [cause.name for cause in causes]
         coords["cause_phrase"] = ("cause", [cause.phrase for cause in causes])
         coords["start_measurements"] = Causes.of(model.task).start
-    if actions:
-        coords["action_name"] = list(dict.fromkeys(sum(actions.values(), ())))
+    if "action" in variables:
+        coords["action_name"] = kept.action_names
     return xarray.Dataset(variables, coords)

@@ -54,15 +54,8 @@ class ImportPaths(NamedTuple):
     """What the user's environment says of PYTHONSAFEPATH, which we set for the processes that begin."""
 
 
-class Outcome(NamedTuple):
-    """What became of a piece of work."""
-
-    number: int
-    result: Any
-    error: Exception | None
-    traceback: str
-    """Of the error, where it was raised."""
-    warnings: list[tuple[str, type[Warning]]]
+Outcome = tuple[int, Any, tuple[Exception, str] | None, list[tuple[str, type[Warning]]]]
+"""Number of a piece of work, its result, its error with the traceback, and its warnings."""
 
 
 class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
@@ -101,10 +94,10 @@ def _run_piece(index: int, packed: bytes, packed_item: bytes, paths: ImportPaths
             function = pickle.loads(packed)  # only now: its modules may lie on those paths
             with on_path(paths.named_in):
                 item = pickle.loads(packed_item)
-            found = Outcome(index, function(item, lambda measurements: None), None, "", [])
+            result, failed = function(item, lambda measurements: None), None
         except Exception as error:
-            found = Outcome(index, None, _sendable(error), traceback.format_exc(), [])
-    return found._replace(warnings=[(str(warning.message), warning.category) for warning in noted])
+            result, failed = None, (_sendable(error), traceback.format_exc())
+    return index, result, failed, [(str(warning.message), warning.category) for warning in noted]
 
 
 def _sendable(error: Exception) -> Exception:
@@ -225,16 +218,16 @@ class Workers:
         shown_warnings: set[tuple[str, type[Warning]]] = set()
         # Processes that begin search no libraries in the working directory; :func:`_run_piece` tells them the paths.
         with _environment(PYTHONSAFEPATH="1"):
-            for outcome in spread(calls):
-                for text, category in outcome.warnings:
+            for number, result, failed, noted in spread(calls):
+                for text, category in noted:
                     if (text, category) not in shown_warnings:
                         shown_warnings.add((text, category))
                         warnings.warn(text, category, stacklevel=2)
-                if outcome.error is not None:
-                    raise outcome.error from Elsewhere(outcome.traceback)
+                if failed is not None:
+                    raise failed[0] from Elsewhere(failed[1])
                 if sizes is not None:
-                    tick(sizes[outcome.number])
-                yield outcome.number, outcome.result
+                    tick(sizes[number])
+                yield number, result
 
     def results(
         self,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
-from ...compiler.functions import Specialised
+from ...compiler.functions import Specialised, map_arrays
 from ...compiler.native import optimised_code
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import Array
@@ -32,6 +32,10 @@ from ..competitors.kinds import (
 from ..competitors.smoothers import SmoothedTrack, check_open_loop, report_smoothed, report_world, run_forward
 from ..competitors.steered_filter import compile_policy, trace_policy
 from ..competitors.stepping import SteppingPolicy
+from .kept import DRAWN_PREFIX
+
+AT_ONCE = 2**18
+"""Measurements of all episodes side by side that are run at once in native code."""
 
 Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
@@ -81,29 +85,23 @@ def rollout(
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
-    if kind == "policy":
-        yield from _steer_by_python(model, competitor, seeds, report, name)
-        return
-    yield from _step_filter(_put_in_loop(model, competitor, kind, seeds, name), seeds, report)
+    looped = model if kind == "policy" else _put_in_loop(model, competitor, kind, seeds, name)
+    yield from _step(looped, competitor if kind == "policy" else None, seeds, report, name)
 
 
-def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
-    """Step a filter that needs nobody who steers it."""
-    lanes, action = start_lanes(looped, seeds, report=report), numpy.zeros(len(seeds), dtype=numpy.int64)
-    for _ in range(lanes.decisions_per_episode):
-        for found, _ in lanes.decide(action, report):
-            yield found, action
-
-
-def _steer_by_python(
-    model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
+def _step(
+    looped: Model, asked: Any, seeds: Sequence[int], report: Report, name: str
 ) -> Iterator[tuple[Any, Array]]:
-    """Step a bank, and ask its policy before every decision."""
-    lanes = start_lanes(model, seeds, report=report)
-    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
-    memory = policy.begin(seeds)
+    """Step a bank, whose policy is asked before every decision, or a filter that needs none, ``asked`` is None."""
+    lanes, action, policy, memory = start_lanes(looped, seeds, report=report), None, None, None
+    if asked is None:
+        action = numpy.zeros(len(seeds), dtype=numpy.int64)
+    else:
+        policy = SteppingPolicy(looped, check_competitor(name, make_competitor(asked, looped), "policy"))
+        memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
-        action, memory = policy.predict(lanes.observe(), memory)
+        if policy is not None:
+            action, memory = policy.predict(lanes.observe(), memory)
         for found, _ in lanes.decide(action, report):
             yield found, action
 
@@ -143,17 +141,6 @@ def _smoothed_estimates(
     return means, covariances
 
 
-class More(NamedTuple):
-    """What is reported of the first episodes only; of all it would take much memory."""
-
-    report: Report
-    """Of all that is reported of them."""
-    episodes: int
-    """How many they are."""
-    prefix: str
-    """Begins the names of what is not reported of the others."""
-
-
 class Flown(NamedTuple):
     """What is reported of episodes that were run to their end."""
 
@@ -171,7 +158,7 @@ def run_episodes(
     report: Report,
     name: str = "competitor",
     tick: Progress | None = None,
-    more: More | None = None,
+    more: tuple[Report, int] | None = None,
 ) -> Flown:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -186,7 +173,8 @@ def run_episodes(
         report: of arrays ``(..., N)`` by name.
         name: of the competitor, in errors.
         tick: told of measurements done.
-        more: what is reported of the first episodes beside it.
+        more: report on the first episodes, and how many they are: of all it would take much memory. Names that begin
+            with :data:`.kept.DRAWN_PREFIX` are of them only.
     """
     count, compiled_policy, tick = len(seeds), None, tick or (lambda measurements: None)
     is_policy = kind == "policy"
@@ -198,22 +186,21 @@ def run_episodes(
         if can_step(forward, report_world):
             lanes = start_lanes(forward, seeds)
             length = lanes.decisions_per_episode * model.task.decision_interval
-            reported = report if more is None else more.report
-            return _join_stretches(report_smoothed(looped, lanes, track, reported, length), count, tick, more)
-    compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
+            reported, drawn = more or (report, 0)
+            return _join_stretches(
+                report_smoothed(looped, lanes, track, reported, length), count, tick, drawn
+            )
+    compiled = can_step(looped, report) and (more is None or can_step(looped, more[0]))
     if compiled and (compiled_policy is not None or not is_policy):
         if more is None:
             return _run_compiled(looped, compiled_policy, seeds, report, tick)
-        parts = [_run_compiled(looped, compiled_policy, seeds[: more.episodes], more.report, tick)]
-        if more.episodes < count:
-            parts.append(_run_compiled(looped, compiled_policy, seeds[more.episodes :], report, tick))
+        parts = [_run_compiled(looped, compiled_policy, seeds[: more[1]], more[0], tick)]
+        if more[1] < count:
+            parts.append(_run_compiled(looped, compiled_policy, seeds[more[1] :], report, tick))
         return _one_after_another(parts)
-    steps = (
-        _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
-        if is_policy
-        else _step_filter(looped, seeds, report if more is None else more.report)
-    )
-    return _step_episodes(steps, count, is_policy, tick, more)
+    report, drawn = more or (report, 0)
+    steps = _step(looped, competitor if is_policy else None, seeds, report, name)
+    return _step_episodes(steps, count, is_policy, tick, drawn)
 
 
 def run_stretches(
@@ -244,11 +231,7 @@ def run_stretches(
         for first in range(0, length, rows):
             yield _without_padding(lanes.run(report, policy, min(rows, length - first))[0], len(seeds))
         return
-    steps = (
-        _steer_by_python(model, competitor, seeds, report, name)
-        if is_policy
-        else _step_filter(looped, seeds, report)
-    )
+    steps = _step(looped, competitor if is_policy else None, seeds, report, name)
     while some := [found for found, _ in itertools.islice(steps, rows)]:
         together = {key: numpy.stack([each[key] for each in some]) for key in some[0]}
         yield _without_padding(together, len(seeds))
@@ -262,35 +245,46 @@ def _without_padding(report: Mapping[str, numpy.ndarray], count: int) -> dict[st
 def _run_compiled(
     looped: Model, compiled_policy: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
 ) -> Flown:
-    """Run compiled episodes as one call of native code."""
+    """Run compiled episodes in native code, ``AT_ONCE`` measurements at a time, each from where the last was left."""
     lanes, count = start_lanes(looped, seeds, report=report), len(seeds)
-    reports, actions = lanes.run(report, compiled_policy)
-    tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
-    found = {name: _episodes_first(values, count) for name, values in reports.items()}
-    return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
+    interval = looped.task.decision_interval
+    decisions, most = lanes.decisions_per_episode, max(1, AT_ONCE // (lanes.width * interval))
+
+    def run(decisions: int, whole: bool) -> Flown:
+        """Run so many decisions; of whole episodes a view is returned."""
+        reports, actions = lanes.run(report, compiled_policy, decisions * interval)
+        tick(count * decisions * interval)
+        found = {name: _episodes_first(values, count) for name, values in reports.items()}
+        steered = None if actions is None else _checked_actions(looped, actions, count)
+        return Flown(found, steered) if whole else map_arrays(numpy.ascontiguousarray, Flown(found, steered))
+
+    parts = [run(min(most, decisions - i), decisions <= most) for i in range(0, decisions, most)]
+    return _one_after_another(parts, axis=1)
 
 
-def _one_after_another(parts: Sequence[Flown]) -> Flown:
-    """Join episodes; what is reported of some only is theirs alone."""
+def _one_after_another(parts: Sequence[Flown], axis: int = 0) -> Flown:
+    """Join episodes, or measurements of the same ones, and empty the parts on the way; what is reported of some
+    episodes only is theirs alone.
+    """
     if len(parts) == 1:
         return parts[0]
     found = {
-        name: numpy.concatenate([part.found[name] for part in parts if name in part.found])
-        for name in parts[0].found
+        name: numpy.concatenate([part.found.pop(name) for part in parts if name in part.found], axis)
+        for name in list(parts[0].found)
     }
     actions = [part.action for part in parts if part.action is not None]
-    return Flown(found, numpy.concatenate(actions) if actions else None)
+    return Flown(found, numpy.concatenate(actions, axis) if actions else None)
 
 
 def _join_stretches(
-    stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, more: More | None
+    stretches: Iterator[dict[str, numpy.ndarray]], count: int, tick: Progress, drawn: int
 ) -> Flown:
     """Keep what is reported of many measurements together, arrays ``(scans, ..., N)`` by name."""
     series: dict[str, list[numpy.ndarray]] = {}
     for found in stretches:
         for name, values in found.items():
-            few = more is not None and name.startswith(more.prefix)
-            series.setdefault(name, []).append(values[..., : more.episodes if more and few else count].copy())
+            kept = drawn if name.startswith(DRAWN_PREFIX) else count
+            series.setdefault(name, []).append(values[..., :kept].copy())
         tick(count * len(next(iter(found.values()))))
     return Flown(
         {name: _episodes_first(numpy.concatenate(values), count) for name, values in series.items()}, None
@@ -298,15 +292,16 @@ def _join_stretches(
 
 
 def _step_episodes(
-    steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, more: More | None
+    steps: Iterator[tuple[Any, Array]], count: int, is_policy: bool, tick: Progress, drawn: int
 ) -> Flown:
     """Keep what is reported of episodes that are stepped."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
         for name, values in found.items():
-            if more is not None and name.startswith(more.prefix):
-                values = values[..., : more.episodes].copy()  # a view would keep the numbers of all
+            kept = drawn if name.startswith(DRAWN_PREFIX) else count
+            if kept < values.shape[-1]:
+                values = values[..., :kept].copy()  # a view would keep the numbers of all
             series.setdefault(name, []).append(values)
         actions.append(numpy.asarray(action))
         tick(count)
@@ -402,11 +397,7 @@ def measure_time(
     if can_step(looped, _report_estimate) and (compiled_policy is not None or not is_policy):
         spent = _time_compiled(looped, compiled_policy, seeds, decisions)
         return ProcessorTime(1e9 * spent / (len(seeds) * task.decision_interval), True)
-    steps = (
-        _steer_by_python(model, competitor, seeds, _report_estimate, name)
-        if is_policy
-        else _step_filter(looped, seeds, _report_estimate)
-    )
+    steps = _step(looped, competitor if is_policy else None, seeds, _report_estimate, name)
     with warnings.catch_warnings():
         if own:
             warnings.simplefilter("ignore")  # the evaluation has said what is wrong with a program

@@ -175,7 +175,7 @@ def reduce_episodes(
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
-    plan = plan_of(asked.experiment, {asked.name: asked.maker})
+    plan = plan_of(asked.experiment, {asked.name: asked.maker}, asked.first, asked.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)
@@ -184,20 +184,20 @@ def reduce_episodes(
     def part(first: int) -> Part:
         """Run a block of episodes and reduce it; nothing of what was measured in it outlives the call."""
         piece = plan.piece(asked.name, first, min(block, asked.end - first), True)
-        run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds).isel(policy=0)
-        return Part(reduce_run(run, declare, bootstrap, first), _head(run))
+        count = len(piece.seeds)
+        kept = plan.arrays(count, asked.experiment.drawn_episodes - first)
+        kept.write(asked.name, slice(count), run_piece(piece, tick))
+        run = plan.dataset(kept, piece.seeds).isel(policy=0)
+        reduction = reduce_run(run, declare, bootstrap, first)
+        others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
+        head = run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
+        return Part(reduction, head)
 
     parts = (part(first) for first in range(asked.first, asked.end, block))
     found = functools.reduce(Part.merge, parts)
     if asked.experiment.timed and asked.first == 0:
         return found._replace(head=with_times(found.head, [plan.time(asked.name)]))
     return found
-
-
-def _head(run: xarray.Dataset) -> xarray.Dataset:
-    """Return an evaluation without what was kept of every episode; of the first, its seed."""
-    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
-    return run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
 
 
 def summaries(
@@ -232,29 +232,22 @@ def summaries(
         if progress is not None:
             progress(one.measurements)
         yield i, found
-    for i, found in _summarise(asked, missing, workers, progress):
-        store.write(work[i], found)
-        yield i, found
-
-
-def _summarise(
-    asked: Sequence[EvaluationRequest], missing: Sequence[int], workers: Workers, progress: Progress | None
-) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
         for i in missing:
             check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
     pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
     batches = [[piece] for piece in pieces] if workers.alone else _batches(pieces)
-    work = [[piece for _, piece in batch] for batch in batches]
+    items = [[piece for _, piece in batch] for batch in batches]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}
     done = [0] * len(asked)
-    sizes = [sum(piece.measurements for piece in batch) for batch in work]
-    run = workers.run(functools.partial(_one_after_another, summarise), work, sizes, progress)
+    sizes = [sum(piece.measurements for piece in batch) for batch in items]
+    run = workers.run(lambda batch, tick: [summarise(one, tick) for one in batch], items, sizes, progress)
     for (i, piece), found in (
         (which, one) for k, ones in run for which, one in zip(batches[k], ones, strict=True)
     ):
         if isinstance(found, Summary):
+            store.write(work[i], found)
             yield i, found
             continue
         # In the order of the episodes, whichever come first: sums of the same numbers in another order differ.
@@ -265,15 +258,8 @@ def _summarise(
         if done[i] == asked[i].episodes:
             with one_thread():
                 whole = added.pop(i).summary(asked[i])
+            store.write(work[i], whole)
             yield i, whole
-
-
-def _one_after_another(
-    function: Callable[[EvaluationRequest, Progress], Summary | Part],
-    batch: Sequence[EvaluationRequest],
-    tick: Progress,
-) -> list[Summary | Part]:
-    return [function(piece, tick) for piece in batch]
 
 
 def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple[int, EvaluationRequest]]]:
@@ -332,10 +318,10 @@ def run_requests(
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
-    if not whole:
+    first = asked[0]
+    if not whole and first.episodes > 1:
         found = dict(summaries(asked, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
-    first = asked[0]
     dataset = run_experiment(first.experiment, {one.name: one.maker for one in asked}, progress, workers)
     costs = {}
     for name in dataset["policy"].values.tolist() if "cost" in dataset else ():

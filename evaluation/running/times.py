@@ -42,9 +42,9 @@ def with_times(dataset: "xarray.Dataset", times: Sequence[ProcessorTime | None])
     values = [math.nan if time is None else time.nanoseconds for time in times]
     compiled = [0 if time is None else WAYS.index(way_of(time)) for time in times]
     attrs = {"units": "ns", "long_name": "processor time of a measurement, of world and competitor"}
-    if "policy" not in dataset.dims:
-        return dataset.assign_coords(nanoseconds=((), values[0], attrs), compiled=compiled[0])
-    return dataset.assign_coords(nanoseconds=("policy", values, attrs), compiled=("policy", compiled))
+    of_one = "policy" not in dataset.dims
+    nanoseconds, ways = (((), each[0]) if of_one else ("policy", each) for each in (values, compiled))
+    return dataset.assign_coords(nanoseconds=(*nanoseconds, attrs), compiled=ways)
 
 
 def way_of(time: ProcessorTime) -> str:

@@ -6,7 +6,8 @@ paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resample
 which is a hundred times slower here.
 
 Of many episodes that matrix would be the largest thing in memory, so counts are kept, in as few bytes as they need, and
-products are summed over blocks of episodes, always the same ones.
+products are summed over blocks of episodes, always the same ones. Of more than ``SEPARATE`` episodes, groups of
+successive ones are resampled: independent episodes make independent groups, whose mean varies as that of the episodes.
 
 Episodes of one recorded flight are no independent samples of what there is to fly. Where episodes belong to flights,
 whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997,
@@ -26,8 +27,10 @@ import numpy
 RESAMPLES = 1000
 BLOCK = 2048
 """Episodes that are weighted at a time."""
-AT_ONCE = 32
-"""Resamples whose weights of all episodes are held at a time."""
+SEPARATE = 2**15
+"""Episodes, or groups of them, that are resampled, at most: a byte of each in every resample is kept."""
+AT_ONCE, SEGMENTS = 32, 64
+"""Resamples in which a quantile is sought at a time, and parts of the order of the values in which it is."""
 FEWEST, MEASUREMENTS = 256, 2**20
 """Episodes that are run at a time, at least, and their measurements."""
 CONFIDENCE = 0.95
@@ -53,7 +56,7 @@ def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
-    """Values and their 95 % percentile intervals; an interval is NaN where a resample is not finite.
+    """Values and their 95 % percentile intervals; NaN where a resample is not finite, or there is none.
 
     Args:
         samples: of the data and of every resample, ``(1 + resamples, ...)``.
@@ -61,6 +64,8 @@ def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
     Returns:
         ``(3, ...)``: value, lower and upper end.
     """
+    if len(samples) == 1:
+        return numpy.concatenate([samples, numpy.full((2, *samples.shape[1:]), numpy.nan)])
     tail = 50.0 * (1.0 - CONFIDENCE)
     with numpy.errstate(invalid="ignore"):
         ends = numpy.percentile(samples[1:], [tail, 100.0 - tail], axis=0)
@@ -112,37 +117,47 @@ class Bootstrap:
         self.episodes = episodes
         generator = numpy.random.default_rng(seed)
         self.ragged = clusters is not None
-        of = None
-        number = episodes
+        self._group = 1 if self.ragged else -(-episodes // SEPARATE)
+        """Successive episodes that are resampled together."""
+        self._clusters = None
+        number = -(-episodes // self._group)
         if clusters is not None and len(set(clusters)) > 1:
-            of = numpy.unique(numpy.asarray(clusters), return_inverse=True)[1]
-            number = int(of.max()) + 1
+            self._clusters = numpy.unique(numpy.asarray(clusters), return_inverse=True)[1]
+            number = int(self._clusters.max()) + 1
         counts = numpy.ones((1 + resamples, number), dtype=numpy.uint8)
         even = numpy.full(number, 1.0 / number)
-        for first in range(
-            1, 1 + resamples, 100
-        ):  # the numbers of one draw, without all of them in 64 bits at once
+        for first in range(1, 1 + resamples, 100):  # as one draw, never all of them in 64 bits
             drawn = generator.multinomial(number, even, size=min(100, 1 + resamples - first))
             if drawn.max() > numpy.iinfo(counts.dtype).max:
                 counts = counts.astype(numpy.min_scalar_type(int(drawn.max())))
             counts[first : first + len(drawn)] = drawn
-        if of is not None:
-            counts = counts[:, of]
-        self.counts = counts
+        self._counts = counts
+        """Of every cluster, group or episode in the data and in every resample."""
         # Clusters may differ in size: the mean is over the episodes of those that were drawn.
-        self.totals = counts.sum(axis=1, dtype=numpy.int64)
+        self.totals = self._weigh(numpy.bincount(self._resampled(numpy.arange(episodes))))
         self._last: tuple[slice, numpy.ndarray] | None = None
+
+    def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:
+        """Number of the cluster or group with which each of these episodes is resampled."""
+        return episodes // self._group if self._clusters is None else self._clusters[episodes]
+
+    def _weigh(self, numbers: numpy.ndarray) -> numpy.ndarray:
+        """Sum of whole numbers ``(clusters, ...)`` in every resample, ``(1 + resamples, ...)``; exact."""
+        numbers = numbers.astype(float)
+        parts = (self._counts[i : i + AT_ONCE] for i in range(0, len(self._counts), AT_ONCE))
+        return numpy.concatenate([part.astype(float) @ numbers for part in parts])
 
     @property
     def weights(self) -> numpy.ndarray:
         """Share of every episode in the data and in every resample, ``(1 + resamples, episodes)``."""
-        return self.counts / self.totals[:, None]
+        return self._counts[:, self._resampled(numpy.arange(self.episodes))] / self.totals[:, None]
 
-    def weights_of(self, episodes: slice) -> numpy.ndarray:
-        """Share of some episodes, ``(1 + resamples, some)``; those asked for last are kept."""
-        if self._last is None or self._last[0] != episodes:
+    def weights_of(self, some: slice) -> numpy.ndarray:
+        """Share of some episodes, or of those of some groups, ``(1 + resamples, some)``; the last ones are kept."""
+        if self._last is None or self._last[0] != some:
             self._last = None  # two blocks of weights are never held
-            self._last = episodes, self.counts[:, episodes] / self.totals[:, None]
+            which = some if self._clusters is None else self._clusters[some]
+            self._last = some, self._counts[:, which] / self.totals[:, None]
         return self._last[1]
 
     def sums(
@@ -161,7 +176,12 @@ class Bootstrap:
         """
         some = len(values[0])
         flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
-        weights = self.weights_of(slice(first, first + some))
+        part = slice(first, first + some)
+        if self._group > 1:
+            part = slice(first // self._group, (part.stop - 1) // self._group + 1)
+            begins = numpy.arange(part.start, part.stop) * self._group - first
+            flat = numpy.add.reduceat(flat, numpy.maximum(begins, 0), axis=0)
+        weights = self.weights_of(part)
         weights = weights if resamples is None else weights[: 1 + resamples]
         if self.ragged:
             present = ~numpy.isnan(flat)
@@ -183,7 +203,11 @@ class Bootstrap:
         Returns:
             ``(1 + resamples, ...)``; the first row is the data's own.
         """
-        parts = (self.sums([values[i : i + BLOCK]], i)[0] for i in range(0, len(values), BLOCK))
+        return self.means_of(lambda part: values[part])
+
+    def means_of(self, values: Callable[[slice], numpy.ndarray]) -> numpy.ndarray:
+        """Means as of :meth:`means`, of values that are made for some episodes at a time."""
+        parts = (self.sums([values(slice(i, i + BLOCK))], i)[0] for i in range(0, self.episodes, BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
     def quantiles(
@@ -198,19 +222,35 @@ class Bootstrap:
             share: such as 0.5 for the median.
             chosen: which episodes count, ``(episodes,)`` booleans; None: all.
         """
-        chosen = numpy.ones(len(values), dtype=bool) if chosen is None else chosen
-        order = numpy.argsort(numpy.where(chosen, values, numpy.inf))
-        ordered, found = values[order], []
-        for i in range(0, len(self.counts), AT_ONCE):
-            weights = self.counts[i : i + AT_ONCE, order] / self.totals[i : i + AT_ONCE, None]
-            weights = numpy.cumsum(weights * chosen[order], axis=1)
-            # Rounding of the sums must not move a share that is met exactly.
-            enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
-            found.append(numpy.where(weights[:, -1] > 0.0, ordered[enough.argmax(axis=1)], numpy.nan))
-        return numpy.concatenate(found)
+        which = numpy.arange(len(values)) if chosen is None else numpy.flatnonzero(chosen)
+        found = numpy.full(len(self._counts), numpy.nan)
+        if not len(which):
+            return found
+        order = which[numpy.argsort(values[which])]
+        ordered, owners = values[order], self._resampled(order)
+        # The segment first in which the quantile is, then its place there.
+        length = -(-len(order) // SEGMENTS)
+        cells = owners * SEGMENTS + numpy.arange(len(order)) // length
+        numbers = numpy.bincount(cells, minlength=self._counts.shape[1] * SEGMENTS)
+        sums = numpy.cumsum(self._weigh(numbers.reshape(-1, SEGMENTS)), axis=1)
+        # Rounding must not move a share that is met exactly.
+        needed = share * sums[:, -1:] * (1.0 - 1e-9)
+        segment = (sums >= needed).argmax(axis=1)
+        before = numpy.where(segment > 0, sums[numpy.arange(len(sums)), segment - 1], 0.0)
+        for i in range(0, len(found), AT_ONCE):
+            rows = slice(i, i + AT_ONCE)
+            places = segment[rows, None] * length + numpy.arange(length)
+            places = numpy.minimum(places, len(order) - 1)
+            counts = numpy.take_along_axis(self._counts[rows], owners[places], axis=1)
+            enough = before[rows, None] + numpy.cumsum(counts, axis=1, dtype=float) >= needed[rows]
+            first = numpy.take_along_axis(places, enough.argmax(axis=1)[:, None], axis=1)[:, 0]
+            found[rows] = numpy.where(sums[rows, -1] > 0.0, ordered[first], numpy.nan)
+        return found
 
     def interval(self, statistics: numpy.ndarray) -> IntervalEstimate:
-        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""
+        """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``; none of one episode."""
+        if self._counts.shape[1] == 1:
+            statistics = statistics[:1]
         return IntervalEstimate(*percentile_interval(statistics).tolist())
 
     def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> IntervalEstimate:

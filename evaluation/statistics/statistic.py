@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from .bootstrap import Bootstrap, block_of, mean_of_sums
+from .time_blocks import BlockBootstrap
 
 if TYPE_CHECKING:
     import xarray
@@ -47,6 +48,9 @@ class Statistic(NamedTuple):
     """Number of the first episodes whose values are kept, in place of means of all; zero: means."""
     optional: bool = False
     """A block that lacks it adds nothing to its means; otherwise it is then known of no episode."""
+    of_units: Callable[[BlockBootstrap], numpy.ndarray] | None = None
+    """What each unit of time contributes where one episode is resampled over time, ``(units, ...)``: as an episode
+    does, or of a mean its sum and how many numbers; None: it is one number of the whole episode."""
 
 
 class Reduction(NamedTuple):
@@ -110,7 +114,9 @@ def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap, first: 
         for s in statistics:
             found.functions[s.key] = s.function
             found.optional.update([s.key] * s.optional)
-            if s.sample:
+            if isinstance(bootstrap, BlockBootstrap) and not s.sample:
+                found.samples[s.key] = [bootstrap.resample(s.values, s.of_units)]
+            elif s.sample:
                 found.samples[s.key] = [s.values[: max(0, s.sample - first)].copy()]
             else:
                 yield s

@@ -381,7 +381,7 @@ def _flights(dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most
     notes.append(
         f"Intervals of the table over all {what}s resample whole {what}s; of fewer than ten they are too narrow."
         if several
-        else f"Intervals below are over the episodes of this one {what}."
+        else f"Intervals below are over {'time' if len(flights) == 1 else 'the episodes'} of this one {what}."
     )
     table.caption = " ".join(notes)
     table.caption_justify = "left"
