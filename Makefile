@@ -31,7 +31,7 @@ EXTRAS := agents,fast,tensorboard,report,render,flights,logs,ins,adapters,onnx,o
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests core-test-names test-processors test-parts test-lowest test-cluster test-extras test-pythons distributions publishable check format docs clean
+.PHONY: fuzz benchmark test claims test-slow numbers coverage core-tests core-test-names test-processors test-without-unix test-parts test-lowest test-cluster test-extras test-pythons distributions publishable check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -95,6 +95,9 @@ test-pythons:  ## core tests with every newer Python that is found
 
 test-processors: $(VENV)/.dev  ## parity, gradients and stored trajectories as other processors compute them
 	OMP_NUM_THREADS=1 $(BIN)/python tests/check_processors.py -n 2 --dist worksteal
+
+test-without-unix: $(VENV)/.dev  ## core tests as on Windows, without what only Unix has
+	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python -m pytest -p without_unix $(CORE_TESTS)
 
 test-parts: $(VENV)/.dev  ## delete each part beyond the core, one at a time, and run what is left; ten minutes
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/check_parts.py

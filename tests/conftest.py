@@ -10,7 +10,6 @@ import gc
 import importlib
 import os
 import re
-import resource
 import sys
 import tempfile
 from pathlib import Path
@@ -91,7 +90,7 @@ def pytest_runtest_teardown(item, nextitem):
 def _resident():
     """Resident memory of this process, MB; 0 where Linux does not tell it."""
     status = Path("/proc/self/statm")
-    return int(status.read_text().split()[1]) * resource.getpagesize() // 2**20 if status.is_file() else 0
+    return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 2**20 if status.is_file() else 0
 
 
 @pytest.fixture(scope="session", autouse=True)

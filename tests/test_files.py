@@ -75,7 +75,7 @@ def writer(tmp_path):
 
     def begin(program):
         process = subprocess.Popen(
-            [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", AS_HERE + program, str(tmp_path)], stdout=subprocess.PIPE, text=True
         )
         begun.append(process)
         assert process.stdout.readline() == "here\n"
@@ -96,6 +96,8 @@ with whole_files(pathlib.Path(sys.argv[1])) as waiting:
     print("here", flush=True)
     time.sleep(60)
 """
+AS_HERE = "import without_unix\n" if "without_unix" in sys.modules else ""
+"""Before the program of another process: `make test-without-unix`."""
 ONE_FILE = """
 import sys, time, pathlib
 from filtergym.evaluation.storage.files import whole_file
@@ -111,10 +113,8 @@ claim_folder(pathlib.Path(sys.argv[1]))
 print("here", flush=True)
 time.sleep(60)
 """
-locks = pytest.mark.skipif(sys.platform == "win32", reason="the system has no such locks")
 
 
-@locks
 def test_what_a_dead_writer_left_is_swept_and_a_living_one_is_left_alone(tmp_path, writer):
     first, second = writer(FILES), writer(FILES)
     assert len(list(tmp_path.glob(".unfinished-*"))) == 2
@@ -134,7 +134,6 @@ def test_what_a_dead_writer_left_is_swept_and_a_living_one_is_left_alone(tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 
-@locks
 def test_two_writers_of_a_file_or_a_folder_are_told_apart(tmp_path, writer):
     process = writer(ONE_FILE)
     with pytest.raises(
@@ -156,7 +155,6 @@ def test_two_writers_of_a_file_or_a_folder_are_told_apart(tmp_path, writer):
     claim_folder(tmp_path)  # its own already
 
 
-@locks
 def test_a_command_that_is_told_to_end_takes_away_what_is_unfinished(tmp_path, writer):
     program = FILES.replace(
         "import sys, time, pathlib", "import sys, time, pathlib\nfrom filtergym.__main__ import main"

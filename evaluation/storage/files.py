@@ -1,8 +1,7 @@
 """Files and folders that are whole or as they were: written beside their place, then moved into it.
 
 Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place. Two
-processes that write the same are told apart by locks, which end with their process; where the system has none
-(Windows), they are not.
+processes that write the same are told apart by locks, which end with their process.
 """
 
 import os
@@ -15,8 +14,11 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # Windows
+except ImportError:  # Windows, where a folder cannot be locked, and a file that is open cannot be moved
+    import msvcrt
+
     fcntl = None  # type: ignore[assignment]
+UNIX = fcntl is not None
 
 UNFINISHED = ".unfinished-"
 """Begins the name of a folder whose files wait until all of them are complete."""
@@ -63,11 +65,12 @@ def _make_folder(path: Path) -> Iterator[None]:
 
 def _lock(handle: int) -> bool:
     """Lock an open file or folder, if nobody else has; the lock ends when it is closed, or with the process."""
-    if fcntl is None:
-        return True
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        if not UNIX:
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
+        else:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
         return False
     except OSError:  # a file system without locks
         return True
@@ -85,11 +88,12 @@ def claim_folder(folder: Path) -> None:
         ValueError: if another process has claimed it, or it cannot be made.
     """
     name = os.path.realpath(folder)
-    if name in _CLAIMED or fcntl is None:
+    if name in _CLAIMED:
         return
     with _explain_refusals(f"to folder {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(name, os.O_RDONLY)
+        own = (name, os.O_RDONLY) if UNIX else (os.path.join(name, LOCK), os.O_RDWR | os.O_CREAT)
+        handle = os.open(*own)
     if not _lock(handle):
         os.close(handle)
         raise ValueError(f"another process writes to {folder}: wait until it ends, or choose another folder")
@@ -103,13 +107,16 @@ def _sweep_unfinished(folder: Path) -> None:
             if not (place / LOCK).exists():
                 if time.time() - place.stat().st_mtime > YOUNG:
                     shutil.rmtree(place)
-            elif fcntl is not None:
+            else:
                 handle = os.open(place / LOCK, os.O_RDWR)
                 try:
-                    if _lock(handle):
+                    dead = _lock(handle)
+                    if dead and UNIX:  # before it is let go, so that nobody takes it meanwhile
                         shutil.rmtree(place)
                 finally:
                     os.close(handle)
+                if dead:
+                    shutil.rmtree(place, ignore_errors=True)
 
 
 def writable_file(path: Path) -> Path:
@@ -160,15 +167,26 @@ def whole_file(path: Path, patience: float = 0.0) -> Iterator[Path]:
 @contextmanager
 def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
     """Make a file that nobody else writes, and hold it; arguments and errors as of :func:`whole_file`."""
-    handle = _open_locked(partial, time.monotonic() + patience)
+    held = partial if UNIX else partial.with_name(partial.name + LOCK)
+    handle = _open_locked(held, partial.name[1:-8], time.monotonic() + patience)
     try:
+        partial.touch()
         yield
     finally:
         os.close(handle)
+        if held != partial:
+            with suppress(OSError):  # the next writer holds it
+                held.unlink()
 
 
-def _open_locked(partial: Path, until: float) -> int:
-    """Make a file that nobody else writes, and lock it, or try again until a time of the monotonic clock."""
+def _open_locked(partial: Path, name: str, until: float) -> int:
+    """Make a file that nobody else writes, and lock it, or try again until a time of the monotonic clock.
+
+    Args:
+        partial: the file.
+        name: of what is written, for the error.
+        until: s.
+    """
     while True:
         handle = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -178,9 +196,7 @@ def _open_locked(partial: Path, until: float) -> int:
                     if os.path.samestat(os.fstat(handle), os.stat(partial)):
                         return handle
             elif time.monotonic() >= until:
-                raise ValueError(
-                    f"another process writes {partial.name[1:-8]} now: wait until it ends, or write elsewhere"
-                )
+                raise ValueError(f"another process writes {name} now: wait until it ends, or write elsewhere")
             else:
                 time.sleep(0.02)
         except BaseException:
