@@ -43,7 +43,7 @@ KNOWN = {
     "programs of others": {"core"},
 }
 """Parts that a part may import, of those that know few."""
-MOST_LINES = 36_000
+MOST_LINES = 36_600
 """Of the core."""
 CIRCLES: set[frozenset[str]] = {
     frozenset({"compiler/namespace.py", "compiler/numpy_functions.py"}),

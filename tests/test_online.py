@@ -1,6 +1,5 @@
 """A filter in a loop of one's own gives what an evaluation gives, whatever it is."""
 
-import functools
 import pickle
 import runpy
 from datetime import timedelta
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_models import forget
 
 import filtergym
 from filtergym.baselines.problem import import_problem
@@ -220,12 +220,13 @@ def values_of(filter, k):
     return {} if k == 3 else {"values": [10.0 * k + rng.normal()]}
 
 
-@functools.cache
+@pytest.fixture
 def own_model():
-    return filtergym.state_space(
+    yield filtergym.state_space(
         "tests/Live-v0", f=[[1, 1.0], [0, 1]], h=[[1, 0]], Q=[[0.25, 0.5], [0.5, 1.0]], R=[[25.0]],
         mean=[0, 10], covariance=[[100, 0], [0, 25]],
     )  # fmt: skip
+    forget("tests/Live-v0")
 
 
 OF_ALL_KINDS = [
@@ -249,8 +250,7 @@ def begin(filter):
 
 
 @pytest.mark.parametrize(("id", "name"), OF_ALL_KINDS)
-def test_one_native_call_is_the_functions_of_the_model_one_after_another(id, name):
-    own_model()
+def test_one_native_call_is_the_functions_of_the_model_one_after_another(own_model, id, name):
     filter = filtergym.online(id, name)
     model = filter.model.on_numpy()
     memory, asked = None, kind_of(find_competitor(import_problem(id), name).maker) == "policy"
@@ -276,8 +276,7 @@ def test_one_native_call_is_the_functions_of_the_model_one_after_another(id, nam
 
 
 @pytest.mark.parametrize(("id", "name"), OF_ALL_KINDS)
-def test_estimates_are_the_callers_own_and_one_track_is_as_one_of_many(id, name):
-    own_model()
+def test_estimates_are_the_callers_own_and_one_track_is_as_one_of_many(own_model, id, name):
     one, many = filtergym.online(id, name), filtergym.online(id, name, tracks=3)
     begin(one)
     repeat = lambda array: np.repeat(np.asarray(array)[..., None], 3, axis=-1)  # noqa: E731
