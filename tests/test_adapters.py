@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from models import make_model
+from own_models import forget
 
 import filtergym
 from filtergym import adapters
@@ -284,6 +285,8 @@ def test_calls_of_filterpy_and_ours_agree(tmp_path, monkeypatch, capsys):
     pytest.importorskip("filterpy", reason="filterpy is in filtergym[adapters]")
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "from_filterpy.py"))
+    for name in ("Tracker", "Beacon", "Switching"):
+        forget(f"mine/{name}-v0")
     differences = dict(re.findall(r"^(.*?) +differ by (\S+)$", capsys.readouterr().out, re.MULTILINE))
     assert len(differences) == 11
     # FilterPy's unscented filter does not draw its points anew after the prediction.

@@ -267,7 +267,7 @@ def test_doctor_says_what_an_issue_needs(run, monkeypatch):
     monkeypatch.setattr(metadata, "version", version)
     lines = dict(line.split(maxsplit=1) for line in run("doctor").stdout.splitlines())
     assert lines["[fast]"].startswith("llvmlite missing, platformdirs ")
-    assert "numpy 0.1, wants >=2.1" in lines["libraries"]
+    assert "numpy 0.1, wants >=2.2" in lines["libraries"]
     monkeypatch.setattr(native, "AVAILABLE", True)
     for features, widest in (
         ("+avx2,+avx512f", "AVX-512"),

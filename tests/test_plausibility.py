@@ -173,7 +173,9 @@ def test_what_is_noteworthy_is_said(env, columns, sentence, tmp_path):
 
 def test_what_is_noteworthy_goes_with_an_evaluation(tmp_path):
     recording = read_recording(table(tmp_path / "log.csv", **plots(x=outlier)), TARGET)
-    assert notes_of(evaluate(TARGET, ["random"], recording)) == list(recording.notes)
+    *notes, of_intervals = notes_of(evaluate(TARGET, ["random"], recording))
+    assert notes == list(recording.notes)
+    assert of_intervals.startswith("Of one episode intervals are over time")
 
 
 def test_a_log_of_ten_rows_is_called_a_guess(tmp_path):
