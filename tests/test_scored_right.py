@@ -196,7 +196,9 @@ class TestRunFolder:
         code, output, errors = command("evaluate", ID, *words)
         assert (code, errors) == (0, "")
         assert "tuned" in output  # a long name goes on below, from its hyphen on
-        assert "Costs are compared with that of imm-steady-state where it takes part" in " ".join(output.split())
+        assert "Costs are compared with that of imm-steady-state where it takes part" in " ".join(
+            output.split()
+        )
 
     def test_where_there_are_no_arrays_it_is_the_model(self, sb3, tmp_path):
         folder = run_folder(tmp_path / "run", "ppo", arrays=False)
