@@ -19,6 +19,7 @@ import numpy
 
 from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
+from ...filters.array_namespace import map_nested
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
@@ -37,17 +38,14 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples and dictionaries of
     arrays.
     """
-    if old is None:
-        return None
-    if isinstance(old, dict):
-        return {name: _replace_lanes(part, new[name], lanes) for name, part in old.items()}
-    if isinstance(old, tuple):
-        parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
-        return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one.
-    merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
-    merged[..., lanes] = new[..., : len(lanes)]
-    return merged
+
+    def replaced(old: Array, new: Array) -> Array:
+        # A copy, because states are never changed in place: someone may still hold the old one.
+        merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
+        merged[..., lanes] = new[..., : len(lanes)]
+        return merged
+
+    return map_nested(replaced, old, new)
 
 
 class EpisodeStepper(Protocol):
