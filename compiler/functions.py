@@ -267,6 +267,16 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
     return memory[start : start + math.prod(shape) * stride].reshape(*shape, stride)[..., :width]
 
 
+def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
+    """Memory for the arrays that a program reads or writes."""
+    return [empty_lanes(leaf.shape, width) for leaf in arrays]
+
+
+def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+    """Copies of arrays in their own types, in the places of a template of their numbers."""
+    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
+
+
 def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
     leaf = inputs[argument]
     nodes = numpy.array([graph.input(argument, row) for row in range(leaf.rows)], dtype=numpy.int64)
