@@ -19,7 +19,7 @@ import numpy
 
 from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
-from ...filters.array_namespace import map_nested
+from ...filters.array_namespace import host_array, map_nested
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
@@ -304,7 +304,7 @@ class Lanes:
             self.noise.take(noise, index)
         self.decisions[index] = 0
         if task.flights:
-            lengths = task.lengths(start[0][:, : identities.shape[1]]) // task.decision_interval
+            lengths = task.lengths(host_array(start[0])[:, : identities.shape[1]]) // task.decision_interval
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
         if self._on_start is not None:
             self._on_start(self.model.begin(*start))
