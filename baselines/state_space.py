@@ -16,7 +16,7 @@ from ..envs.linear.state_space import StateSpace, StateSpaceMeasurement, StateSp
 from ..envs.linear.state_space_banks import Mixture, MultipleModelBank
 from ..evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ..filters import kalman, scans, smoothing, unscented
-from ..filters.array_namespace import namespace, select_nested
+from ..filters.array_namespace import map_nested, namespace, select_nested
 from ..filters.innovation_update import unscented_update, update_with_gain
 from ..filters.ordered_sums import ordered_sum
 from .table import Baselines, tunable
@@ -271,7 +271,7 @@ class ExtendedSmoother(Extended):
         found = [scans.take_scans(settled, slice(K - known, K + 1))]
         for k in range(known, K):
             state, measurement = (
-                scans.map_nested(lambda values, place=place: values[..., place, :], part)
+                map_nested(lambda values, place=place: values[..., place, :], part)
                 for part, place in ((found[-1], -1), (measured, k))
             )
             found.append(scans.stack_scans([self.take(state, Past(measurement, None, None))]))

@@ -267,6 +267,20 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
     return memory[start : start + math.prod(shape) * stride].reshape(*shape, stride)[..., :width]
 
 
+def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
+    """Memory for the arrays that a program reads or writes."""
+    return [empty_lanes(leaf.shape, width) for leaf in arrays]
+
+
+def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+    """Copies of arrays in their own types, in the places of a template of their numbers."""
+
+    def copied(i: int) -> numpy.ndarray:
+        return memory[i].astype(DTYPES[kinds[i]], order="C")
+
+    return map_arrays(copied, template)
+
+
 def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
     leaf = inputs[argument]
     nodes = numpy.array([graph.input(argument, row) for row in range(leaf.rows)], dtype=numpy.int64)

@@ -1,5 +1,7 @@
 """The array library that an array belongs to, NumPy or torch through the array API standard, and ways between them."""
 
+import functools
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -46,18 +48,24 @@ def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
     return values + zero
 
 
+def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
+    """Apply a function to the arrays of nested tuples and dictionaries; None holds none."""
+    first = parts[0]
+    if first is None:
+        return None
+    if isinstance(first, dict):
+        return {name: map_nested(function, *(part[name] for part in parts)) for name in first}
+    if isinstance(first, tuple):
+        answers = [map_nested(function, *each) for each in zip(*parts, strict=True)]
+        return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
+    return function(*parts)
+
+
 def select_nested(which: Array, one: Any, other: Any) -> Any:
     """Entries of one nested tuple or dictionary of arrays ``(..., N)`` where ``which``, ``(N,)``, is true, and of
     another elsewhere; None holds none.
     """
-    if one is None:
-        return None
-    if isinstance(one, dict):
-        return {name: select_nested(which, part, other[name]) for name, part in one.items()}
-    if isinstance(one, tuple):
-        parts = [select_nested(which, a, b) for a, b in zip(one, other, strict=True)]
-        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
-    return namespace(which).where(which, one, other)
+    return map_nested(functools.partial(namespace(which).where, which), one, other)
 
 
 def is_tensor(values: Any) -> bool:

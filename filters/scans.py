@@ -16,7 +16,7 @@ from ..compiler.functions import CompiledFunction, leaves, round_up_lanes
 from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
 from ..compiler.sequence import CallSequence, moving_array
-from .array_namespace import Array, namespace
+from .array_namespace import Array, map_nested, namespace
 
 Carried = TypeVar("Carried", bound=tuple[Any, ...])
 Step = Callable[..., Any]
@@ -88,19 +88,6 @@ def over_time(function: Step, *parts: Any) -> Any:
 def by_stretches(function: Step, *parts: Any) -> Callable[[slice], Any]:
     """Return what calls :func:`over_time` for some scans of ``parts`` alone."""
     return lambda stretch: over_time(function, *(take_scans(part, stretch) for part in parts))
-
-
-def map_nested(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples and dictionaries; None holds none."""
-    first = parts[0]
-    if first is None:
-        return None
-    if isinstance(first, dict):
-        return {name: map_nested(function, *(part[name] for part in parts)) for name in first}
-    if isinstance(first, tuple):
-        answers = [map_nested(function, *each) for each in zip(*parts, strict=True)]
-        return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
-    return function(*parts)
 
 
 def _flatten_time(values: Array) -> Array:

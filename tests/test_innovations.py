@@ -6,10 +6,10 @@ import itertools
 import numpy as np
 import pytest
 import scipy
-import xarray
 
 from filtergym import evaluate, record, tidy_records
-from filtergym.evaluation.statistics.predictions import Predictions
+from filtergym.baselines.log_scores import _Whiteness
+from filtergym.evaluation.statistics.predictions import stretches_of
 
 CASES = {
     "filtergym/ManeuveringTarget-v0": ("imm", "missed-detections", ["position"], ["m"]),
@@ -88,21 +88,15 @@ def test_without_tracks_or_for_a_smoother_nothing_is_said():
 def test_whiteness_is_of_each_sensor_from_one_of_its_measurements_to_the_next():
     """White errors of one sensor at every third measurement beside those of another that repeat themselves by half."""
     rng = np.random.default_rng(4)
-    errors = np.full((1, 1, 3000, 2), np.nan)
-    errors[0, 0, ::3, 0] = rng.normal(0.0, 5.0, 1000)
-    errors[0, 0, :, 1] = scipy.signal.lfilter([1.0], [1.0, -0.5], rng.normal(0.0, 1.0, 3000))
-    coordinates = {
-        "policy": ["one"],
-        "measured": ["gps", "odometry"],
-        "measured_group": ("measured", ["gps", "odometry"]),
-    }
-    values = (("policy", "episode", "time", "measured"), errors)
-    dataset = xarray.Dataset({"prediction_error": values}, coordinates, {"truth": False})
-    found = Predictions(dataset, None).correlations("one", np.ones((1, 3000), dtype=bool))
-    assert found["gps"].low < 0.0 < found["gps"].high
-    assert found["odometry"].low < 0.5 < found["odometry"].high
-    naive = errors[0, 0, ::3, 0]
+    errors = np.full((2, 1, 3000), np.nan)
+    errors[0, 0, ::3] = rng.normal(0.0, 5.0, 1000)
+    errors[1, 0] = scipy.signal.lfilter([1.0], [1.0, -0.5], rng.normal(0.0, 1.0, 3000))
+    whiteness = _Whiteness(stretches_of(np.ones((1, 3000), dtype=bool)), np.array([True, False]))
+    for first, last in ((0, 1000), (1000, 3000)):
+        whiteness.add(errors[..., first:last], first)
+    _, gps, odometry = whiteness.correlations()
+    assert gps.low < 0.0 < gps.high
+    assert odometry.low < 0.5 < odometry.high
+    naive = errors[0, 0, ::3]
     expected = (naive[1:] * naive[:-1]).sum() / (0.5 * (naive[1:] ** 2 + naive[:-1] ** 2)).sum()
-    np.testing.assert_allclose(found["gps"].value, expected, rtol=1e-12)
-    same = dataset.assign_coords(measured_group=("measured", ["position"] * 2))
-    assert Predictions(same, None).correlations("one", np.ones((1, 3000), dtype=bool)) == {}
+    np.testing.assert_allclose(gps.value, expected, rtol=1e-12)

@@ -11,9 +11,10 @@ from filtergym.envs.engine.catalogue import folders
 
 PROBLEM = f"({'|'.join(folders().values())})"
 OF_PROBLEMS = (
-    "alpha_beta", "class_fusion", "coordinated_turn", "data_association", "dead_reckoning", "emitter_association",
-    "extended_kalman", "gnss_ins", "gusts", "linear_systems", "loosely_coupled", "noise_levels", "polar",
-    "predicted_covariance", "range_errors", "receiver_faults", "satellites", "singer", "stored_solutions",
+    "alpha_beta", "bounds", "class_fusion", "contaminated_normal", "coordinated_turn", "data_association",
+    "dead_reckoning", "emitter_association", "extended_kalman", "gnss_ins", "gusts", "linear_systems",
+    "loosely_coupled", "noise_adaptation", "noise_levels", "packed_covariance", "polar", "predicted_covariance",
+    "range_errors", "receiver_faults", "satellites", "semi_markov", "singer", "stored_solutions",
 )  # fmt: skip
 """Mathematics of problems and their papers alone, beside what all use."""
 PARTS = {
@@ -23,7 +24,7 @@ PARTS = {
         r"|filtergym/reports/(tables/(advice|recording_tables)|pages/advice_report)\.py"
         r"|evaluation/(competitors/(likelihood|file_estimates)|storage/(blind|estimate_tables|estimates))\.py"
     ),
-    "problems": rf"(envs|baselines)/{PROBLEM}/|filters/({'|'.join(OF_PROBLEMS)})\.py",
+    "problems": rf"(envs|baselines)/{PROBLEM}/|baselines/measurement_noise\.py|filters/({'|'.join(OF_PROBLEMS)})\.py",
     "learning": r"agents/|filtergym/commands/training\.py|filtergym/reports/tables/standing\.py",
     "crash test": r"evaluation/stress/|filtergym/commands/stress\.py|filtergym/reports/pages/crash_report\.py",
     "programs of others": r"evaluation/competitors/(programs|program_process|isolation|isolated_estimator)\.py",
@@ -43,7 +44,7 @@ KNOWN = {
     "programs of others": {"core"},
 }
 """Parts that a part may import, of those that know few."""
-MOST_LINES = 36_600
+MOST_LINES = 36_000
 """Of the core."""
 CIRCLES: set[frozenset[str]] = {
     frozenset({"compiler/namespace.py", "compiler/numpy_functions.py"}),

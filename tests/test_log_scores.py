@@ -17,7 +17,8 @@ from filtergym.baselines.log_scores import report_picture, score_log
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.evaluation.competitors import likelihood as likelihood_module
-from filtergym.evaluation.statistics.predictions import Predictions, correlation, mean_of, relative_error
+from filtergym.evaluation.statistics.bootstrap import ratio
+from filtergym.evaluation.statistics.predictions import correlation, stretch_interval
 from filtergym.names import find_competitor
 
 
@@ -59,23 +60,30 @@ def test_scores_are_those_of_the_whole_evaluation(recording, rows, monkeypatch):
     scores = score_log(PROBLEM.experiment(recording), makers, roles, shares.append)
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1.0)
-    log = FittedLog(PROBLEM, recording)
-    whole = Predictions(PROBLEM.evaluate(makers, recording, tracks=True), log.task)
-    chosen, judged = (mask[:, : whole.shape[1]] for mask in roles)
+    whole = PROBLEM.evaluate(makers, recording, tracks=True)
+    chosen, judged = (mask[:, : whole.sizes["time"]] for mask in roles)
+    likely = {name: whole["log_likelihood"].sel(policy=name).values for name in names}
+    groups = whole["measured_group"].values
+    errors = whole["prediction_error"][..., groups == groups[0]]
+    main = list(next(iter(FittedLog(PROBLEM, recording).task.groups.values())))
+    squares = (whole["error"].sel(component=main) ** 2).sum("component", skipna=False)
+    predicted = (errors**2).sum("measured", skipna=False)
     for i, name in enumerate(names):
-        likely = whole.log_likelihood(name)
-        np.testing.assert_allclose(scores.log_likelihood[0].mean(i), mean_of(likely, chosen), rtol=1e-12)
-        np.testing.assert_allclose(scores.nis(i), whole.nis(name, judged), rtol=1e-12)
-        white = correlation(whole.prediction_error(name), judged)
+        there = chosen & np.isfinite(likely[name])
+        np.testing.assert_allclose(scores.log_likelihood[0].mean(i), likely[name][there].mean(), rtol=1e-12)
+        nis, degrees = (whole[key].sel(policy=name).values for key in ("nis", "nis_degrees"))
+        there = judged & (degrees > 0.0) & np.isfinite(nis)
+        np.testing.assert_allclose(scores.nis(i), nis[there].sum() / degrees[there].sum(), rtol=1e-12)
+        white = correlation(np.moveaxis(errors.sel(policy=name).values, -1, 0), judged)
         np.testing.assert_allclose(scores.correlation(i), white, rtol=1e-9)
-    squares = {name: whole.squared_error(name) for name in names}
-    predicted = {name: (whole.prediction_error(name) ** 2).sum(axis=0) for name in names}
     for (i, one), (j, other) in itertools.permutations(enumerate(names), 2):
+        less = likely[one] - likely[other]
         for sums, mask in zip(scores.log_likelihood, (chosen, judged), strict=True):
-            expected = whole.difference(one, other, mask)
+            expected = stretch_interval(mask, np.stack([less, np.ones_like(less)], axis=-1), ratio)
             np.testing.assert_allclose(sums.difference(i, j), expected, rtol=1e-9, atol=1e-12)
         for sums, values in ((scores.squared, squares), (scores.predicted[1], predicted)):
-            expected = relative_error(values[one], values[other], judged)
+            pair = np.stack([values.sel(policy=name).values for name in (one, other)], axis=-1)
+            expected = stretch_interval(judged, pair, lambda means: np.sqrt(ratio(means)) - 1.0)
             np.testing.assert_allclose(sums.relative_root(i, j), expected, rtol=1e-9, atol=1e-12)
 
 

@@ -105,7 +105,6 @@ class EpisodeNoise:
     def _forget(self) -> None:
         """Forget what follows from identities and measurements."""
         self._next: Call | None = None
-        self._address = 0
         self._due = False
         """Whether the numbers of the measurement that is gone on to are still to be made."""
         self._row: Array = None
@@ -181,13 +180,6 @@ class EpisodeNoise:
             self._row = row if task.xp is numpy else task.xp.asarray(row, device=task.device)
         return self._row
 
-    def calls(self) -> tuple[Call, ...]:
-        """Return what makes the numbers of this measurement at :attr:`address`; nothing the second time."""
-        if not self._due:
-            return ()
-        self._due = False
-        return (self._next or self._next_call(),)
-
     def call_of_each(self) -> Call:
         """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
 
@@ -200,19 +192,20 @@ class EpisodeNoise:
 
     @property
     def address(self) -> int:
-        """Address of the memory that :meth:`calls` write, rows apart as those of :func:`empty_lanes`."""
-        return self._address or address_of(self._next_call().arrays[2])
+        """Address of the memory that :meth:`call_of_each` writes, rows apart as those of :func:`empty_lanes`."""
+        return address_of(self._next_call().arrays[2])
 
     def _copied_from_code(self) -> numpy.ndarray:
-        for call in self.calls():
+        call = self._next_call()
+        if self._due:
             call(0, self.width)
-        return self._next_call().arrays[2].copy()
+            self._due = False
+        return call.arrays[2].copy()
 
     def _next_call(self) -> Call:
         if self._next is None:
             memory = empty_lanes((self._rows,), self.width)
             self._next = bind_numbers(self.identities, self.measurement, memory, self._layout.normals)
-            self._address = address_of(memory)
         return self._next
 
     def _next_of_block(self) -> numpy.ndarray:

@@ -19,7 +19,7 @@ import numpy
 
 from ...compiler.block import LANES
 from ...compiler.functions import Specialised, map_arrays, round_up_lanes
-from ...filters.array_namespace import host_array
+from ...filters.array_namespace import host_array, map_nested
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
 from .compiled import can_step, share_world
@@ -38,17 +38,14 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples and dictionaries of
     arrays.
     """
-    if old is None:
-        return None
-    if isinstance(old, dict):
-        return {name: _replace_lanes(part, new[name], lanes) for name, part in old.items()}
-    if isinstance(old, tuple):
-        parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
-        return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one.
-    merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
-    merged[..., lanes] = new[..., : len(lanes)]
-    return merged
+
+    def replaced(old: Array, new: Array) -> Array:
+        # A copy, because states are never changed in place: someone may still hold the old one.
+        merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
+        merged[..., lanes] = new[..., : len(lanes)]
+        return merged
+
+    return map_nested(replaced, old, new)
 
 
 class EpisodeStepper(Protocol):
@@ -60,45 +57,58 @@ class EpisodeStepper(Protocol):
 
     def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
         """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
+        ...
 
     def begin_some(
         self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
     ) -> tuple[Array, Array]:
         """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+        ...
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes; what they show, ``(fields, width)``, is observed from them unless it is given."""
+        ...
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
+        ...
 
     def take(self, action: Array) -> None:
         """Apply an action from the next decision on, batch first, of all lanes or of the first."""
+        ...
 
     def decide(self, noise: EpisodeNoise, others: Any) -> None:
         """Answer all measurements of a decision by the action, and report on each."""
+        ...
 
     def reports(self) -> list[Any]:
         """Return these reports, each of arrays ``(..., width)`` that stay as they are."""
+        ...
 
     @property
     def rewards(self) -> Any:
         """These reports where each is one number, ``(interval, width)``."""
+        ...
 
     def observation_by_field(self) -> Array:
         """What is shown, ``(fields, width)``, until the next decision."""
+        ...
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
+        ...
 
     def take_alone(self, action: Array) -> None:
         """Apply an action of the first lane from the next decision on."""
+        ...
 
     def first_reward(self, beside: Any) -> float:
         """Mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
+        ...
 
     def observation_of_first(self) -> Array:
         """Observation of the first lane; the caller may keep it."""
+        ...
 
 
 class ModelStepper:
@@ -307,8 +317,7 @@ class Lanes:
             self.noise.take(noise, index)
         self.decisions[index] = 0
         if task.flights:
-            uniforms = host_array(start[0][:, : identities.shape[1]])
-            lengths = task.lengths(uniforms) // task.decision_interval
+            lengths = task.lengths(host_array(start[0])[:, : identities.shape[1]]) // task.decision_interval
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
         if self._on_start is not None:
             self._on_start(self.model.begin(*start))

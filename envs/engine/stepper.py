@@ -11,9 +11,11 @@ from ...compiler.functions import (
     Call,
     Leaf,
     Specialised,
+    copy_arrays,
     empty_lanes,
     leaves,
     map_arrays,
+    memory_of,
 )
 from ...compiler.sequence import TILE, CallSequence, Moving, moving_array
 from ...filters.ordered_sums import ordered_sum
@@ -53,14 +55,9 @@ class Stepper:
         self.width, self._threads, self._model, self._report = width, model.threads, model, report
         self._world_of, self._shared = world_of, 0 if world_of is None else truths + measured
         count = itertools.count()
-        self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
-        count = itertools.count()
-        self._filter_template = map_arrays(lambda _: next(count), episode.filter)
-        self._filter_kinds = self._kinds[truths + measured :]
+        self._template = map_arrays(lambda _: next(count), episode)
+        self._kinds = [array.dtype.kind for array in leaves(episode)]
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
-
-        def memory(outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
-            return [empty_lanes(leaf.shape, width) for leaf in outputs]
 
         self.action = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
@@ -68,7 +65,7 @@ class Stepper:
         fields = predict.outputs[-1].shape[0] if world_of is None else 0
         self._shown, self._given = numpy.empty((width, fields)), False
         self._first_shown = self._shown[0]
-        self._reported = memory(tell.outputs)
+        self._reported = memory_of(tell.outputs, width)
         knows = bool(model.filter.knows)
         # Episodes go to and fro between two copies, which share what stays as it is. Of the filter they share what is
         # not read any more when the prediction is written: all but what the update has handed on.
@@ -87,24 +84,21 @@ class Stepper:
             kept, own = iter(staying), iter(going)
             self._copies.append([*world[: self._shared], *(next(kept if s else own) for s in stays)])
         first, second = self._copies
-        written = self._written = memory(update.outputs)
+        written = self._written = memory_of(update.outputs, width)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
-        self._updated: list[list[numpy.ndarray]] = []
-        """State of the filter after the update, of each copy."""
         world, start = model.programs.start
         begun = model.programs.first
         uniforms, normals = world.inputs
         drawn = empty_lanes((normals.rows + uniforms.rows,), width)
         self._start_numbers, self._drawn = drawn, (drawn[normals.rows :], drawn[: normals.rows])
         self._initial: list[numpy.ndarray] = (
-            memory(world.outputs[truths:]) if world_of is None else world_of._initial
+            memory_of(world.outputs[truths:], width) if world_of is None else world_of._initial
         )
         for now, then in ((first, second), (second, first)):
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
             updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
-            self._updated.append(updated[:states])
             ahead, predicted = then[: truths + measured], then[truths + measured :]
             step = [
                 update.bound(given, written),
@@ -159,7 +153,7 @@ class Stepper:
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
-        return _copy_numbers(self._template, self._copies[self._now], self._kinds)
+        return copy_arrays(self._template, self._copies[self._now], self._kinds)
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
@@ -363,11 +357,7 @@ class Stepper:
 
     def _blank_memory(self, compiled_policy: Specialised | None) -> list[numpy.ndarray]:
         """Memory of a policy before its first action."""
-        blank = (
-            [empty_lanes(leaf.shape, self.width) for leaf in compiled_policy.outputs[1:]]
-            if compiled_policy
-            else []
-        )
+        blank = memory_of(compiled_policy.outputs[1:] if compiled_policy else (), self.width)
         for array in blank:
             array[...] = 0.0
         return blank
@@ -375,7 +365,7 @@ class Stepper:
     def reports(self) -> list[Any]:
         """Return the reports on the measurements of the last :meth:`decide`, each as of :meth:`report`."""
         return [
-            _copy_numbers(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
+            copy_arrays(self._report_template, [rows[k] for rows in self.reported], self._report_kinds)
             for k in range(self._interval)
         ]
 
@@ -433,16 +423,3 @@ def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, li
     starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
     parts = zip(arrays, starts, strict=False)
     return numbers, [numbers[at : at + leaf.rows].reshape(*leaf.shape, width) for leaf, at in parts]
-
-
-def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:
-    return [array.dtype.kind for array in arrays]
-
-
-def _copy_numbers(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
-    """Copies of arrays of numbers in their places, in their own types."""
-
-    def copied(i: int) -> numpy.ndarray:
-        return memory[i].astype(DTYPES[kinds[i]], order="C")
-
-    return map_arrays(copied, template)

@@ -14,7 +14,8 @@ from ...envs.contract.task import Task
 from ...envs.engine.compiled import can_step
 from ...envs.engine.lanes import Lanes, whole_episode
 from ...envs.engine.programs import Report
-from ...filters.scans import TOGETHER, Scans, map_nested, over_time, stack_scans
+from ...filters.array_namespace import map_nested
+from ...filters.scans import TOGETHER, Scans, over_time, stack_scans
 from .filters import Adapted, Checked, find_fault, is_lacking
 
 

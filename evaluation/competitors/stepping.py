@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...compiler.functions import (
-    DTYPES,
     Call,
-    Leaf,
     Specialised,
+    copy_arrays,
     empty_lanes,
     leaves,
     map_arrays,
+    memory_of,
     round_up_lanes,
 )
 from ...compiler.sequence import CallSequence
@@ -165,16 +165,6 @@ class SteppingPolicy(Policy):
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
         ]
-
-
-def memory_of(arrays: Sequence[Leaf], width: int) -> list[numpy.ndarray]:
-    """Memory for the arrays that a program reads or writes."""
-    return [empty_lanes(leaf.shape, width) for leaf in arrays]
-
-
-def copy_arrays(template: Any, memory: Sequence[numpy.ndarray], kinds: Any) -> Any:
-    """Copies of arrays in their own types, in the places of a template of their numbers."""
-    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
 
 
 class MeasurementMemory:

@@ -66,7 +66,7 @@ def _make_folder(path: Path) -> Iterator[None]:
 def _lock(handle: int) -> bool:
     """Lock an open file or folder, if nobody else has; the lock ends when it is closed, or with the process."""
     try:
-        if not UNIX:
+        if fcntl is None:
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
         else:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,6 +1,5 @@
 """The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
 
-import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,6 @@ from ..envs.contract.log_format import LogFormat
 from ..envs.data.recording import Recording
 from ..envs.engine.backend import make_model
 from ..envs.engine.catalogue import nearest
-from ..envs.engine.scenario_choice import make_task
 from ..envs.logs.flights import names_flights, read_flights
 from ..envs.logs.plausibility import LOUD
 from ..envs.logs.reading import read_recording
@@ -30,9 +28,9 @@ from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.metrics import Record, flight_records
 from ..evaluation.running.parallel import Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
-from ..evaluation.statistics.bootstrap import IntervalEstimate
+from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
 from ..evaluation.statistics.cause_split import phrases_of
-from ..evaluation.statistics.predictions import Predictions, mean_of
+from ..evaluation.statistics.predictions import stretch_interval
 from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.storage.estimates import check_estimates, write_estimates
 from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
@@ -254,14 +252,23 @@ def flights_of(found: Evaluation) -> list[Record]:
     return flight_records(found.dataset) if each else []
 
 
-def likelihood_differences(problem: Problem, dataset: xarray.Dataset) -> dict[str, IntervalEstimate]:
+def likelihood_differences(dataset: xarray.Dataset) -> dict[str, IntervalEstimate]:
     """Return the log-likelihood per measurement less that of the best, by name."""
-    predictions = Predictions(dataset, make_task(problem.task))
-    everywhere = numpy.ones(predictions.shape, dtype=bool)
-    means = {name: mean_of(predictions.log_likelihood(name), everywhere) for name in predictions.names}
-    known = [name for name, mean in means.items() if not math.isnan(mean)]
-    best = max(known, key=means.__getitem__, default=None)
-    return {} if best is None else {name: predictions.difference(name, best) for name in known}
+    if "log_likelihood" not in dataset:
+        return {}
+    likely = {
+        str(name): dataset["log_likelihood"].sel(policy=name).values for name in dataset["policy"].values
+    }
+    known = {name: values for name, values in likely.items() if numpy.isfinite(values).any()}
+    best = max(known, key=lambda name: known[name][numpy.isfinite(known[name])].mean(), default=None)
+    if best is None:
+        return {}
+    everywhere = numpy.ones(known[best].shape, dtype=bool)
+    pairs = {name: values - known[best] for name, values in known.items()}
+    return {
+        name: stretch_interval(everywhere, numpy.stack([less, numpy.ones_like(less)], axis=-1), ratio)
+        for name, less in pairs.items()
+    }
 
 
 def tables_of(
@@ -375,7 +382,7 @@ def write(
         own: names of the user's own.
     """
     flights = flights_of(found)
-    differences = likelihood_differences(problem, found.dataset) if found.recorded else {}
+    differences = likelihood_differences(found.dataset) if found.recorded else {}
     printed, in_file = (
         tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
     )
