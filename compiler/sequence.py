@@ -200,8 +200,8 @@ class CallSequence:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
         self._natives: list[Native | None] = []
-        self._uncounted = 0
-        """Lanes that it ran over and that no code was told of."""
+        self._uncounted, self._together = [0], [self]
+        """Lanes that were run over and that no code was told of, by all that count together."""
         self._tries, self._seconds = 0, [math.inf, math.inf]
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
         self._tables = numpy.array([call.address for call in self._calls], dtype=numpy.int64)
@@ -244,10 +244,11 @@ class CallSequence:
 
     def run(self, width: int, threads: int = 1) -> None:
         """Run over all lanes, shared by so many threads where that has turned out to be faster."""
-        self._uncounted += width * self._form[1]
-        if self._uncounted > UNCOUNTED:
-            self.expect(self._uncounted // 2)
-            self._uncounted = 0
+        self._uncounted[0] += width * self._form[1]
+        if self._uncounted[0] > UNCOUNTED:
+            for each in self._together:
+                each.expect(self._uncounted[0] // (2 * len(self._together)))
+            self._uncounted[0] = 0
         elif not self._natives:
             self.refresh()
         if threads == 1 or width < 2 * LANES:
@@ -264,6 +265,11 @@ class CallSequence:
         if trial:
             self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
             self._tries += 1
+
+    def count_with(self, other: "CallSequence") -> None:
+        """Ask for better code together with another sequence, of the same code bound to other memory."""
+        self._uncounted, self._together = other._uncounted, other._together
+        self._together.append(self)
 
     def run_once(self, width: int, threads: int = 1) -> None:
         """Run over all lanes what is not run again, with better code at once where so many steps are worth it."""

@@ -185,7 +185,7 @@ class Stepper:
                         calls[0].replace(place, numbers)
                 turn += calls
         shown = [turn[1 + len(self._begin[0])] for turn in turns]
-        return _Bound(draw, [CallSequence(turn) for turn in turns], shown)
+        return _bound(draw, [CallSequence(turn) for turn in turns], shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
         """Run whole decisions, or beginnings, of the task and of what runs beside it, as one native call."""
@@ -279,7 +279,7 @@ class Stepper:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
             shown = []
         orders = turns, turns[::-1]
-        return _Bound(
+        return _bound(
             draw, [CallSequence(even, odd, moving, interval, passing) for even, odd in orders], shown
         )
 
@@ -415,6 +415,12 @@ class _Bound(NamedTuple):
     sequences: list[CallSequence]
     shown: list[Call]
     """Calls whose last array is what is shown."""
+
+
+def _bound(draw: Call, sequences: list[CallSequence], shown: list[Call]) -> _Bound:
+    """Put together what is run from either copy, by the same code."""
+    sequences[1].count_with(sequences[0])
+    return _Bound(draw, sequences, shown)
 
 
 def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
