@@ -200,8 +200,10 @@ class CallSequence:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
         self._natives: list[Native | None] = []
-        self._uncounted, self._together = [0], [self]
-        """Lanes that were run over and that no code was told of, by all that count together."""
+        self._count, self._asked = [0, 0], 0
+        """Lanes that were run over and that no code was told of, and how often better code was asked for, by all that
+        count together; and how often that was at the last run of this one.
+        """
         self._tries, self._seconds = 0, [math.inf, math.inf]
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
         self._tables = numpy.array([call.address for call in self._calls], dtype=numpy.int64)
@@ -244,13 +246,15 @@ class CallSequence:
 
     def run(self, width: int, threads: int = 1) -> None:
         """Run over all lanes, shared by so many threads where that has turned out to be faster."""
-        self._uncounted[0] += width * self._form[1]
-        if self._uncounted[0] > UNCOUNTED:
-            for each in self._together:
-                each.expect(self._uncounted[0] // (2 * len(self._together)))
-            self._uncounted[0] = 0
-        elif not self._natives:
-            self.refresh()
+        count = self._count
+        count[0] += width * self._form[1]
+        if count[0] > UNCOUNTED:
+            self.expect(count[0] // 2)
+            count[0], count[1] = 0, count[1] + 1
+            self._asked = count[1]
+        elif self._asked != count[1] or not self._natives:
+            self.expect(0)
+            self._asked = count[1]
         if threads == 1 or width < 2 * LANES:
             self._run(0, width)
             return
@@ -268,8 +272,7 @@ class CallSequence:
 
     def count_with(self, other: "CallSequence") -> None:
         """Ask for better code together with another sequence, of the same code bound to other memory."""
-        self._uncounted, self._together = other._uncounted, other._together
-        self._together.append(self)
+        self._count = other._count
 
     def run_once(self, width: int, threads: int = 1) -> None:
         """Run over all lanes what is not run again, with better code at once where so many steps are worth it."""

@@ -184,7 +184,7 @@ class Stepper:
                     for place, numbers in enumerate(self._drawn):
                         calls[0].replace(place, numbers)
                 turn += calls
-        shown = [turn[1 + len(self._begin[0])] for turn in turns]
+        shown = [[turn[1 + len(self._begin[0])]] for turn in turns]
         return _bound(draw, [CallSequence(turn) for turn in turns], shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
@@ -192,13 +192,16 @@ class Stepper:
         draw = noise.call_of_each()
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
-        bound = self._bound.get(whole)
+        now, bound = self._now, self._bound.get(whole)
         if bound is None or bound.draw is not draw:
             bind = self._bind_decisions if whole else self._bind_beginnings
             bound = self._bound[whole] = bind(draw, noise, others)
-        bound.sequences[self._now].run(self.width, self._threads)
+        for call in bound.shown[now]:
+            if call.arrays[-1] is not self._shown:
+                call.replace(len(call.arrays) - 1, self._shown)
+        bound.sequences[now].run(self.width, self._threads)
         if not whole or self._interval % 2:
-            self._now = 1 - self._now
+            self._now = 1 - now
             for each in others:
                 each._now = self._now
 
@@ -278,10 +281,8 @@ class Stepper:
         if self._passing is not None:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
             shown = []
-        orders = turns, turns[::-1]
-        return _bound(
-            draw, [CallSequence(even, odd, moving, interval, passing) for even, odd in orders], shown
-        )
+        sequences = [CallSequence(even, odd, moving, interval, passing) for even, odd in (turns, turns[::-1])]
+        return _bound(draw, sequences, [shown, shown] if interval > 1 else [shown[:1], shown[1:]])
 
     def _let_pass(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
@@ -340,6 +341,7 @@ class Stepper:
         moving: list[Moving] = []
         for now in (self._now, 1 - self._now):
             update, tell, *others = self._bound_copies(now, noise, reported, moving)
+            others[-1].replace(len(others[-1].arrays) - 1, self._shown)
             turns.append([update, tell, draw, *others])
             if compiled_policy is not None and actions is not None:
                 steer = compiled_policy.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
@@ -402,9 +404,6 @@ class Stepper:
     def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
         self._shown, self._first_shown, self._given = memory, memory[0], False
-        bound = (call for each in self._bound.values() for call in each.shown)
-        for predict in (*(calls[-1] for calls in (*self._calls, *self._begin)), *bound):
-            predict.replace(len(predict.arrays) - 1, memory)
 
 
 class _Bound(NamedTuple):
@@ -413,11 +412,11 @@ class _Bound(NamedTuple):
     draw: Call
     """What makes the noise of a measurement."""
     sequences: list[CallSequence]
-    shown: list[Call]
-    """Calls whose last array is what is shown."""
+    shown: list[list[Call]]
+    """From each, the calls whose last array is what is shown: its memory is put there before they run."""
 
 
-def _bound(draw: Call, sequences: list[CallSequence], shown: list[Call]) -> _Bound:
+def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -> _Bound:
     """Put together what is run from either copy, by the same code."""
     sequences[1].count_with(sequences[0])
     return _Bound(draw, sequences, shown)
