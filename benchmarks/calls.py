@@ -214,7 +214,7 @@ TRACK = "filtergym/ManeuveringTarget-v0"
 
 def measure_logs(rows: Sequence[int]) -> Figures:
     """Judge logs and evaluate episodes, more and more of them."""
-    evaluate = f"import filtergym\nfiltergym.evaluate({TRACK!r}, {{names!r}}, episodes={{count}}, horizon=20)"
+    policies = [word for name in COMPETITORS for word in ("--policy", name)]
     log = ["evaluate", TRACK, "--recording", "truth.csv", "--speeds", "0.0001,100000", "--policy"]
     for count in rows:
         with tempfile.TemporaryDirectory() as folder:
@@ -223,7 +223,9 @@ def measure_logs(rows: Sequence[int]) -> Figures:
                 "advise": COMMAND.format(words=["advise", "plain.csv", "--speeds", "0.0001,100000"]),
                 "evaluate imm, with truth": COMMAND.format(words=[*log, "imm"]),
                 "smoother, with truth": COMMAND.format(words=[*log, "kalman-smoother"]),
-                "evaluate, ten competitors, 20 measurements": evaluate.format(names=COMPETITORS, count=count),
+                "evaluate, ten competitors, 20 measurements": COMMAND.format(
+                    words=["evaluate", TRACK, "--episodes", str(count), "--set", "horizon=20", *policies]
+                ),
             }
             for name, code in cases.items():
                 unit = "episodes" if "ten" in name else "rows"
