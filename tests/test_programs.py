@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import py_compile
 import re
 import shutil
 import signal
@@ -21,7 +22,14 @@ from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.task import Component, named_arrays
 from filtergym.evaluation.competitors import program_process
-from filtergym.evaluation.competitors.program_process import ENDED, LATE, WRONG, Limits, ProgramProcess
+from filtergym.evaluation.competitors.program_process import (
+    ENDED,
+    LATE,
+    WRONG,
+    Limits,
+    ProgramProcess,
+    quickest_form,
+)
 from filtergym.evaluation.competitors.programs import (
     LIMITS,
     ArrayField,
@@ -455,3 +463,13 @@ def test_the_filter_in_cpp_is_the_one_in_numpy(tmp_path, examples):
     ]
     subprocess.run([*words, "-o", tmp_path / "kalman"], check=True)
     agree(Program(str(tmp_path / "kalman")), examples("mine:Mine"))
+
+
+def test_a_compiled_launcher_of_another_text_is_not_run(tmp_path):
+    source = tmp_path / "launcher.py"
+    source.write_text("x = 1\n")
+    assert quickest_form(str(source)) == str(source)
+    compiled = py_compile.compile(str(source))
+    assert quickest_form(str(source)) == compiled
+    source.write_text("x = 12\n")
+    assert quickest_form(str(source)) == str(source)

@@ -8,6 +8,7 @@ and whatever it has begun end with the object, or with Python.
 import os
 import selectors
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -19,11 +20,21 @@ from typing import NamedTuple
 
 from . import isolated_estimator
 
-LAUNCHER = isolated_estimator.__file__
-if (compiled := cache_from_source(LAUNCHER)) and os.path.exists(
-    compiled
-):  # which takes half the time to start
-    LAUNCHER = compiled
+
+def quickest_form(source: str) -> str:
+    """Return the compiled form of a source file, which starts in half the time, where it is of this text; else it."""
+    compiled = cache_from_source(source)
+    try:
+        with open(compiled, "rb") as file:
+            header, now = file.read(16), os.stat(source)
+    except OSError:
+        return source
+    # As the import system tells: no flags, then date and size of the source.
+    mark = struct.pack("<LLL", 0, int(now.st_mtime) & 0xFFFFFFFF, now.st_size & 0xFFFFFFFF)
+    return compiled if header[4:] == mark else source
+
+
+LAUNCHER = quickest_form(isolated_estimator.__file__)
 ENDED, LATE, WRONG = 6, 7, 8
 """Numbers of the reasons among :data:`..storage.dataset.FAULTS`."""
 START_SECONDS = 30.0
