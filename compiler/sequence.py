@@ -199,10 +199,10 @@ class CallSequence:
     ) -> None:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
         self._codes = numpy.zeros(len(self._calls), dtype=numpy.int64)
-        self._natives: list[Native | None] = []
+        self._natives: list[Native] = []
         self._count, self._asked = [0, 0], 0
-        """Lanes that were run over and that no code was told of, and how often better code was asked for, by all that
-        count together; and how often that was at the last run of this one.
+        """Lanes run over since better code was last asked for, and how often it was, by all sequences that count
+        together; and how often it was at the last run of this one.
         """
         self._tries, self._seconds = 0, [math.inf, math.inf]
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
@@ -232,17 +232,10 @@ class CallSequence:
 
     def expect(self, lanes: int, in_sequence: bool = False) -> None:
         """Let every call use the code for running over so many lanes in all, see :meth:`.functions.Call.expect`."""
-        for call in self._calls:
-            call.expect(lanes, in_sequence)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Use the code that the calls have now."""
-        natives = [call.native for call in self._calls]
+        natives = [call.expect(lanes, in_sequence) for call in self._calls]
         if natives != self._natives:
-            self._natives = [call.native or call.expect(0) for call in self._calls]
-            self._tries, self._seconds = 0, [math.inf, math.inf]
-            self._codes[:] = list(map(address_of_code, self._natives))
+            self._natives, self._tries, self._seconds = natives, 0, [math.inf, math.inf]
+            self._codes[:] = list(map(address_of_code, natives))
 
     def run(self, width: int, threads: int = 1) -> None:
         """Run over all lanes, shared by so many threads where that has turned out to be faster."""

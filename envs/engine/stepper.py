@@ -216,7 +216,7 @@ class Stepper:
 
         Args:
             lanes: which, ascending.
-            identities: of the episodes, likewise.
+            identities: of the episodes, ``(2, lanes)``.
             noise: of as many lanes, or more.
             others: of the same task.
 

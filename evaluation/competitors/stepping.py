@@ -298,7 +298,7 @@ class CompiledUpdate:
 
     @property
     def policy_state(self) -> Any:
-        """Memory of the traced policy, likewise."""
+        """Memory of the traced policy, in arrays of the caller's own."""
         return map_arrays(lambda i: self._policies[self._now > 0][i].copy(), self._policy_template)
 
     def go_on(self, state: Any, policy: Any) -> None:
@@ -337,7 +337,7 @@ class ModelUpdate:
 
     @property
     def observed(self) -> numpy.ndarray:
-        """What ``observe`` reports, likewise."""
+        """What ``observe`` reports, ``(width, fields)``."""
         return numpy.asarray(self._model.run(self._observe, self._episode)).T
 
     def answer(self, action: numpy.ndarray) -> None:

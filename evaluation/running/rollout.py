@@ -209,13 +209,13 @@ def run_stretches(
     """Run whatever competes as :func:`run_episodes` does, in a memory that does not grow with the episodes' length.
 
     Args:
-        model: as in :func:`run_episodes`, likewise the others that it has.
-        competitor: likewise.
-        kind: likewise.
-        seeds: likewise.
-        report: likewise.
+        model: as in :func:`run_episodes`, with the five arguments of the same names.
+        competitor: see there.
+        kind: see there.
+        seeds: see there.
+        report: see there.
         rows: measurements that are reported at once, in whole decisions.
-        name: likewise.
+        name: see there.
 
     Yields:
         What is reported of some measurements after the others, arrays ``(rows, ..., episodes)`` by name.

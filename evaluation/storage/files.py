@@ -1,7 +1,7 @@
 """Files and folders that are whole or as they were: written beside their place, then moved into it.
 
 Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place. Two
-processes that write the same are told apart by locks, which end with their process.
+processes that write the same are kept apart by locks, which end with their process.
 """
 
 import os
@@ -111,7 +111,7 @@ def _sweep_unfinished(folder: Path) -> None:
                 handle = os.open(place / LOCK, os.O_RDWR)
                 try:
                     dead = _lock(handle)
-                    if dead and UNIX:  # before it is let go, so that nobody takes it meanwhile
+                    if dead and UNIX:  # before the lock ends, so that no other process takes it
                         shutil.rmtree(place)
                 finally:
                     os.close(handle)
@@ -180,7 +180,7 @@ def _hold_alone(partial: Path, patience: float) -> Iterator[None]:
 
 
 def _open_locked(partial: Path, name: str, until: float) -> int:
-    """Make a file that nobody else writes, and lock it, or try again until a time of the monotonic clock.
+    """Make a file that no other process writes, and lock it, or try again until a time of the monotonic clock.
 
     Args:
         partial: the file.
