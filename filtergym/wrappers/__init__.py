@@ -169,7 +169,7 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
     def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
         """Step the environment, and read the sensors."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.reading = self._readings.advance(ONE, self._state(observation))
+        self.reading = self._readings.advance(None, self._state(observation))
         shown, info = self._show(info)
         return shown, reward, terminated, truncated, info
 
@@ -218,10 +218,10 @@ class EstimatedObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.util
         self._sensors: NoisyObservation = find_readings(env, NoisyObservation)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model = check_model(found, self._sensors, env.action_space)
-        self._show = check_shown(show, self.model)
-        self._estimates = Estimates(self.model, self._sensors.sensors, competitor, control, 1)
+        shown = check_shown(show, self.model)
+        self._estimates = Estimates(self.model, self._sensors.sensors, competitor, control, shown, 1)
         dtype: Any = self._sensors.observation_space.dtype
-        self.observation_space = self._estimates.space(self._show, dtype)
+        self.observation_space = self._estimates.space(dtype)
         self.action_space = joint_space(env.action_space, self._estimates.action_space)
         self._joins = isinstance(self.action_space, gymnasium.spaces.Box)
 
@@ -248,11 +248,11 @@ class EstimatedObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.util
         _, reward, terminated, truncated, info = self.env.step(action)
         assert self._sensors.reading is not None
         inputs = inputs_of(self.model, numpy.asarray(action)[None])
-        self._estimates.advance(ONE, inputs, self._sensors.reading, own)
+        self._estimates.advance(None, inputs, self._sensors.reading, own)
         return self._shown(), reward, terminated, truncated, info
 
     def _shown(self) -> numpy.ndarray:
-        return self._estimates.show(self._show, self.observation_space.dtype)[0]
+        return self._estimates.show(self.observation_space.dtype)[0]
 
 
 def split_action(action: Any, space: gymnasium.Space[Any], joins: bool) -> tuple[Any, numpy.ndarray]:

@@ -14,6 +14,7 @@ from ..envs.data.recorded_world import Feed
 from ..envs.engine.backend import make_model
 from ..envs.engine.compiled import can_step
 from ..envs.engine.scenario_choice import find_scenario
+from ..envs.linear.equations import StateSpaceMeasurement
 from ..envs.linear.inputs import Input
 from ..envs.linear.sensors import Sensor
 from ..evaluation.competitors.filters import put_in_loop
@@ -92,6 +93,7 @@ class Estimates:
         competitor: name of an estimator of a state-space model, such as ``"extended"``, or what makes one.
         control: ``"noise"`` or ``"gain"``: an action multiplies these of the filter as written, in place of a
             competitor; None: nothing does.
+        show: words of :data:`PARTS`.
         lanes: N.
 
     Attributes:
@@ -107,9 +109,10 @@ class Estimates:
         sensors: Mapping[str, EnvironmentSensor],
         competitor: Any,
         control: str | None,
+        show: tuple[str, ...],
         lanes: int,
     ) -> None:
-        self.model, self._lanes = model, lanes
+        self.model, self._lanes, self._show = model, lanes, show
         problem = import_problem(state_space_id(model, sensors))
         if control is not None and control not in CONTROLS:
             raise ValueError(f"control must be {' or '.join(CONTROLS)}, or None, got {control!r}")
@@ -127,13 +130,12 @@ class Estimates:
             own = put_in_loop(own, maker, "estimator", str(competitor), lanes)
         self.action_space = None if control is None else own.action_space
         self._own, world = own, own.task.world
-        self._initial, self._measurement = world.initial, world.measurement
         self._is_compiled = can_step(own, report_estimate)
         self._is_asked = not self._is_compiled or control is not None
         self._update: Any = (
             CompiledUpdate(own, report_estimate, lanes, None, self._is_asked, None)
             if self._is_compiled
-            else ModelUpdate(own, report_estimate, lanes, self._measurement, None)
+            else ModelUpdate(own, report_estimate, lanes, world.measurement, None)
         )
         self._width = round_up_lanes(lanes)
         self._pad = numpy.minimum(numpy.arange(self._width), lanes - 1)
@@ -152,21 +154,23 @@ class Estimates:
         m, p = len(numbers), len(model.inputs)
         depth = self._behind + 1
         self._values = numpy.zeros((depth, lanes, m))
-        self._available = numpy.zeros((depth, lanes, m))
+        self._available = numpy.zeros((depth, lanes, m), dtype=bool)
         self._inputs = numpy.zeros((depth + 1, lanes, p))
         self._steps = numpy.zeros(lanes, dtype=numpy.int64)
         self.mean = numpy.zeros((lanes, len(model.names)))
         self.deviation = numpy.zeros_like(self.mean)
         self.nis = numpy.zeros(lanes)
         self.innovation = numpy.zeros((lanes, m))
-        self.lost = numpy.zeros(lanes, dtype=bool)
-        """Whether the filter of a lane has just begun anew because its estimate was not finite."""
+        self._filtered = self.mean.T
+        """Means of the filters, ``(n, N)``."""
+        self._each, self._no_inputs = numpy.arange(lanes), numpy.zeros((lanes, p))
+        self._intervals, self._needs_innovation = numpy.full(lanes, model.interval), "innovation" in show
 
     def begin(self, lanes: Array, reading: Reading) -> None:
         """Begin episodes of some lanes with their first readings; the others stay as they are."""
         self._restart(lanes)
         self._steps[lanes] = 0
-        self._take(lanes, reading, None)
+        self._take(lanes, reading, self._no_inputs, None)
 
     def _restart(self, lanes: Array) -> None:
         model, N = self.model, self._width
@@ -176,121 +180,118 @@ class Estimates:
         if not lanes.all():
             begun = select_nested(lanes[self._pad], begun, self._update.state)
         self._update.go_on(begun, ())
-        self.mean[lanes], self.deviation[lanes] = mean[:, 0], numpy.sqrt(numpy.diag(covariance[..., 0]))
-        self._filtered = numpy.where(
-            lanes[:, None], mean[:, : self._lanes].T, getattr(self, "_filtered", self.mean)
-        )
+        self._filtered = numpy.where(lanes, mean[:, : self._lanes], self._filtered)
 
-    def advance(self, lanes: Array, inputs: Array, reading: Reading, action: Array | None = None) -> None:
+    def advance(
+        self, lanes: Array | None, inputs: Array, reading: Reading, action: Array | None = None
+    ) -> None:
         """Take in the readings of a step of some lanes.
 
         Args:
-            lanes: which step, booleans ``(N,)``.
+            lanes: which step, booleans ``(N,)``; None: all.
             inputs: that acted in the step, ``(N, p)``.
             reading: of all lanes.
             action: of the control, ``(N, ...)``.
         """
-        self._steps[lanes] += 1
+        self._steps += 1 if lanes is None else lanes
         self._take(lanes, reading, inputs, action)
 
-    def _take(
-        self, lanes: Array, reading: Reading, inputs: Array | None, action: Array | None = None
-    ) -> None:
-        depth, each, own = self._behind + 1, numpy.arange(self._lanes), self.model
-        step = self._steps
-        if depth == 1:
-            values, available = reading.values, reading.available * lanes[:, None]
-            acted = inputs
-        else:
-            self._values[step[lanes] % depth, each[lanes]] = reading.values[lanes]
-            self._available[step[lanes] % depth, each[lanes]] = reading.available[lanes]
-            if inputs is not None:
-                self._inputs[step[lanes] % (depth + 1), each[lanes]] = inputs[lanes]
-            place = (step[:, None] - self._held) % depth
-            columns = numpy.arange(self._values.shape[2])
-            ready = (step >= self._behind)[:, None] & lanes[:, None]
-            values = self._values[place, each[:, None], columns]
-            available = self._available[place, each[:, None], columns] * ready
-            acted = self._inputs[(step - self._behind) % (depth + 1), each]
-        at = step - self._behind
-        moves = lanes & (at > 0)
-        interval = numpy.where(moves, own.interval, 0.0)
-        acted = numpy.zeros((self._lanes, len(own.inputs))) if acted is None else acted
+    def _take(self, lanes: Array | None, reading: Reading, inputs: Array, action: Array | None) -> None:
+        values, available, acted, moves = reading.values, reading.available, inputs, lanes
+        if self._behind:
+            values, available, acted = self._align(lanes, reading, inputs)
+            moves = self._steps > self._behind if lanes is None else lanes & (self._steps > self._behind)
+        elif lanes is not None:
+            available = available & lanes[:, None]
+            moves = lanes & (self._steps > 0)
+        interval = self._intervals if moves is None else numpy.where(moves, self.model.interval, 0.0)
         self._send(values.T, available.T, interval, acted.T)
         if self._is_asked:
             self._update.answer(self._no_action if action is None else self._actions(action, moves))
         found = self._update.report()
-        mean, variance, nis = (
-            numpy.reshape(found[name], (-1, self._lanes)) for name in ("mean", "variance", "nis")
-        )
-        finite = numpy.isfinite(mean).all(axis=0) & numpy.isfinite(variance).all(axis=0)
-        predicted = self._motion_of(self._filtered.T, interval, acted.T)
-        innovation = values - self._h_of(predicted).T
-        turning = numpy.isfinite(self.periods)
-        if turning.any():
-            periods = numpy.where(turning, self.periods, 1.0)
-            innovation = innovation - numpy.where(turning, numpy.round(innovation / periods) * periods, 0.0)
-        used = (available > 0.0) & lanes[:, None]
-        self.innovation = numpy.where(lanes[:, None], numpy.where(used, innovation, 0.0), self.innovation)
-        self._filtered = mean.T.copy()
-        present = mean
+        mean, variance = found["mean"].reshape(-1, self._lanes), found["variance"].reshape(-1, self._lanes)
+        if self._needs_innovation:
+            self._find_innovation(lanes, values, available, interval, acted.T)
+        self._filtered, present = mean, mean
         for back in range(self._behind - 1, -1, -1):
-            going = lanes & (step - back > 0)
-            u = self._inputs[(step - back) % (depth + 1), each].T
-            present = self._motion_of(present, numpy.where(going, own.interval, 0.0), u)
-        self.mean = numpy.where(lanes[:, None], present.T, self.mean)
-        self.deviation = numpy.where(
-            lanes[:, None], numpy.sqrt(numpy.clip(variance, 0.0, None)).T, self.deviation
+            going = numpy.where(self._steps > back, self.model.interval, 0.0)
+            u = self._inputs[(self._steps - back) % (self._behind + 2), self._each].T
+            present = self._motion_of(present, going, u)
+        nis = (
+            found["nis"].reshape(self._lanes)
+            if available.all()
+            else numpy.where(available.any(axis=1), found["nis"], 0.0)
         )
-        self.nis = numpy.where(lanes & used.any(axis=1), nis[0], numpy.where(lanes, 0.0, self.nis))
-        self.lost = lanes & ~finite
-        if self.lost.any():
-            self._restart(self.lost)
+        shown = present.T.copy(), numpy.sqrt(variance.T), nis
         for i, period in self.turns:
-            self.mean[:, i] -= period * numpy.round(self.mean[:, i] / period)
+            shown[0][:, i] -= period * numpy.rint(shown[0][:, i] / period)
+        if lanes is not None:
+            old = self.mean, self.deviation, self.nis
+            shown = tuple(
+                numpy.where(lanes if new.ndim == 1 else lanes[:, None], new, before)
+                for new, before in zip(shown, old, strict=True)
+            )
+        self.mean, self.deviation, self.nis = shown
+        if not numpy.isfinite(numpy.sum(mean) + numpy.sum(variance)):
+            self._restart(~(numpy.isfinite(mean).all(axis=0) & numpy.isfinite(variance).all(axis=0)))
+
+    def _align(self, lanes: Array | None, reading: Reading, inputs: Array) -> tuple[Array, Array, Array]:
+        """Return the readings of the time for which the slowest sensor has come, and the inputs until then."""
+        depth, step, each = self._behind + 1, self._steps, self._each
+        which = each if lanes is None else numpy.flatnonzero(lanes)
+        self._values[step[which] % depth, which] = reading.values[which]
+        self._available[step[which] % depth, which] = reading.available[which]
+        self._inputs[step[which] % (depth + 1), which] = inputs[which]
+        place, columns = (step[:, None] - self._held) % depth, numpy.arange(self._values.shape[2])
+        ready = (step >= self._behind)[:, None]
+        ready = ready if lanes is None else ready & lanes[:, None]
+        values = self._values[place, each[:, None], columns]
+        available = self._available[place, each[:, None], columns] & ready
+        return values, available, self._inputs[(step - self._behind) % (depth + 1), each]
+
+    def _find_innovation(
+        self, lanes: Array | None, values: Array, available: Array, interval: Array, acted: Array
+    ) -> None:
+        """Compare readings with those predicted at the last estimate."""
+        predicted = self._motion_of(self._filtered, interval, acted)
+        innovation = values - numpy.asarray(self._h.value(predicted, numpy)).T
+        turning = numpy.isfinite(self.periods)
+        periods = numpy.where(turning, self.periods, 1.0)
+        innovation -= numpy.where(turning, numpy.rint(innovation / periods) * periods, 0.0)
+        innovation = numpy.where(available, innovation, 0.0)
+        self.innovation = (
+            innovation if lanes is None else numpy.where(lanes[:, None], innovation, self.innovation)
+        )
 
     def _send(self, values: Array, available: Array, interval: Array, inputs: Array) -> None:
         """Give a measurement to the filters; arrays ``(..., N)``, without this axis where there is one lane."""
-        parts = [values, numpy.asarray(available, dtype=float), interval]
-        measurement = self._measurement._replace(
-            values=parts[0],
-            available=parts[1],
-            interval=parts[2],
-            inputs=inputs if len(self.model.inputs) else None,
-        )
+        parts = (values, available, interval, inputs if self.model.inputs else None, None, None)
         if self._lanes == 1:
-            one = {
-                name: None if part is None else part[..., 0] for name, part in measurement._asdict().items()
-            }
-            measurement = measurement._replace(**one)
-        self._update.arrive(measurement)
+            parts = tuple(None if part is None else part[..., 0] for part in parts)
+        self._update.arrive(StateSpaceMeasurement(*parts))
 
-    def _actions(self, action: Array, moves: Array) -> Array:
+    def _actions(self, action: Array, moves: Array | None) -> Array:
         """Return actions of the whole width; zero in lanes whose filter stands still."""
         padded = numpy.asarray(action, dtype=float)[self._pad]
-        padded[~moves[self._pad]] = 0.0
-        return padded
+        return padded if moves is None else numpy.where(moves[self._pad][:, None], padded, 0.0)
 
     def _motion_of(self, mean: Array, interval: Array, inputs: Array) -> Array:
         """Return states ``(n, N)`` an interval later."""
         return numpy.asarray(self._motion.value(numpy.concatenate([mean, interval[None], inputs]), numpy))
 
-    def _h_of(self, mean: Array) -> Array:
-        return numpy.asarray(self._h.value(mean, numpy))
-
-    def space(self, show: tuple[str, ...], dtype: Any) -> gymnasium.spaces.Box:
+    def space(self, dtype: Any) -> gymnasium.spaces.Box:
         """Return the space of what is shown of one lane."""
-        size, n = 0, len(self.model.names)
+        size, n, show = 0, len(self.model.names), self._show
         if "observation" in show:
             size += self.model.observation(numpy.zeros((1, n))).shape[1]  # type: ignore[misc]
         size += n * (("mean" in show) + ("deviation" in show)) + ("nis" in show)
         size += self.innovation.shape[1] * ("innovation" in show)
         return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), dtype)
 
-    def show(self, show: tuple[str, ...], dtype: Any) -> Array:
+    def show(self, dtype: Any) -> Array:
         """Return what is shown, ``(N, fields)``."""
         parts = []
-        for name in show:
+        for name in self._show:
             if name == "observation":
                 parts.append(self.model.observation(self.mean))  # type: ignore[misc]
             else:

@@ -143,6 +143,18 @@ class Readings:
         self.limit = 0.5 * self.periods
         self._turning, self._rounded = numpy.isfinite(self.periods), self.quantum > 0.0
         self._size = m
+        self._is_linear = all(one.matrix is not None and not numpy.any(one.offset) for one in self._functions)
+        self._is_linear &= not any(isinstance(root, VectorFunction) for root in self._noises)
+        if self._is_linear:
+            self._rows = numpy.concatenate([one.matrix for one in self._functions])
+            self._root = numpy.zeros((m, m))
+            for channel, root in zip(self.channels, self._noises, strict=True):
+                self._root[channel.places, channel.places] = root
+        self._is_steady = all(one.interval is None and one.availability == 1.0 for one in self.channels)
+        self._turn = numpy.where(self._turning, self.periods, 0.0)
+        self._per_turn = numpy.where(self._turning, 1.0 / self.periods, 0.0)
+        self._is_exact = not (self._turning.any() or self._rounded.any())
+        self._each, self._all_made = numpy.arange(lanes), numpy.ones((lanes, m), dtype=bool)
         self._identities = numpy.zeros((2, lanes), dtype=numpy.uint64)
         self.steps = numpy.zeros(lanes, dtype=numpy.int64)
         """Since the start of each lane's episode."""
@@ -200,47 +212,51 @@ class Readings:
         values = self._measure(state, row)
         self._waiting[:, 0, lanes], self._waiting[:, 1, lanes] = values[lanes], 0.0
         self._waiting[0, 1, lanes] = 1.0
-        self._last[lanes] = values[lanes]
+        self._last = numpy.where(lanes[:, None], values, self._last)
         available = numpy.zeros((self._lanes, self._size), dtype=bool)
         available[lanes] = self.delays == 0
-        return Reading(self._last.copy(), available)
+        return Reading(self._last, available)
 
-    def advance(self, lanes: Array, state: Array) -> Reading:
+    def advance(self, lanes: Array | None, state: Array) -> Reading:
         """Return the readings one step later of some lanes; others keep their last ones.
 
         Args:
-            lanes: which step, booleans ``(N,)``.
+            lanes: which step, booleans ``(N,)``; None: all.
             state: of all lanes, ``(N, n)``.
         """
-        self.steps[lanes] += 1
-        late = lanes & (self.steps - self._filled >= BLOCK)
+        self.steps += 1 if lanes is None else lanes
+        late = self.steps - self._filled >= BLOCK
         if late.any():
             self._fill(late)
         row = self._row()
+        made = self._all_made if self._is_steady else self._made(row[2 * self._size :])
+        values = self._measure(state, row)
+        if len(self._waiting) > 1:
+            number, depth, each = self.steps, len(self._waiting), self._each
+            self._waiting[number % depth, 0, each], self._waiting[number % depth, 1, each] = values, made
+            sent = (number[:, None] - self.delays) % depth
+            values, made = (
+                self._waiting[sent, part, each[:, None], numpy.arange(self._size)] for part in (0, 1)
+            )
+            made = (made > 0.0) & (number[:, None] >= self.delays)
+        if lanes is not None:
+            made = made & lanes[:, None]
+        if made is not self._all_made:
+            values = numpy.where(made, values, self._last)
+        self._last = values
+        return Reading(values, made)
+
+    def _made(self, uniforms: Array) -> Array:
+        """Return whether each number is measured at this step, ``(N, m)``; uniforms ``(sensors, N)``."""
         made = numpy.empty((self._lanes, self._size), dtype=bool)
-        for channel, uniform in zip(self.channels, row[2 * self._size :], strict=True):
-            due = numpy.ones(self._lanes, dtype=bool)
+        for channel, uniform in zip(self.channels, uniforms, strict=True):
+            due = uniform < channel.availability
             if channel.interval is not None:
                 share = self.interval / channel.interval
-                due = numpy.floor(self.steps * share + EARLY) > numpy.floor((self.steps - 1) * share + EARLY)
-            if channel.availability < 1.0:
-                due &= uniform < channel.availability
+                count = numpy.floor(self.steps * share + EARLY)
+                due &= count > numpy.floor((self.steps - 1) * share + EARLY)
             made[:, channel.places] = due[:, None]
-        values = self._measure(state, row)
-        if len(self._waiting) == 1:
-            received = made
-        else:
-            number, depth = self.steps, len(self._waiting)
-            each = numpy.arange(self._lanes)
-            self._waiting[number % depth, 0, each] = values
-            self._waiting[number % depth, 1, each] = made
-            sent = (number[:, None] - self.delays) % depth
-            values = self._waiting[sent, 0, each[:, None], numpy.arange(self._size)]
-            received = self._waiting[sent, 1, each[:, None], numpy.arange(self._size)] > 0.0
-            received &= number[:, None] >= self.delays
-        received = received & lanes[:, None]
-        self._last = numpy.where(received, values, self._last)
-        return Reading(self._last.copy(), received)
+        return made
 
     def _fill(self, lanes: Array) -> None:
         """Make the noise of the coming steps of some lanes."""
@@ -250,10 +266,15 @@ class Readings:
 
     def _row(self) -> Array:
         """Return the noise of this step of every lane, ``(2 m + sensors, N)``."""
-        return self._block[self.steps - self._filled, :, numpy.arange(self._lanes)].T
+        if self._lanes == 1:
+            return self._block[self.steps[0] - self._filled[0]]
+        return self._block[self.steps - self._filled, :, self._each].T
 
     def _measure(self, state: Array, row: Array) -> Array:
         """Return what all sensors measure now, ``(N, m)``."""
+        if self._is_linear:
+            measured = state @ self._rows.T + row[: self._size].T @ self._root.T
+            return self.finish(measured + self._offset)
         x = state.T
         values = numpy.empty((self._lanes, self._size))
         for channel, h, root in zip(self.channels, self._functions, self._noises, strict=True):
@@ -269,6 +290,8 @@ class Readings:
 
     def finish(self, values: Array) -> Array:
         """Round readings to whole quanta, and wrap angles."""
+        if self._is_exact:
+            return values
         if self._rounded.any():
             quantum = numpy.where(self._rounded, self.quantum, 1.0)
             values = numpy.where(self._rounded, numpy.round(values / quantum) * quantum, values)

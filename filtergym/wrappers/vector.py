@@ -87,7 +87,7 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
                     last if was else now
                     for last, was, now in zip(infos["final_obs"], infos["_final_obs"], observations, strict=True)
                 ])  # fmt: skip
-                self.final = self._readings.advance(self.every, self._state(final))
+                self.final = self._readings.advance(None, self._state(final))
                 begun = self._readings.begin(ended, state, None)
                 chosen = ended[:, None]
                 self.reading = Reading(
@@ -100,10 +100,10 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
                 ]
                 infos = {**infos, "final_obs": shown}
             else:
-                self.reading = self._readings.advance(self.every, state)
+                self.reading = self._readings.advance(None, state)
         else:
             self.began = self._ended if self.mode is AutoresetMode.NEXT_STEP else ~self.every
-            reading = self._readings.advance(~self._ended, state)
+            reading = self._readings.advance(~self._ended if self._ended.any() else None, state)
             if self.began.any():
                 begun = self._readings.begin(self.began, state, None)
                 chosen = self.began[:, None]
@@ -146,10 +146,12 @@ class EstimatedObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self._sensors: NoisyObservation = find_readings(env, NoisyObservation)
         found = self._sensors.model if model is None else find_model(model, env.spec)
         self.model = check_model(found, self._sensors, env.single_action_space)
-        self._show = check_shown(show, self.model)
-        self._estimates = Estimates(self.model, self._sensors.sensors, competitor, control, env.num_envs)
+        shown = check_shown(show, self.model)
+        self._estimates = Estimates(
+            self.model, self._sensors.sensors, competitor, control, shown, env.num_envs
+        )
         dtype: Any = self._sensors.single_observation_space.dtype
-        self.single_observation_space = self._estimates.space(self._show, dtype)
+        self.single_observation_space = self._estimates.space(dtype)
         self.single_action_space = joint_space(env.single_action_space, self._estimates.action_space)
         self.observation_space, self.action_space = (
             gymnasium.vector.utils.batch_space(one, env.num_envs)
@@ -181,17 +183,16 @@ class EstimatedObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         inputs, began = inputs_of(self.model, numpy.asarray(actions)), sensors.began
         assert sensors.reading is not None
         if sensors.final is not None:
-            estimates.advance(sensors.every, inputs, sensors.final, own)
+            estimates.advance(None, inputs, sensors.final, own)
             last = numpy.empty(self.num_envs, dtype=object)
             last[:] = [values if was else None for values, was in zip(self._shown(), began, strict=True)]
             infos = {**infos, "final_obs": last}
         else:
-            moves = sensors.every if sensors.mode is AutoresetMode.SAME_STEP else ~waiting
-            if moves.any():
-                estimates.advance(moves, inputs, sensors.reading, own)
+            stays = waiting if sensors.mode is not AutoresetMode.SAME_STEP and waiting.any() else None
+            estimates.advance(None if stays is None else ~stays, inputs, sensors.reading, own)
         if began.any():
             estimates.begin(began, sensors.reading)
         return self._shown(), rewards, terminations, truncations, infos
 
     def _shown(self) -> numpy.ndarray:
-        return self._estimates.show(self._show, self.single_observation_space.dtype)
+        return self._estimates.show(self.single_observation_space.dtype)
