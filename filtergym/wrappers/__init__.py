@@ -181,7 +181,7 @@ class NoisyObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Re
         assert self.reading is not None
         values = self.reading.values[0].astype(self.observation_space.dtype)
         numpy.clip(values, self.observation_space.low, self.observation_space.high, out=values)  # type: ignore[attr-defined]
-        return values, {**info, "available": self.reading.available[0]}
+        return values, {**info, "available": self.reading.available[0].copy()}
 
 
 class EstimatedObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):

@@ -112,6 +112,7 @@ class Estimates:
         show: tuple[str, ...],
         lanes: int,
     ) -> None:
+        self._arguments = model, sensors, competitor, control, show, lanes
         self.model, self._lanes, self._show = model, lanes, show
         problem = import_problem(state_space_id(model, sensors))
         if control is not None and control not in CONTROLS:
@@ -165,6 +166,17 @@ class Estimates:
         """Means of the filters, ``(n, N)``."""
         self._each, self._no_inputs = numpy.arange(lanes), numpy.zeros((lanes, p))
         self._intervals, self._needs_innovation = numpy.full(lanes, model.interval), "innovation" in show
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return arguments, arrays and the state of the filters; their code is made anew."""
+        arrays = {name: value for name, value in vars(self).items() if isinstance(value, numpy.ndarray)}
+        return {"arguments": self._arguments, "arrays": arrays, "filters": self._update.state}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["arguments"])  # type: ignore[misc]
+        vars(self).update(state["arrays"])
+        if state["filters"] is not None:
+            self._update.go_on(state["filters"], ())
 
     def begin(self, lanes: Array, reading: Reading) -> None:
         """Begin episodes of some lanes with their first readings; the others stay as they are."""

@@ -53,6 +53,13 @@ class EnvironmentModel:
             if shape != (n,) and (name == "mean" or shape != (n, n)):
                 raise ValueError(f"{name} of the model must be of its {n} components, got the shape {shape}")
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickle a model of :data:`CLASSIC_CONTROL` by its name."""
+        for name, model in CLASSIC_CONTROL.items():
+            if model is self:
+                return find_model, (name, None)
+        return super().__reduce_ex__(protocol)
+
     def matrix(self, name: str) -> Array:
         """Return ``noise`` or ``covariance`` as a matrix, ``(n, n)``."""
         given = numpy.asarray(getattr(self, name), dtype=float)

@@ -63,8 +63,8 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
         """Begin episodes of the environments, of some alone with the option ``reset_mask``, and their readings."""
+        mask = (options or {}).get("reset_mask")  # Gymnasium takes it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        mask = (options or {}).get("reset_mask")
         lanes = self.every if mask is None else numpy.asarray(mask, dtype=bool)
         if seed is None and not self._is_seeded:
             seed = int(numpy.random.SeedSequence().generate_state(1)[0])
@@ -123,7 +123,7 @@ class NoisyObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def _show(self, infos: dict[str, Any]) -> tuple[numpy.ndarray, dict[str, Any]]:
         assert self.reading is not None
-        infos = {**infos, "available": self.reading.available, "_available": self.every}
+        infos = {**infos, "available": self.reading.available.copy(), "_available": self.every.copy()}
         return self._typed(self.reading.values), infos
 
 
