@@ -236,50 +236,76 @@ def mean_returns(runs: dict[tuple[str, ...], Any], way: str, level: str) -> dict
     return {key[4]: float(numpy.mean(one["fresh"])) for key, one in runs.items() if key[2:4] == (way, level)}
 
 
-def print_tables(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
-    """Print returns, and differences to those under truth."""
-    for name in only:
-        truth = found.get(("fixed", name, "truth", ""))
-        if truth is None:
-            continue
-        print(f"\n{name}, fixed controller: return {numpy.mean(truth):.1f} under truth; less of it by\n")
-        ways = ("raw", "average", *FILTERS)
-        print("| noise | " + " | ".join(ways) + " |\n|---|" + "---|" * len(ways))
-        for level in LEVELS:
-            row = []
-            for way in ways:
-                returns = found.get(("fixed", name, way, level))
-                if returns is None:
-                    row.append("")
-                    continue
-                mean, low, high = interval(numpy.array(truth) - numpy.array(returns))
-                row.append(f"{mean:.1f} [{low:.1f}, {high:.1f}]")
-            print(f"| {level} | " + " | ".join(row) + " |")
-    for name in only:
+def print_fixed(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
+    """Print the loss of return of the fixed controllers against the truth."""
+    ways = ("raw", "average", *FILTERS)
+    print("\n| fixed controller, less return than under truth | noise | " + " | ".join(ways) + " |")
+    print("|---|---|" + "---|" * len(ways))
+    for name, level in itertools.product(only, LEVELS):
+        truth = numpy.array(found.get(("fixed", name, "truth", ""), [math.nan]))
+        row = []
+        for way in ways:
+            returns = found.get(("fixed", name, way, level))
+            row.append(
+                "" if returns is None else "{:.1f} [{:.1f}, {:.1f}]".format(*interval(truth - returns))
+            )
+        deviation = PROBLEMS[name][4][LEVELS.index(level)]
+        print(f"| {name}, {truth.mean():.0f} | {deviation:g} | " + " | ".join(row) + " |")
+
+
+def print_trained(found: dict[tuple[str, ...], Any], only: list[str]) -> None:
+    """Print the returns of trained agents, and what estimates bring them."""
+    ways = ("raw", "stack", "estimate")
+    print("\n| PPO, mean return (seeds) | noise | truth | " + " | ".join(ways) + " | estimate less stack |")
+    print("|---|---|" + "---|" * (len(ways) + 2))
+    for name, level in itertools.product(only, LEVELS):
         runs = {key: value for key, value in found.items() if key[:2] == ("trained", name)}
-        if not runs:
-            continue
-        steps = TRAINING[name]["steps"]
-        print(
-            f"\n{name}, PPO of {steps:,} steps: mean return of {FRESH} fresh episodes, mean over training seeds\n"
-        )
-        print("| noise | truth | " + " | ".join(("raw", "stack", "estimate", "estimate less stack")) + " |")
-        print("|---|" + "---|" * 5)
-        truth = mean_returns(runs, "truth", "")
-        for level in LEVELS:
-            row = [f"{numpy.mean([*truth.values()]):.1f} ({len(truth)})" if truth else ""]
-            for way in ("raw", "stack", "estimate"):
-                own = [*mean_returns(runs, way, level).values()]
-                row.append(f"{numpy.mean(own):.1f} ({len(own)})" if own else "")
-            pairs = [
-                value - mean_returns(runs, "stack", level)[seed]
-                for seed, value in mean_returns(runs, "estimate", level).items()
-                if seed in mean_returns(runs, "stack", level)
-            ]
-            if pairs:
-                mean, low, high = interval(numpy.array(pairs))
-                row.append(f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]")
-            print(f"| {level} | " + " | ".join(row) + " |")
+        of = {way: mean_returns(runs, way, level) for way in ways}
+        each = [mean_returns(runs, "truth", ""), *of.values()]
+        row = [f"{numpy.mean([*one.values()]):.1f} ({len(one)})" if one else "" for one in each]
+        both = sorted({*of["estimate"]} & {*of["stack"]})
+        pairs = numpy.array([of["estimate"][seed] - of["stack"][seed] for seed in both])
+        row.append("{:+.1f} [{:+.1f}, {:+.1f}]".format(*interval(pairs)) if len(pairs) else "")
+        deviation = PROBLEMS[name][4][LEVELS.index(level)]
+        print(f"| {name}, {TRAINING[name]['steps']:,} steps | {deviation:g} | " + " | ".join(row) + " |")
+
+
+def draw_episode(file: Path) -> None:
+    """Draw the angle of the pendulum, its readings, and the estimate with its 95 % band."""
+    from matplotlib.figure import Figure
+
+    env: Any = NoisyObservation(gymnasium.make("Pendulum-v1"), sensors_of("Pendulum-v1", "high"))
+    env = EstimatedObservation(env, show=("mean", "deviation"))
+    env.reset(seed=4)
+    rows = []
+    for _ in range(120):
+        found = env.estimates
+        angle, rate = env.unwrapped.state
+        rows.append([angle, rate, env.env.reading.values[0, 0], *found.mean[0], *found.deviation[0]])
+        env.step(pendulum(found.mean[0]))
+    t, (angle, rate, reading, mean, speed, sigma, own) = 0.05 * numpy.arange(120), numpy.array(rows).T
+    turn = 2.0 * math.pi
+    angle, reading, mean = (
+        one - turn * numpy.rint((one - angle[0]) / turn) for one in (angle, reading, mean)
+    )
+    angle, reading, mean = (numpy.unwrap(one) for one in (angle, reading, mean))
+    reading, mean = (one - turn * numpy.rint((one - angle) / turn) for one in (reading, mean))
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
+    for axis, truth, line, deviation, label in zip(
+        figure.subplots(2, 1, sharex=True), (angle, rate), (mean, speed), (sigma, own),
+        ("angle, rad", "rate, rad/s"), strict=True,
+    ):  # fmt: skip
+        axis.fill_between(t, line - 1.96 * deviation, line + 1.96 * deviation, color="tab:blue", alpha=0.2, lw=0,
+                          label="95 % of the filter")  # fmt: skip
+        if label.startswith("angle"):
+            axis.plot(t, reading, ".", color="0.6", ms=4, label="reading")
+        axis.plot(t, truth, color="black", lw=1.0, label="truth")
+        axis.plot(t, line, color="tab:blue", lw=1.3, label="estimate")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.25)
+    figure.axes[1].set_xlabel("time, s")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), ncols=4, frameon=False, loc="outside upper center")
+    figure.savefig(file, dpi=150)
 
 
 def main() -> None:
@@ -291,7 +317,13 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PROBLEMS, default=[*PROBLEMS], metavar="ENVIRONMENT")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("results/estimation_in_the_loop.jsonl"))
+    parser.add_argument(
+        "--picture", type=Path, help="draw an episode of the pendulum into this file, and end"
+    )
     given = parser.parse_args()
+    if given.picture:
+        draw_episode(given.picture)
+        return
     given.out.parent.mkdir(parents=True, exist_ok=True)
     found: dict[tuple[str, ...], Any] = {}
     if given.out.exists():
@@ -306,7 +338,8 @@ def main() -> None:
         found[cell] = result
         with given.out.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"cell": cell, "found": result}) + "\n")
-    print_tables(found, given.only)
+    print_fixed(found, given.only)
+    print_trained(found, given.only)
 
 
 if __name__ == "__main__":
