@@ -234,7 +234,7 @@ class Estimates:
             if available.all()
             else numpy.where(available.any(axis=1), found["nis"], 0.0)
         )
-        shown = present.T.copy(), numpy.sqrt(variance.T), nis
+        shown: tuple[Array, ...] = present.T.copy(), numpy.sqrt(variance.T), nis
         for i, period in self.turns:
             shown[0][:, i] -= period * numpy.rint(shown[0][:, i] / period)
         if lanes is not None:
@@ -277,7 +277,14 @@ class Estimates:
 
     def _send(self, values: Array, available: Array, interval: Array, inputs: Array) -> None:
         """Give a measurement to the filters; arrays ``(..., N)``, without this axis where there is one lane."""
-        parts = (values, available, interval, inputs if self.model.inputs else None, None, None)
+        parts: tuple[Any, ...] = (
+            values,
+            available,
+            interval,
+            inputs if self.model.inputs else None,
+            None,
+            None,
+        )
         if self._lanes == 1:
             parts = tuple(None if part is None else part[..., 0] for part in parts)
         self._update.arrive(StateSpaceMeasurement(*parts))
