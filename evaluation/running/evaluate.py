@@ -29,7 +29,7 @@ from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .kept import Kept, limits
-from .metrics import bootstrap_of
+from .metrics import bootstrap_of, units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
@@ -215,7 +215,7 @@ def run_experiment(
     for i, found in workers.run(run_piece, pieces, sizes, progress):
         kept.write(pieces[i].name, pieces[i].part, found)
     dataset = plan.dataset(kept, plan.seeds)
-    if isinstance(bootstrap := bootstrap_of(dataset), BlockBootstrap):
+    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
         dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
