@@ -198,6 +198,24 @@ def run_experiment(
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
             the control.
     """
+    dataset = run_competitors(experiment, competitors, progress, workers)
+    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
+        return dataset.assign_attrs(notes=with_sentence(dataset.attrs["notes"], bootstrap.sentence))
+    return dataset
+
+
+def with_sentence(notes: str, sentence: str) -> str:
+    """Return the notes of an evaluation with another one."""
+    return "\n".join(filter(None, [notes, sentence]))
+
+
+def run_competitors(
+    experiment: Experiment,
+    competitors: Mapping[str, Any],
+    progress: Progress | None = None,
+    workers: Workers | None = None,
+) -> "xarray.Dataset":
+    """Return the evaluation of :func:`run_experiment`, which says nothing of intervals yet."""
     if progress is not None and not callable(progress):
         raise ValueError(f"progress is a function of the measurements done, got {quote_shortened(progress)}")
     plan = plan_of(experiment, competitors)
@@ -215,8 +233,6 @@ def run_experiment(
     for i, found in workers.run(run_piece, pieces, sizes, progress):
         kept.write(pieces[i].name, pieces[i].part, found)
     dataset = plan.dataset(kept, plan.seeds)
-    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
-        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
     return dataset

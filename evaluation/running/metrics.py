@@ -97,8 +97,16 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
-    clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
-    return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
+    clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
+    return resampling(dataset.sizes["episode"], resamples, clusters)
+
+
+@functools.lru_cache(maxsize=2)
+def resampling(
+    episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
+) -> Bootstrap:
+    """Return the resampling of so many episodes, which takes a while where they are many."""
+    return Bootstrap(episodes, resamples, clusters=clusters)
 
 
 def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
@@ -142,48 +150,60 @@ class Reduced(NamedTuple):
     """What records need of one competitor; of one episode no more than units of time."""
 
     reduction: Reduction
-    measures: list[Measure]
-    """That need no resampling of the others."""
+    units: TimeUnits | None
+    """Of one long episode."""
+    series: numpy.ndarray | None
+    """As of :func:`sums_over_time`."""
+    predictions: list[Measure]
     run: "xarray.Dataset"
     """Its part of an evaluation, of whose variables none is needed."""
 
+    def without_variables(self) -> "Reduced":
+        """Return it without the variables of the evaluation, and at its first measurement."""
+        run = self.run.drop_vars(list(self.run.data_vars))
+        return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
 
-def reduce_competitor(
-    run: "xarray.Dataset", parts: Bootstrap | TimeUnits, metrics: OwnMetrics | None = None
-) -> Reduced:
+
+def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
     """Reduce one competitor's part of an evaluation to what its records need.
 
     Args:
         run: its part.
-        parts: what is resampled of the evaluation.
         metrics: the environment's own; left out for recordings.
     """
     # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
-    return Reduced(reduce_run(run, declare, parts), list(prediction_measures(run)), run)
+    units = units_of(run)
+    series = None if units is None else sums_over_time(run, units)
+    reduction = reduce_run(run, declare, units or bootstrap_of_episodes(run))
+    return Reduced(reduction, units, series, list(prediction_measures(run)), run)
+
+
+def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
+    """Resampling of an evaluation that was reduced, as of :func:`bootstrap_of`."""
+    if (units := reduced[0].units) is None:
+        return bootstrap_of_episodes(evaluation)
+    return bootstrap_over_time(units, [one.series for one in reduced])
 
 
 def records_of_reduced(
-    reduced: Sequence[Reduced],
-    evaluation: "xarray.Dataset",
-    bootstrap: Bootstrap,
-    metrics: OwnMetrics | None = None,
+    reduced: Sequence[Reduced], evaluation: "xarray.Dataset", metrics: OwnMetrics | None = None
 ) -> list[Record]:
     """Return every record of an evaluation.
 
     Args:
         reduced: all competitors, from :func:`reduce_competitor`.
-        evaluation: whose attributes say of what.
-        bootstrap: over its episodes, or over time.
+        evaluation: whose coordinates and attributes say of what.
         metrics: as of :func:`reduce_competitor`.
     """
     own = None if evaluation.attrs.get("recorded") else metrics
+    bootstrap = bootstrap_of_reduced(reduced, evaluation)
     blocks = bootstrap if isinstance(bootstrap, BlockBootstrap) else None
     contenders = []
     for one in reduced:
         contender = contender_of(one.reduction.results(blocks), one.run, bootstrap, own)
-        contenders.append(contender._replace(measures=[*contender.measures, *one.measures]))
+        contenders.append(contender._replace(measures=[*contender.measures, *one.predictions]))
     return records_of(contenders, evaluation, bootstrap)
 
 
@@ -531,15 +551,18 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
     Args:
         dataset: from an evaluation of a set of flights.
     """
-    records = []
+    parts = parts_by_flight(dataset)
+    return [r for part in parts for r in tidy_records(part) if r.metric in PER_FLIGHT]
+
+
+def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
+    """Yield the evaluation of each flight, whose scenario has its name, in the order of the names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
         part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # which copies them
         part = part.isel(time=slice(int(part["length"].max())))
         windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
-        part = with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
-        records += [r for r in tidy_records(part) if r.metric in PER_FLIGHT]
-    return records
+        yield with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
 
 
 PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "relative_cost_difference")
@@ -575,11 +598,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
         dataset: from an evaluation.
         metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
-    bootstrap = bootstrap_of(dataset)
-    parts = units_of(dataset) or bootstrap
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
-    reduced = [reduce_competitor(run, parts, metrics) for run in runs]
-    return records_of_reduced(reduced, dataset, bootstrap, metrics)
+    return records_of_reduced([reduce_competitor(run, metrics) for run in runs], dataset, metrics)
 
 
 def contender_of(

@@ -118,9 +118,7 @@ def reduce_run(
     return functools.reduce(Reduction.merge, parts)
 
 
-def _reduce_block(
-    statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUnits, first: int
-) -> Reduction:
+def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUnits, first: int) -> Reduction:
     found = Reduction({}, {}, {}, set(), {}, {})
     columns = 0
 

@@ -7,7 +7,7 @@ go on at the start, until they are as long as the episode. The length of the blo
 correction of Patton, Politis and White, Econometric Reviews 28, 2009). It supposes that what is averaged is stationary.
 Of long episodes blocks begin at every unit of a few measurements, whose sums are all that is kept of the episode.
 
-Where an episode holds few blocks there is no interval: the autocorrelation of a short series is estimated too small, and
+Of an episode of few blocks there is no interval: of a short series the autocorrelation is estimated too small, and
 the interval with it. Of first-order autoregressive processes the 95 % interval covers 90 to 97 % where there are
 ``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third (``tests/test_time_blocks.py``).
 Rules for the estimate of a correlation time lie on either side: 50 correlation times (emcee) and 1,000 (Sokal: Monte
@@ -118,9 +118,8 @@ class BlockBootstrap(Bootstrap):
     @property
     def sentence(self) -> str:
         """What the intervals are, or why there are none."""
-        rule = (
-            f"blocks of {self.block:,} measurements, by the rule of Politis and White (2004) from the autocorrelation"
-        )
+        blocks = f"blocks of {self.block:,} measurements, by the rule of Politis and White (2004)"
+        rule = f"{blocks} from the autocorrelation"
         if self.blocks < FEWEST_BLOCKS:
             return (
                 f"This one episode has no intervals: it holds {self.blocks:.0f} {rule}, and of fewer than "
