@@ -311,14 +311,21 @@ def combine_summaries(found: Sequence[Summary]) -> Evaluation:
     each = [one.curves for one in found if one.curves is not None]
     if len(each) < len(found):
         return Evaluation(evaluation, records, None, costs)
-    controls = [one.contender.control for one in found]
-    if len({control for control, own in zip(controls, each, strict=True) if own.actions}) > 1:
-        each = [
-            own._replace(actions=[f"{control}: {part}" for part in own.actions])
-            for control, own in zip(controls, each, strict=True)
-        ]
+    each = _actions_by_control(each, [one.contender.control for one in found])
     curves = stack_curves(each, evaluation, found[0].episodes)
     return Evaluation(evaluation, records, curves, costs)
+
+
+def _actions_by_control(
+    curves: Sequence[CompetitorCurves], controls: Sequence[str]
+) -> list[CompetitorCurves]:
+    """Name the actions of competitors that steer by several controls by these, too."""
+    if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
+        return list(curves)
+    return [
+        own._replace(actions=[f"{control}: {part}" for part in own.actions])
+        for control, own in zip(controls, curves, strict=True)
+    ]
 
 
 class Alone(NamedTuple):
@@ -373,7 +380,10 @@ def _run_alone(asked: EvaluationRequest, tick: Progress) -> Alone:
 
 @one_thread()
 def _combine_alone(
-    found: Mapping[str, Alone], evaluation: xarray.Dataset, metrics: OwnMetrics | None
+    found: Mapping[str, Alone],
+    curves: Sequence[CompetitorCurves],
+    evaluation: xarray.Dataset,
+    metrics: OwnMetrics | None,
 ) -> Evaluation:
     """Return the evaluation of all competitors over flights, a recording or one episode."""
     reduced = [one.reduced for one in found.values()]
@@ -387,7 +397,6 @@ def _combine_alone(
         for record in records_of_reduced(own, own[0].run, metrics)
         if record.metric in PER_FLIGHT
     ]
-    curves = [one.curves for one in found.values() if one.curves is not None]
     shown = evaluation.drop_vars(list(evaluation.data_vars))
     shown = shown.isel(time=spread(shown.sizes["time"], DRAWN_TIMES))
     return Evaluation(
@@ -414,7 +423,7 @@ def run_requests(
         workers: share the work.
         progress: called with the number of measurements done.
         store: as of :func:`summaries`.
-        whole: keep every number of every episode; flights and recordings have no summary.
+        whole: keep every number of every episode.
 
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
@@ -424,6 +433,7 @@ def run_requests(
         makers = {one.name: one.maker for one in asked}
         evaluation = run_competitors(first.experiment, makers, progress, workers)
         remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in asked]
+        curves = [one.curves for one in remains if one.curves is not None]
     elif first.episodes > 1 and not first.experiment.make_task().flights:
         found = dict(summaries(asked, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
@@ -432,10 +442,14 @@ def run_requests(
             check_sendable(first.experiment.task, {one.name: one.maker for one in asked})
         done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
         remains = [done[i] for i in range(len(asked))]
+        curves = [one.curves for one in remains if one.curves is not None]
+        curves = _actions_by_control(
+            curves, [str(one.head["control"].values) for one in remains][: len(curves)]
+        )
         evaluation = _heads_together(
             [one.head for one in remains], [one.losses for one in remains], remains[0].head.sizes["episode"]
         )
-    return _combine_alone(dict(zip(names, remains, strict=True)), evaluation, first.metrics)
+    return _combine_alone(dict(zip(names, remains, strict=True)), curves, evaluation, first.metrics)
 
 
 def _heads_together(
