@@ -215,7 +215,7 @@ def run_competitors(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> "xarray.Dataset":
-    """Return the evaluation of :func:`run_experiment`, which says nothing of intervals yet."""
+    """Return the evaluation of :func:`run_experiment`, without its note on intervals."""
     if progress is not None and not callable(progress):
         raise ValueError(f"progress is a function of the measurements done, got {quote_shortened(progress)}")
     plan = plan_of(experiment, competitors)

@@ -48,7 +48,7 @@ TOGETHER = 4 * BLOCK
 DRAWN_TIMES = 20_000
 """Measurements of an episode that pictures show, at most."""
 MOST_RECORDINGS = 40
-"""Episodes of a recording that are told one by one."""
+"""Episodes of a recording that are reported one by one."""
 BATCH = 600_000
 """Measurements that another process is given at once, where several pieces of work share a model: about a second. A
 longer batch would leave the others idle at the end, and lose more where the work is interrupted."""
@@ -120,7 +120,7 @@ class Evaluation(NamedTuple):
     costs: Mapping[str, numpy.ndarray]
     """Mean cost of every episode by name, ``(episodes,)``, of all whose cost is known."""
     flights: Sequence[Record] = ()
-    """Of every flight, where they are told one by one."""
+    """Of every flight, where they are reported one by one."""
     differences: Mapping[str, IntervalEstimate] = {}
     """Of a recording, by name, the log-likelihood per measurement less that of the best."""
 
@@ -443,9 +443,8 @@ def run_requests(
         done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
         remains = [done[i] for i in range(len(asked))]
         curves = [one.curves for one in remains if one.curves is not None]
-        curves = _actions_by_control(
-            curves, [str(one.head["control"].values) for one in remains][: len(curves)]
-        )
+        if curves:
+            curves = _actions_by_control(curves, [str(one.head["control"].values) for one in remains])
         evaluation = _heads_together(
             [one.head for one in remains], [one.losses for one in remains], remains[0].head.sizes["episode"]
         )

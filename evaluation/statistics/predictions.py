@@ -96,7 +96,7 @@ class LikelihoodSums(NamedTuple):
 
 
 def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
-    """Add up one competitor's log-likelihoods; None where it says none.
+    """Add up one competitor's log-likelihoods; None where it has none.
 
     Args:
         run: its part of an evaluation.

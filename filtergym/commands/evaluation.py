@@ -290,8 +290,9 @@ def run(
     """
     task = requests[0].experiment.make_task()
     measurements = sum(one.measurements for one in requests)
-    size = measurements * len(task.components) * 8
-    refusal = _size_warning(size, size, outputs.netcdf)
+    error = measurements * len(task.components) * 8
+    # And two costs, the causes and the NEES.
+    refusal = _size_warning(error + 4 * 8 * measurements, error, outputs.netcdf)
     written = outputs.folder is not None and not refusal
     whole = written or outputs.estimates is not None
     failures: dict[str, str] = {}
