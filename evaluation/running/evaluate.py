@@ -200,13 +200,8 @@ def run_experiment(
     """
     dataset = run_competitors(experiment, competitors, progress, workers)
     if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
-        return dataset.assign_attrs(notes=with_sentence(dataset.attrs["notes"], bootstrap.sentence))
+        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     return dataset
-
-
-def with_sentence(notes: str, sentence: str) -> str:
-    """Return the notes of an evaluation with another one."""
-    return "\n".join(filter(None, [notes, sentence]))
 
 
 def run_competitors(

@@ -19,24 +19,12 @@ from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
-from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece, with_sentence
+from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
 from .kept import DRAWN_PREFIX
 from .metrics import (
-    PER_FLIGHT,
-    Contender,
-    Record,
-    Reduced,
-    bootstrap_of_episodes,
-    bootstrap_of_reduced,
-    contender_of,
-    mean_over_time,
-    parts_by_flight,
-    record_statistics,
-    records_of,
-    records_of_reduced,
-    reduce_competitor,
-    resampling,
-)
+    PER_FLIGHT, Contender, Record, Reduced, bootstrap_of_episodes, bootstrap_of_reduced, contender_of, mean_over_time,
+    parts_by_flight, record_statistics, records_of, records_of_reduced, reduce_competitor, resampling,
+)  # fmt: skip
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
@@ -343,12 +331,7 @@ class Alone(NamedTuple):
 
 
 def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
-    """Reduce one competitor's part of an evaluation to what remains of it.
-
-    Args:
-        run: its part.
-        asked: of what it is.
-    """
+    """Reduce one competitor's part of an evaluation to what remains of it."""
     episodes, times = run.sizes["episode"], run.sizes["time"]
     flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
     if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
@@ -389,8 +372,8 @@ def _combine_alone(
     reduced = [one.reduced for one in found.values()]
     bootstrap = bootstrap_of_reduced(reduced, evaluation)
     if isinstance(bootstrap, BlockBootstrap):
-        notes = with_sentence(evaluation.attrs["notes"], bootstrap.sentence)
-        evaluation = evaluation.assign_attrs(notes=notes)
+        notes = filter(None, [evaluation.attrs["notes"], bootstrap.sentence])
+        evaluation = evaluation.assign_attrs(notes="\n".join(notes))
     flights = [
         record
         for own in zip(*(one.flights for one in found.values()), strict=True)
