@@ -127,13 +127,7 @@ def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | N
 def bootstrap_over_time(
     units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
 ) -> Bootstrap:
-    """Resampling of one episode, whose blocks are as long as all competitors need.
-
-    Args:
-        units: of the episode.
-        series: of every competitor, from :func:`sums_over_time`.
-        resamples: number of bootstrap samples.
-    """
+    """Resampling of one episode, whose blocks are as long as the ``series`` of all competitors need."""
     known = [one for one in series if one is not None]
     return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
 
@@ -165,12 +159,7 @@ class Reduced(NamedTuple):
 
 
 def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
-    """Reduce one competitor's part of an evaluation to what its records need.
-
-    Args:
-        run: its part.
-        metrics: the environment's own; left out for recordings.
-    """
+    """Reduce one competitor's part of an evaluation to what its records need; ``metrics`` not of recordings."""
     # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
     own = None if run.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)

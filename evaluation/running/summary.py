@@ -22,9 +22,21 @@ from .curves import CompetitorCurves, competitor_curves, curve_statistics, sprea
 from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
 from .kept import DRAWN_PREFIX
 from .metrics import (
-    PER_FLIGHT, Contender, Record, Reduced, bootstrap_of_episodes, bootstrap_of_reduced, contender_of, mean_over_time,
-    parts_by_flight, record_statistics, records_of, records_of_reduced, reduce_competitor, resampling,
-)  # fmt: skip
+    PER_FLIGHT,
+    Contender,
+    Record,
+    Reduced,
+    bootstrap_of_episodes,
+    bootstrap_of_reduced,
+    contender_of,
+    mean_over_time,
+    parts_by_flight,
+    record_statistics,
+    records_of,
+    records_of_reduced,
+    reduce_competitor,
+    resampling,
+)
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
