@@ -20,7 +20,7 @@ from .program import COMPARISONS, Graph, without_collection
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
 finfo = numpy.finfo
-bool = numpy.dtype("bool")
+bool: numpy.dtype = numpy.dtype("bool")
 pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
@@ -83,8 +83,8 @@ class Traced:
     __setitem__ = _refuse_entry
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
-        self.nodes = numpy.asarray(nodes)
-        self.dtype = numpy.dtype(dtype)
+        self.nodes: numpy.ndarray = numpy.asarray(nodes)
+        self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
         """Array of objects, on which NumPy's own arithmetic makes expressions, too."""

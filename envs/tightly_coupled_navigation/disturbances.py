@@ -51,8 +51,9 @@ class _OfSatellites(Disturbance):
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
-        self.task, self.satellites = task, task.satellites
-        self.places = task.constant(range(task.satellites))[:, None]
+        self.task = task
+        self.satellites: int = task.satellites
+        self.places: Array = task.constant(range(task.satellites))[:, None]
 
     def change_rows(self, values: Array, first: int, changed: Array) -> Array:
         """Values of the readings, ``(m, N)``, with some of them changed, from the first on."""
@@ -127,7 +128,8 @@ class _Hidden(_Once):
 class StuckAccelerometers(_Hidden):
     """The accelerometers repeat their last reading, its own state, m/s^2, ``(3, N)``."""
 
-    name, title = "stuck", "stick"
+    name = "stuck"
+    title = "stick"
     causes = (Cause("stuck accelerometers", "while the accelerometers are stuck", context_flag("stuck_now")),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
@@ -153,7 +155,8 @@ class StuckAccelerometers(_Hidden):
 class NoisyRate(_Hidden):
     """The rate of one satellite is noisier than stated, by a factor of its own, ``(N,)``."""
 
-    name, title = "noisy", "rate_fault"
+    name = "noisy"
+    title = "rate_fault"
     causes = (Cause("noisy rate", "while a pseudorange rate is too noisy", _is_noisy),)
 
     def draw_satellites(self, draws: Draws) -> Array:
@@ -179,7 +182,8 @@ class NoisyRate(_Hidden):
 class HiddenSatellites(_Once):
     """Two satellites are gone."""
 
-    name, title = "hidden", "satellites_outage"
+    name = "hidden"
+    title = "satellites_outage"
     causes = (Cause("range lost", "where a pseudorange is missing", _lacks_range),)
 
     def draw_satellites(self, draws: Draws) -> Array:
@@ -202,7 +206,8 @@ class HiddenSatellites(_Once):
 class LostRates(_Once):
     """No satellite has a rate."""
 
-    name, title = "no_rates", "rates_outage"
+    name = "no_rates"
+    title = "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:
@@ -262,8 +267,8 @@ class Reflections(_OfSatellites):
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
-        self.row_uniforms = self.satellites if self.parameters.urban else 0
-        self.normals = 2 * self.row_uniforms
+        self.row_uniforms: int = self.satellites if self.parameters.urban else 0
+        self.normals: int = 2 * self.row_uniforms
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Reception:
         """Draw C/N0, in open country too: every scenario takes the same numbers."""

@@ -38,13 +38,13 @@ class BlockBootstrap(Bootstrap):
     def __init__(self, series: numpy.ndarray, resamples: int = RESAMPLES, seed: int = 0) -> None:
         super().__init__(1, 0)
         times = series.shape[1]
-        self.unit = -(-times // UNITS)
-        self.units = -(-times // self.unit)
+        self.unit: int = -(-times // UNITS)
+        self.units: int = -(-times // self.unit)
         known = ~numpy.isnan(series)
         sums, present = (self.cut(each).sum(axis=-1) for each in (numpy.where(known, series, 0.0), known))
         means = numpy.divide(sums, present, out=numpy.full(sums.shape, math.nan), where=present > 0.0)
         length = max(map(block_length, means))
-        self.block = length * self.unit
+        self.block: int = length * self.unit
         generator = numpy.random.default_rng(seed)
         begins = generator.integers(self.units, size=(resamples, -(-self.units // length)))
         self._counts = numpy.ones((1 + resamples, self.units), dtype=numpy.int64)
@@ -52,7 +52,7 @@ class BlockBootstrap(Bootstrap):
             ends = numpy.bincount(own + length, minlength=2 * self.units)
             twice = numpy.cumsum(numpy.bincount(own, minlength=2 * self.units) - ends[: 2 * self.units])
             counts[:] = twice[: self.units] + twice[self.units :]
-        self.totals = self._counts.sum(axis=1)
+        self.totals: numpy.ndarray = self._counts.sum(axis=1)
 
     def cut(self, values: numpy.ndarray) -> numpy.ndarray:
         """Cut values ``(n, time)`` into units, ``(n, units, unit)``; zero beyond the end."""
