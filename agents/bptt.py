@@ -100,10 +100,11 @@ class NetworkPolicy(torch.nn.Module):
         inside = numpy.clip((first - middle) / half, -NEAREST, NEAREST)
         kept = observations if fields_kept is None else check_integer("fields_kept", fields_kept, 1)
         self.fields_kept: int = min(observations, kept)
-        self.gru = torch.nn.GRUCell(observations, hidden_size) if network == "recurrent" else None
+        self.gru: Any = torch.nn.GRUCell(observations, hidden_size) if network == "recurrent" else None
         hidden = [torch.nn.Linear(observations, hidden_size)] if network == "feedforward" else []
-        self.hidden = torch.nn.ModuleList(hidden)
-        self.head = torch.nn.Linear(observations if network == "linear" else hidden_size, space.shape[0])
+        self.hidden: torch.nn.ModuleList = torch.nn.ModuleList(hidden)
+        inputs = observations if network == "linear" else hidden_size
+        self.head: torch.nn.Linear = torch.nn.Linear(inputs, space.shape[0])
         with torch.no_grad():
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
@@ -345,7 +346,7 @@ class Descent:
         )
         self.learning_rate: Callable[[float], float] = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()
-        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
+        self.optimiser: Any = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
         step_eagerly(self.optimiser)
         self.steps_done: int = 0
 

@@ -69,8 +69,8 @@ class Sb3Policy:
         name: str = "",
     ) -> None:
         self.model = model
-        self.observation_space = model.observation_space
-        self.action_space = model.action_space
+        self.observation_space: Any = model.observation_space
+        self.action_space: Any = model.action_space
         self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
         self.task_keywords: dict[str, Any] = _reach(model)
         if control is not None:

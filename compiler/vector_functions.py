@@ -71,7 +71,8 @@ class VectorFunction:
         self._value = _program(graph, answer.nodes.tolist())
         self._jacobian = _program(graph, nodes)
         known = [graph.values[node] for node in nodes]
-        self.matrix = self.offset = None
+        self.matrix: numpy.ndarray | None = None
+        self.offset: numpy.ndarray | None = None
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]

@@ -140,7 +140,8 @@ class ExactBayes(Filter[RadarEsmTracking, Measurement, ClassState]):
 
     def __init__(self, task: RadarEsmTracking, prior: ClassPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         p = task.parameters
         self.classes: int = task.classes
         self.spacing: int = p.esm_period

@@ -373,7 +373,8 @@ class ColouredErrors(Disturbance):
         super().__init__(task)
         self.interval = interval
         self.count = count
-        self.initial_normals = self.normals = count if present else 0
+        self.normals: int = count if present else 0
+        self.initial_normals: int = self.normals
 
     @abstractmethod
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:

@@ -266,7 +266,9 @@ class DecisionMeans:
 
     def __init__(self, fields: Sequence[Field], interval: int) -> None:
         self.interval = interval
-        self.columns = [i for i, f in enumerate(fields) if f.over_interval == "mean"] if interval > 1 else []
+        self.columns: list[int] = [
+            i for i, f in enumerate(fields) if interval > 1 and f.over_interval == "mean"
+        ]
 
     def add(self, total: Array, observation: Array) -> Array:
         """Add these fields of an observation, ``(fields, N)``, to their sum since the last decision."""

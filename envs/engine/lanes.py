@@ -22,6 +22,7 @@ from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.array_namespace import host_array, map_nested
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
+from ..contract.task import Task
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
@@ -266,7 +267,8 @@ class Lanes:
         report: Report | None = None,
     ) -> None:
         self.model = model
-        self.task = task = model.task
+        self.task: Task = model.task
+        task = self.task
         self.count: int = count
         self.width: int = round_up_lanes(count)
         self.beside = beside

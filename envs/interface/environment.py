@@ -80,8 +80,8 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self._late: LatePicture | None = None
         if render_mode is not None:
             self._picture_of(self._first_distribution.names[0])
-        self.observation_space = self._observation_space()
-        self.action_space = self.model.action_space
+        self.observation_space: gymnasium.Space[Any] = self._observation_space()
+        self.action_space: gymnasium.Space[Any] = self.model.action_space
         is_row = isinstance(self.action_space, gymnasium.spaces.Box) and len(self.action_space.shape) == 1
         self._plain_action = self.action_space.shape if is_row else None
 

@@ -144,10 +144,10 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 )
             name = self._first_distribution.names[0]
             self.pictures = EpisodePictures(self.model, name, num_envs, FRAMES_PER_SECOND)
-        self.single_observation_space = self._observation_space()
-        self.single_action_space = self.model.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.single_observation_space: gymnasium.Space[Any] = self._observation_space()
+        self.single_action_space: gymnasium.Space[Any] = self.model.action_space
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
         self._in_use = _OneThread()
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)

@@ -296,7 +296,9 @@ class Equations:
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
         self.channels: tuple[Channel, ...] = task.definition.channels
-        self.periods = {row: one.period for one in self.channels if one.period for row in one.numbers}
+        self.periods: dict[int, float] = {
+            i: one.period for one in self.channels if one.period for i in one.numbers
+        }
         """Of the numbers of a measurement that are angles."""
         self.angles: dict[int, float] = task.periods
         self.gated: bool = any(channel.gate for channel in self.channels)

@@ -94,7 +94,8 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
         self.loses: bool = self.parameters.availability < 1.0
         self.drawn: int = int(self.switches) + int(self.jitters) + int(self.loses)
         usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
-        self.receptions = Receptions(task.parameters, task.xp, own.channels, numpy.sqrt(numpy.diag(usual)))
+        deviations = numpy.sqrt(numpy.diag(usual))
+        self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
         self.delayed: int = self.drawn + self.receptions.row_uniforms
         self.delays: bool = self.parameters.late > 0.0
         self.row_uniforms: int = self.delayed + len(own.channels) * self.delays

@@ -55,7 +55,8 @@ class HypothesesBank(SettingsBank, KalmanBucyBank):
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
         prior = self.own.prior
-        self.noise_names = ("modelled", *(f"point_{j}" for j in range(1, prior.points + 1)))
+        points = (f"point_{j}" for j in range(1, prior.points + 1))
+        self.noise_names: tuple[str, ...] = ("modelled", *points)
         self.groups: tuple[str, ...] = (*self.noise_names, "young_pull", "old_pull")
         """Of hypotheses whose probabilities are shown: by their noises, and those of pulls too young to end, or not."""
         self.level_names: tuple[str, ...] = tuple(str(i) for i in range(1, len(prior.levels) + 1))

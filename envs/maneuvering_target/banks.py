@@ -486,7 +486,7 @@ class GainsBank(FilterBank):
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
-        self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
+        self.logit: Array = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

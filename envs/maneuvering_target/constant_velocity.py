@@ -23,7 +23,7 @@ class ConstantVelocityModel:
         moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
         self.unmoved: Array = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
         self.moved: Array = task.constant(moved)[:, :, None] - self.unmoved
-        self.correlated = task.constant([[float(entry > 0.0) for entry in row] for row in noise])[:, :, None]
+        self.correlated: Array = task.constant([[float(q > 0.0) for q in row] for row in noise])[:, :, None]
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
         self.identity: Array = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 

@@ -157,7 +157,8 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         self.settings: Mapping[str, float] = {
             "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25
         }  # fmt: skip
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         self.ages: int = len(prior.hazards)
         self.hazard: Array = task.constant(prior.hazards)[:, None]
         sizes = [(size, prior.turn_spread, 1.0 - prior.hard_turns) for size in prior.turns]

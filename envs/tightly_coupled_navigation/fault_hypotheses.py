@@ -188,7 +188,8 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
             "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,
             "motion": 2.0, "pseudoranges": 2.0, "rates": 2.0, "accelerometers": 4.0,
         }  # fmt: skip
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
         self.size = n
         noise, known = numpy.zeros((n, n, 3, 1)), gnss_ins.SIZE

@@ -25,7 +25,7 @@ MOTION_ROW = -1.0
 """Where the true hypothesis is drawn below the faults."""
 LEAST_REACH = 30.0
 """Half width of the course that is shown at least, m."""
-ACTIONS = {
+ACTIONS: dict[str, tuple[str, ...]] = {
     "gain": ("action",),
     "robust": ("action", "readings"),
     "hypotheses": ("action: odds", "noises"),

@@ -67,7 +67,8 @@ class HypothesesBank(SettingsBank, AutopilotBank):
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         prior = self.own.prior
-        self.names = ("designed", *(f"level_{i}" for i in range(1, prior.gust_points + 1)))
+        levels = (f"level_{i}" for i in range(1, prior.gust_points + 1))
+        self.names: tuple[str, ...] = ("designed", *levels)
         """Of the hypotheses of each kind."""
         self.gust_levels: Array = grid(prior.gusts, prior.gust_points)
         self.sensor_limits: tuple[float, ...] = tuple(math.log(limit) for limit in prior.sensors)

@@ -131,7 +131,8 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
 
     def __init__(self, task: AutopilotProblem, prior: LevelPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         p, constant, n = task.parameters, task.constant, len(task.components)
         sensors, sigmas = list(task.sensors), p.value("sensor_sigmas")
         slow = [sensor for sensor in prior.slow if sensor in sensors]
@@ -177,7 +178,8 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         self.believed: Array = constant(believed)[:, :, None]
         self.variances: list[Array] = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
         self.wide: list[float] = [R * prior.outlier_factor**2 for R in task.sensor_variances]
-        self.settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0, **dict.fromkeys(sensors, 1.5)}
+        settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0}
+        self.settings: dict[str, float] = {**settings, **dict.fromkeys(sensors, 1.5)}
         heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
         self.raised: Array = constant(raised)[:, :, None]

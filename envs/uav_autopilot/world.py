@@ -98,8 +98,10 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         self.F, self.B = constant(plant.F), constant(plant.B)
         self.sensor_sigmas: Array = constant(p.value("sensor_sigmas"))[:, None]
         self.initial_sigmas: Array = constant(p.value("initial_sigmas"))[:, None]
-        self.initial_covariance = constant(numpy.diag(numpy.square(p.value("initial_sigmas"))))[:, :, None]
-        self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
+        self.initial_covariance: Array = constant(numpy.diag(numpy.array(p.value("initial_sigmas")) ** 2))[
+            :, :, None
+        ]
+        self.weights: list[Any] = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
         self.optimal: Regulator | None = task.design.optimal
         self.manoeuvres: int = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0

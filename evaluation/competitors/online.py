@@ -15,7 +15,7 @@ import numpy
 
 from ...compiler.functions import leaves, map_arrays, round_up_lanes
 from ...envs.contract.companions import LostTracks, find_companion
-from ...envs.contract.live_input import LiveReader
+from ...envs.contract.live_input import LiveInput, LiveReader
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
@@ -76,7 +76,8 @@ class OnlineFilter:
         self.watch = watch
         self.task: Task = model.task
         world: Any = self.task.world
-        self.input = LiveReader.of(self.task).input(self.task, world.initial, world.measurement, tracks)
+        reader = LiveReader.of(self.task)
+        self.input: LiveInput = reader.input(self.task, world.initial, world.measurement, tracks)
         self._is_policy, interval = kind == "policy", self.task.decision_interval
         self._interval, self._means = interval, DecisionMeans(model.fields, interval)
         self.model: Model = model if self._is_policy else put_in_loop(model, competitor, kind, name, tracks)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy
 
 from ...compiler import namespace
@@ -58,7 +59,7 @@ class Decider:
         self.xp: ModuleType = model.task.xp
         self.ask = act
         self._shapes = [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
-        self.space = model.action_space
+        self.space: gymnasium.Space[Any] = model.action_space
         self.size: int = math.prod(self.space.shape or (1,))
         self.interval: int = model.task.decision_interval if interval is None else interval
         self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)

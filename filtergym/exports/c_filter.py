@@ -46,7 +46,8 @@ class FilterText:
         self.scalar = scalar
         self.components = components
         self.about: list[str] = []
-        self.name = own = file_stem(name)
+        self.name: str = file_stem(name)
+        own = self.name
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
         parts["estimate"] = traced.estimate
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}

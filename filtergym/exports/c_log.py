@@ -19,7 +19,7 @@ from .traced_filter import TracedFilter
 if TYPE_CHECKING:
     from .request import ExportRequest
 
-READING = {
+READING: dict[str, float] = {
     "SINCE_1970": SINCE_1970,
     "DAY": DAY,
     "LARGEST": LARGEST,
