@@ -34,9 +34,7 @@ class ClassAlarm(Alarm):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         p = self.task.parameters
-        self.decisions: int = (
-            p.horizon
-        )  # an episode holds so many ESM decisions, however long an action holds
+        self.decisions: int = p.horizon  # an episode's ESM decisions, however long an action holds
         self.squared: Reader = model.reader("log_squared_innovation")
         self.log_likelihood: Reader = model.reader("log_likelihood")
         self.last_weight: Reader = model.reader("last_weight")

@@ -296,9 +296,7 @@ class Equations:
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
         self.channels: tuple[Channel, ...] = task.definition.channels
-        self.periods: dict[int, float] = {
-            i: one.period for one in self.channels if one.period for i in one.numbers
-        }
+        self.periods: dict[int, float] = {i: c.period for c in self.channels if c.period for i in c.numbers}
         """Of the numbers of a measurement that are angles."""
         self.angles: dict[int, float] = task.periods
         self.gated: bool = any(channel.gate for channel in self.channels)

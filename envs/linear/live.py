@@ -8,7 +8,6 @@ import numpy
 from ...compiler.vector_functions import VectorFunction
 from ..contract.live_input import LiveInput, Memory
 from .equations import StateSpaceDefinition, StateSpaceProblem, find_invalid_noise
-from .sensors import Channel
 
 UNEVEN = 0.01
 """Share of the sampling interval by which a time may be off, as in tables of regular measurements."""
@@ -24,9 +23,7 @@ class StateSpaceInput(LiveInput):
         self.definition: StateSpaceDefinition = task.definition
         self.measured: tuple[str, ...] = tuple(task.definition.measured)
         self.inputs: tuple[str, ...] = tuple(task.definition.inputs)
-        self.groups: list[Channel] = [
-            c for c in task.definition.channels if c.name not in (*self.measured, "values")
-        ]
+        self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
         self.fuses: bool = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)

@@ -128,8 +128,7 @@ class _Hidden(_Once):
 class StuckAccelerometers(_Hidden):
     """The accelerometers repeat their last reading, its own state, m/s^2, ``(3, N)``."""
 
-    name = "stuck"
-    title = "stick"
+    name, title = "stuck", "stick"
     causes = (Cause("stuck accelerometers", "while the accelerometers are stuck", context_flag("stuck_now")),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Fault:
@@ -155,8 +154,7 @@ class StuckAccelerometers(_Hidden):
 class NoisyRate(_Hidden):
     """The rate of one satellite is noisier than stated, by a factor of its own, ``(N,)``."""
 
-    name = "noisy"
-    title = "rate_fault"
+    name, title = "noisy", "rate_fault"
     causes = (Cause("noisy rate", "while a pseudorange rate is too noisy", _is_noisy),)
 
     def draw_satellites(self, draws: Draws) -> Array:
@@ -182,8 +180,7 @@ class NoisyRate(_Hidden):
 class HiddenSatellites(_Once):
     """Two satellites are gone."""
 
-    name = "hidden"
-    title = "satellites_outage"
+    name, title = "hidden", "satellites_outage"
     causes = (Cause("range lost", "where a pseudorange is missing", _lacks_range),)
 
     def draw_satellites(self, draws: Draws) -> Array:
@@ -206,8 +203,7 @@ class HiddenSatellites(_Once):
 class LostRates(_Once):
     """No satellite has a rate."""
 
-    name = "no_rates"
-    title = "rates_outage"
+    name, title = "no_rates", "rates_outage"
     causes = (Cause("rate lost", "where a pseudorange rate is missing", _lacks_rate),)
 
     def change_measurement(self, state: Fault, measurement: Any, step: DisturbanceInput) -> tuple[Fault, Any]:

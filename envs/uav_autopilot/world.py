@@ -98,9 +98,8 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
         self.F, self.B = constant(plant.F), constant(plant.B)
         self.sensor_sigmas: Array = constant(p.value("sensor_sigmas"))[:, None]
         self.initial_sigmas: Array = constant(p.value("initial_sigmas"))[:, None]
-        self.initial_covariance: Array = constant(numpy.diag(numpy.array(p.value("initial_sigmas")) ** 2))[
-            :, :, None
-        ]
+        variances = numpy.square(p.value("initial_sigmas"))
+        self.initial_covariance: Array = constant(numpy.diag(variances))[:, :, None]
         self.weights: list[Any] = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
         self.optimal: Regulator | None = task.design.optimal
