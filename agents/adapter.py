@@ -80,20 +80,21 @@ class TaskVecEnv(VecEnv):
 
     def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env
-        self.residual_to, self.gate = residual_to, gate
+        self.residual_to = residual_to
+        self.gate = gate
         self._policy_memory: Any = None
         self._gate_memory: Any = None
         self._shown: Any = None
         self._start = numpy.ones(env.num_envs, dtype=bool)
         self.staggered = staggered
-        self.started = time.time()
-        self.returns = numpy.zeros(env.num_envs)
+        self.started: float = time.time()
+        self.returns: numpy.ndarray = numpy.zeros(env.num_envs)
         """Sum of rewards of the running episodes."""
-        self.lengths = numpy.zeros(env.num_envs, dtype=int)
+        self.lengths: numpy.ndarray = numpy.zeros(env.num_envs, dtype=int)
         """Decisions taken in them."""
         self._actions: Any = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self.metadata = env.metadata
+        self.metadata: dict[str, Any] = env.metadata
 
     def reset(self) -> Any:
         """Start new episodes with the seeds given to :meth:`seed` and the options given to :meth:`set_options`.

@@ -21,7 +21,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import gymnasium
 import numpy
@@ -99,11 +99,12 @@ class NetworkPolicy(torch.nn.Module):
             raise ValueError(f"first_action must be an action of {space}, got {first_action!r}")
         inside = numpy.clip((first - middle) / half, -NEAREST, NEAREST)
         kept = observations if fields_kept is None else check_integer("fields_kept", fields_kept, 1)
-        self.fields_kept = min(observations, kept)
-        self.gru = torch.nn.GRUCell(observations, hidden_size) if network == "recurrent" else None
+        self.fields_kept: int = min(observations, kept)
+        self.gru: Any = torch.nn.GRUCell(observations, hidden_size) if network == "recurrent" else None
         hidden = [torch.nn.Linear(observations, hidden_size)] if network == "feedforward" else []
-        self.hidden = torch.nn.ModuleList(hidden)
-        self.head = torch.nn.Linear(observations if network == "linear" else hidden_size, space.shape[0])
+        self.hidden: torch.nn.ModuleList = torch.nn.ModuleList(hidden)
+        inputs = observations if network == "linear" else hidden_size
+        self.head: torch.nn.Linear = torch.nn.Linear(inputs, space.shape[0])
         with torch.no_grad():
             # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
@@ -327,13 +328,14 @@ class Descent:
                 f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} "
                 f"has {space}: choose dqn or ppo, or another control"
             )
-        self.run, self.values = run, run.hyperparameters
+        self.run = run
+        self.values: dict[str, Any] = run.hyperparameters
         torch.manual_seed(run.seed)
-        self.env = _environment(run)
+        self.env: TaskVectorEnv = _environment(run)
         run.backend = self.env.backend
         self.env.reset(seed=episode_seeds("train", run.seed, run.envs))
         values = self.values
-        self.policy = NetworkPolicy(
+        self.policy: NetworkPolicy = NetworkPolicy(
             len(self.env.model.fields),
             space,
             values["hidden_size"],
@@ -342,11 +344,11 @@ class Descent:
             values.get("fields_kept"),
             values.get("longest_memory"),
         )
-        self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
+        self.learning_rate: Callable[[float], float] = schedule("learning_rate", self.values["learning_rate"])
         exclude_from_compilation()
-        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
+        self.optimiser: Any = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
         step_eagerly(self.optimiser)
-        self.steps_done = 0
+        self.steps_done: int = 0
 
     def flight(self) -> Callable[[Callable[[], None]], float]:
         """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""

@@ -73,7 +73,8 @@ class EnvelopeAlarm(Alarm):
 
     def __init__(self, model: Model, range: TrainingRange) -> None:
         super().__init__(model)
-        self.range, self.columns = range, model.columns(range.fields)
+        self.range = range
+        self.columns: list[int] = model.columns(range.fields)
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh every field for itself."""
@@ -95,7 +96,9 @@ class NetworkWatch:
     """
 
     def __init__(self, model: Model, range: TrainingRange, observe: Report | None = None) -> None:
-        self.range, self.columns, self.observe = range, model.columns(range.fields), observe
+        self.range = range
+        self.columns: list[int] = model.columns(range.fields)
+        self.observe = observe
         self.memory: numpy.ndarray | None = None
 
     def look(self, observation: numpy.ndarray, start: numpy.ndarray) -> None:

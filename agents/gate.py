@@ -39,6 +39,7 @@ from ..evaluation.competitors.kinds import (
     make_competitor,
     says_traceable,
 )
+from ..evaluation.competitors.steered_filter import Decider
 from ..evaluation.running.evaluate import control_of
 from ..evaluation.running.metrics import mean_cost
 from .envelope import EnvelopeAlarm, TrainingRange, training_range
@@ -68,10 +69,10 @@ class FallbackAction(ConstantPolicy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.control = model.control  # type: ignore[misc]  # made for it
+        self.control: str = model.control  # type: ignore[misc]  # made for it
         own, space = getattr(model.task, "paper_policy", None), model.action_space
         if own is not None and own.control == model.control:
-            self.action = tuple(own.action)
+            self.action: tuple[float, ...] = tuple(own.action)
         elif isinstance(space, gymnasium.spaces.Box) and (space.low < 0.0).all() and (space.high > 0.0).all():
             self.action = (0.0,) * space.shape[0]
         else:
@@ -116,10 +117,10 @@ class Trust:
     ) -> None:
         alarm = alarm or Problem.of(type(model.task)).baselines.alarm or InnovationAlarm
         self.alarm: Alarm = make_competitor(alarm, model)
-        self.window = self.alarm.window if window is None else window
+        self.window: int = self.alarm.window if window is None else window
         if self.window < 1:
             raise ValueError(f"window must be at least one decision, got {self.window!r}")
-        self.envelope = None if envelope is None else EnvelopeAlarm(model, envelope)
+        self.envelope: EnvelopeAlarm | None = None if envelope is None else EnvelopeAlarm(model, envelope)
 
     def listen(
         self, observation: numpy.ndarray, memory: TrustMemory | None, start: numpy.ndarray
@@ -174,7 +175,7 @@ class Gate:
     def __init__(
         self, model: Model, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
-        self.trust = Trust(model, alarm, window)
+        self.trust: Trust = Trust(model, alarm, window)
         self.fallback: Any = check_competitor(
             "fallback", make_competitor(fallback or FallbackAction, model), "policy"
         )
@@ -232,14 +233,14 @@ class Gated(Policy):
         self, model: Model, policy: Any, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
         super().__init__(model)
-        self.control = model.control  # type: ignore[misc]  # made for it
-        self.policy = check_competitor("policy", make_competitor(policy, model), "policy")
+        self.control: str = model.control  # type: ignore[misc]  # made for it
+        self.policy: Any = check_competitor("policy", make_competitor(policy, model), "policy")
         own = getattr(self.policy, "control", model.control)
         if own != model.control:
             raise ValueError(f"the policy is made for control {own!r}, but the task has {model.control!r}")
-        self.gate = Gate(model, fallback, alarm, window)
+        self.gate: Gate = Gate(model, fallback, alarm, window)
         parts = self.policy, self.gate.fallback
-        self.traceable = all(map(says_traceable, parts))  # type: ignore[misc]  # of these two
+        self.traceable: bool = all(map(says_traceable, parts))  # type: ignore[misc]  # of these two
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory] | None:
@@ -279,8 +280,9 @@ class ListeningPolicy(Policy):
 
     def __init__(self, policy: Any, trust: Trust, model: Model) -> None:
         super().__init__(model)
-        self.control = model.control  # type: ignore[misc]  # made for it
-        self.policy, self.trust = policy, trust
+        self.control: str = model.control  # type: ignore[misc]  # made for it
+        self.policy = policy
+        self.trust = trust
 
     def act(
         self, observation: numpy.ndarray, state: ListeningMemory | None, start: numpy.ndarray
@@ -329,10 +331,12 @@ class GatedEstimator(Filter[Any, Any, GatedState]):
 
     def __init__(self, agent: LearnedEstimator, fallback: Filter[Any, Any, Any]) -> None:
         super().__init__(agent.task)
-        self.agent, self.fallback = agent, fallback
-        self.network, self.decider = agent.network, agent.decider
+        self.agent = agent
+        self.fallback = fallback
+        self.network: Policy = agent.network
+        self.decider: Decider = agent.decider
         policy: Any = agent.network
-        self.in_python = fallback.in_python or not says_traceable(policy.policy)
+        self.in_python: bool = fallback.in_python or not says_traceable(policy.policy)
 
     def start(self, initial: Any) -> GatedState:
         """Start both where everyone starts."""
@@ -447,17 +451,20 @@ class GatedMaker:
                 f"{name!r} is of kind {kind_of(maker)} and has no actions that follow from what is measured: an alarm "
                 "has nothing to listen to"
             )
-        self.problem, self.name, self.maker = problem, name, maker
-        self.fallback = fallback or problem.baselines.fallback or problem.paper
-        self.alarm, self.window = alarm, window
+        self.problem = problem
+        self.name = name
+        self.maker = maker
+        self.fallback: str = fallback or problem.baselines.fallback or problem.paper
+        self.alarm = alarm
+        self.window = window
         learned = isinstance(maker, EstimatorMaker)
         self._policy = maker.policy if learned else maker
         self._is_asked_always = learned
-        self.control = maker.bank if learned else control_of(maker, None, problem.task, name)
-        self.task_keywords = getattr(maker, "task_keywords", {})
+        self.control: str = maker.bank if learned else control_of(maker, None, problem.task, name)
+        self.task_keywords: Any = getattr(maker, "task_keywords", {})
         self._fallback = problem.competitor(self.fallback)
         self._check_fallback()
-        self.envelope = training_range(problem.task, maker)
+        self.envelope: TrainingRange | None = training_range(problem.task, maker)
         """What the agent saw in its training; None where nobody knows."""
 
     def _check_fallback(self) -> None:
@@ -546,7 +553,8 @@ class PolicyMaker:
     kind = "policy"
 
     def __init__(self, maker: Any, wrap: Callable[[Model, Any], Any], control: str | None = None) -> None:
-        self.maker, self.wrap = maker, wrap
+        self.maker = maker
+        self.wrap = wrap
         expose_spaces(self, maker, "control", "task_keywords")
         if control is not None:
             self.control = control

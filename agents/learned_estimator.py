@@ -56,7 +56,8 @@ class EstimatorMaker:
     traced_as: ClassVar[str] = "learned estimator"
 
     def __init__(self, bank: str, policy: Callable[[Model], Policy]) -> None:
-        self.bank, self.policy = bank, policy
+        self.bank = bank
+        self.policy = policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
         """Make it."""

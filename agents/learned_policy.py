@@ -94,12 +94,13 @@ class LearnedPolicy(Policy):
         fields: Sequence[str] | None = None,
     ) -> None:
         super().__init__(model)
-        self.control = model.control  # type: ignore[misc]  # as it was trained
-        self.columns = slice(None) if fields is None else model.columns(fields)
+        self.control: str = model.control  # type: ignore[misc]  # as it was trained
+        self.columns: slice | list[int] = slice(None) if fields is None else model.columns(fields)
         arrays = {name: values.astype(numpy.float64) for name, values in arrays.items()}
-        self.arrays, self.output = arrays, output
-        self.activation = ACTIVATIONS[activation]
-        self.layers = [
+        self.arrays = arrays
+        self.output = output
+        self.activation: Callable[[numpy.ndarray], numpy.ndarray] = ACTIVATIONS[activation]
+        self.layers: list[tuple[numpy.ndarray, numpy.ndarray]] = [
             (arrays[f"weight_{i}"], arrays[f"bias_{i}"])
             for i in range(sum(name.startswith("weight_") for name in arrays))
         ]
@@ -301,9 +302,9 @@ class StoredPolicy:
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = read_arrays(path)
         ends = [self.arrays.pop(name) for name in ENVELOPE if name in self.arrays]
-        self.envelope = (ends[0], ends[1]) if ends else None
+        self.envelope: tuple[numpy.ndarray, numpy.ndarray] | None = (ends[0], ends[1]) if ends else None
         self.path = path
-        self.control = self.header["control"]
+        self.control: str = self.header["control"]
         self.around = self.header["run"].get("residual_to", ""), self.header["run"].get("gated", False)
         hyperparameters = self.header["run"].get("hyperparameters", {})
         self._keywords: dict[str, Any] = hyperparameters.get("env_kwargs", {})

@@ -66,9 +66,10 @@ class ResidualPolicy(Policy):
     def __init__(self, model: Model, policy: Any, agent: Any) -> None:
         super().__init__(model)
         check_residual(model, policy)
-        self.control = model.control  # type: ignore[misc]
-        self.policy, self.agent = policy, agent
-        self.traceable = says_traceable(policy) and says_traceable(agent)  # type: ignore[misc]  # of these two
+        self.control: str = model.control  # type: ignore[misc]
+        self.policy = policy
+        self.agent = agent
+        self.traceable: bool = says_traceable(policy) and says_traceable(agent)  # type: ignore[misc]  # of these two
         expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any] | None:

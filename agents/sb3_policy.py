@@ -69,9 +69,10 @@ class Sb3Policy:
         name: str = "",
     ) -> None:
         self.model = model
-        self.observation_space, self.action_space = model.observation_space, model.action_space
+        self.observation_space: Any = model.observation_space
+        self.action_space: Any = model.action_space
         self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
-        self.task_keywords = _reach(model)
+        self.task_keywords: dict[str, Any] = _reach(model)
         if control is not None:
             self.control = control
         name = name or f"this model of {type(model).__name__}"

@@ -154,14 +154,18 @@ class Bookkeeping:
         began: float | None = None,
     ) -> None:
         claim_folder(session.folder)
-        self.began = time.monotonic() if began is None else began
-        self.run, self.stop, self.log = run, stop, log
-        self.folder, self.interval = session.folder, session.steps_between_validations(run)
-        self.report, self.validated = session.report, session.validated
+        self.began: float = time.monotonic() if began is None else began
+        self.run = run
+        self.stop = stop
+        self.log = log
+        self.folder: Path = session.folder
+        self.interval: int = session.steps_between_validations(run)
+        self.report: Callable[[str], None] = session.report
+        self.validated: Callable[[ValidationEntry], bool] = session.validated
         self.policy, self.save_checkpoint, self.save_agent = trainee
-        self.validation = Validation(run)
-        self.due = run.steps_done + self.interval
-        self.seconds_before = run.seconds
+        self.validation: Validation = Validation(run)
+        self.due: int = run.steps_done + self.interval
+        self.seconds_before: float = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:
         """Between two updates: validate and save if it is time; returns whether to stop."""

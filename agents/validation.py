@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy
 
+from ..baselines.problem import Problem
 from ..envs.contract.model import Episode, Model
 from ..envs.engine.backend import make_model
 from ..envs.engine.scenario_choice import find_mixture
@@ -36,9 +37,11 @@ class TrainingEpisodes:
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
-        self.problem, self.keywords, self.backend = run.problem, run.task_keywords, backend
-        self.weights = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
-        self.seeds = episode_seeds("validation", 0, episodes)
+        self.problem: Problem = run.problem
+        self.keywords: dict[str, Any] = run.task_keywords
+        self.backend = backend
+        self.weights: dict[str, float] = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
+        self.seeds: list[int] = episode_seeds("validation", 0, episodes)
         self._models: dict[tuple[str | None, str, str], Model] = {}
 
     def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
@@ -95,9 +98,9 @@ class Validation:
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
         problem = run.problem
-        self.paper = problem.baselines.score_paper
-        self.bootstrap = Bootstrap(VALIDATION_EPISODES)
-        self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
+        self.paper: str = problem.baselines.score_paper
+        self.bootstrap: Bootstrap = Bootstrap(VALIDATION_EPISODES)
+        self.episodes: TrainingEpisodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
         # Once: neither the paper's algorithm nor the episodes change in a run.
         self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 

@@ -189,7 +189,8 @@ class Prices(Mapping[str, Mapping[str, int] | None]):
     def __init__(
         self, makers: Mapping[str, Any], price_of: Callable[[str, Any], Mapping[str, int] | None]
     ) -> None:
-        self.makers, self.price_of = makers, price_of
+        self.makers = makers
+        self.price_of = price_of
         self._known: dict[str, Mapping[str, int] | None] = {}
 
     def __getitem__(self, name: str) -> Mapping[str, int] | None:

@@ -19,6 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ..envs.contract.model import Model
+from ..envs.contract.observation import Reader
 
 LARGER = 3.0
 """Factor on the variance of innovations that an alarm looks for; others are found too, some decisions later."""
@@ -87,7 +88,7 @@ class Alarm:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.task: Any = model.task
-        self.decisions = max(self.task.horizon // self.task.decision_interval, 1)
+        self.decisions: int = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
         """Measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's start, one.
@@ -141,7 +142,7 @@ class InnovationAlarm(Alarm):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         try:
-            self.innovation = model.reader("innovation")
+            self.innovation: Reader = model.reader("innovation")
         except ValueError as error:
             raise ValueError(
                 f"{self.task.id} shows no 'innovation' under control {model.control!r} that tells whether something is "

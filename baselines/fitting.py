@@ -100,7 +100,10 @@ class ScaledNoise(Filter[Task, Any, Any]):
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], factor: Any) -> None:
         super().__init__(own.task)
-        self.own, self.scaled, self.factor, self.in_python = own, scaled, factor, own.in_python
+        self.own = own
+        self.scaled = scaled
+        self.factor = factor
+        self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> Any:
         """Start where everyone starts, as much less sure of it: a track starts from measurements."""
@@ -167,7 +170,10 @@ class RobustEstimator(Filter[Task, Any, RobustState]):
 
     def __init__(self, own: Filter[Any, Any, Any], scaled: Callable[[Any, Any], Any], share: Any) -> None:
         super().__init__(own.task)
-        self.own, self.scaled, self.share, self.in_python = own, scaled, share, own.in_python
+        self.own = own
+        self.scaled = scaled
+        self.share = share
+        self.in_python: bool = own.in_python
 
     def start(self, initial: Any) -> RobustState:
         """Start as the filter does."""

@@ -133,8 +133,11 @@ class Judgement:
         default: str,
         anchored: Container[str] = (),
     ) -> None:
-        self.scores, self.parameters, self.default, self._share = scores, parameters, default, share
-        self.shipped = [name for name in scores.names if name not in parameters]
+        self._share = share
+        self.scores = scores
+        self.parameters = parameters
+        self.default = default
+        self.shipped: list[str] = [name for name in scores.names if name not in parameters]
         self._numbers = {name: i for i, name in enumerate(scores.names)}
         self._predicting = [n for n in scores.names if scores.predicted is not None and n not in anchored]
         self._chosen, self._judged = scores.log_likelihood

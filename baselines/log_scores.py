@@ -59,7 +59,8 @@ class PairSums:
     def __init__(self, competitors: int, stretch: numpy.ndarray) -> None:
         self._stretch = stretch
         shape = int(stretch.max()) + 1, competitors, competitors
-        self.sums, self.counts = numpy.zeros(shape), numpy.zeros(shape)
+        self.sums: numpy.ndarray = numpy.zeros(shape)
+        self.counts: numpy.ndarray = numpy.zeros(shape)
 
     def add(self, values: numpy.ndarray, first: int) -> None:
         """Add values of all competitors from a measurement on, ``(n, E, rows)``."""
@@ -163,13 +164,14 @@ class LogScores:
     def __init__(self, plan: Plan, roles: Roles) -> None:
         self._plan, task = plan, next(iter(plan.models.values())).task
         self._recording: Any = plan.scenario.recording
-        self._task, self.names, n = task, list(plan.competitors), len(plan.competitors)
+        self._task, n = task, len(plan.competitors)
+        self.names: list[str] = list(plan.competitors)
         chosen, self._judged = (stretches_of(mask[:, : task.horizon]) for mask in roles)
-        self.chosen_measurements = int((chosen >= 0).sum())
+        self.chosen_measurements: int = int((chosen >= 0).sum())
         lengths = [task.horizon] * len(chosen) if plan.lengths is None else plan.lengths
         self._there = numpy.arange(task.horizon) < numpy.asarray(lengths)[:, None]
-        self.log_likelihood = PairSums(n, chosen), PairSums(n, self._judged)
-        self.squared = PairSums(n, self._judged) if task.has_truth else None
+        self.log_likelihood: tuple[PairSums, PairSums] = PairSums(n, chosen), PairSums(n, self._judged)
+        self.squared: PairSums | None = PairSums(n, self._judged) if task.has_truth else None
         groups = task.groups
         main = list(next(iter(groups.values()))) if groups else [task.components[0].name]
         self._components = [i for i, each in enumerate(task.components) if each.name in main]

@@ -44,7 +44,7 @@ class Mehra(MeasurementNoise):
     """
 
     def __init__(self, window: float) -> None:
-        self.window = max(round(window), 1)
+        self.window: int = max(round(window), 1)
 
     def start(self, stated: Array) -> Array:
         """Window full of the stated variance."""
@@ -66,7 +66,8 @@ class FadingNoise(MeasurementNoise):
     """
 
     def __init__(self, memory: float, trust: float | None = None) -> None:
-        self.forgetting, self.trust = 1.0 - 1.0 / memory, memory if trust is None else trust
+        self.forgetting: float = 1.0 - 1.0 / memory
+        self.trust: float = memory if trust is None else trust
 
 
 class SageHusaMeasurementNoise(FadingNoise):

@@ -4,6 +4,7 @@ filter that is told the true model.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy
@@ -31,7 +32,7 @@ class StateSpaceKalman(ConstantPolicy):
     """The Kalman filter as written, extended where the model is not linear."""
 
     control = "noise"
-    action = (0.0, 0.0)
+    action: tuple[float, ...] = (0.0, 0.0)
 
 
 class CovarianceMatching(Policy):
@@ -39,7 +40,7 @@ class CovarianceMatching(Policy):
 
     control = "noise"
     traceable = True
-    step = 0.02
+    step: float = 0.02
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -60,7 +61,7 @@ class StateSpaceInteractingMultipleModel(ConstantPolicy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.action = (0.0,) * len(model.task.modes)
+        self.action: tuple[float, ...] = (0.0,) * len(model.task.modes)
 
 
 def _likelihood(result: kalman.Update, available: Array, xp: Any) -> Likelihood:
@@ -179,10 +180,10 @@ class Extended(Filter[StateSpace, StateSpaceMeasurement, EstimateState]):
         self, task: StateSpace, process_noise: Any = 1.0, measurement_noise: Any = 1.0, **noises: Any
     ) -> None:
         super().__init__(task)
-        self.equations = task.believed[0]
+        self.equations: Equations = task.believed[0]
         self.factor = process_noise
         self.of_sources, of_sensors = _split(task, noises)
-        self.sensor_factors = measurement_noise, of_sensors
+        self.sensor_factors: tuple[Any, dict[str, Any]] = measurement_noise, of_sensors
 
     def process_noise(self, mean: Array, measurement: StateSpaceMeasurement) -> Array:
         """Q with its factors at a predicted mean ``(n, N)``, ``(n, n, N)`` or ``(n, n, 1)``."""
@@ -315,7 +316,7 @@ class Unscented(Extended):
     ) -> None:
         super().__init__(task, process_noise, measurement_noise, **noises)
         usual = task.definition.usual_noise(task.parameters.sampling_interval)
-        self.uncertain = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
+        self.uncertain: Array = UNCERTAIN * (process_noise * task.constant(usual)[:, :, None])
 
     def start(self, initial: Initial) -> Any:
         """Start where everyone starts, nowhere certain."""
@@ -353,7 +354,7 @@ class InteractingKalman(Filter[StateSpace, StateSpaceMeasurement, Any]):
     ) -> None:
         super().__init__(task)
         factors = process_noise, measurement_noise
-        self.bank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
+        self.bank: MultipleModelBank = MultipleModelBank(task, "evidence", *factors, *_split(task, noises))
 
     def start(self, initial: Initial) -> Any:
         """Start where everyone starts."""
@@ -385,7 +386,8 @@ class KnownModel:
     knows = "the true model at every measurement, with its Q and R"
 
     def __init__(self, task: StateSpace) -> None:
-        self.task, self.xp = task, task.xp
+        self.task = task
+        self.xp: ModuleType = task.xp
 
     def start(self, initial: Initial, truth: StateSpaceTruth) -> Any:
         """Start where everyone starts."""

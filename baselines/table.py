@@ -106,7 +106,7 @@ class PaperAction(ConstantPolicy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.action = model.task.paper_policy.action
+        self.action: tuple[float, ...] = model.task.paper_policy.action
 
 
 class ConstantMode(Policy):
@@ -122,7 +122,7 @@ class ConstantMode(Policy):
 
     def __init__(self, model: Model, mode: int) -> None:
         super().__init__(model)
-        self.mode = mode if mode >= 0 else len(model.task.modes) + mode
+        self.mode: int = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Name the mode for every episode."""

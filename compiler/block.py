@@ -26,11 +26,13 @@ class LaneBlock:
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
-        self.numbers, self.truths = f"<{lanes} x double>", f"<{lanes} x i1>"
-        self.words, self.addresses = f"<{lanes} x i64>", f"<{lanes} x ptr>"
-        self.alignment = 8 * lanes
+        self.numbers: str = f"<{lanes} x double>"
+        self.truths: str = f"<{lanes} x i1>"
+        self.words: str = f"<{lanes} x i64>"
+        self.addresses: str = f"<{lanes} x ptr>"
+        self.alignment: int = 8 * lanes
         self.zero, self.one, self.minus_one = (self.constant(value) for value in ("0.0", "1.0", "-1.0"))
-        self.true = self.constant("true", "i1")
+        self.true: str = self.constant("true", "i1")
 
     def constant(self, value: str, kind: str = "double") -> str:
         """Return a constant that is the same in every lane."""

@@ -60,8 +60,14 @@ class Loops:
         tables: Mapping[int, str],
         qualifier: str,
     ) -> None:
-        self.program, self.name, self.read, self.write, self.arrays = program, name, read, write, arrays
-        self.scalar, self.tables, self.qualifier = scalar, tables, qualifier
+        self.program = program
+        self.name = name
+        self.read = read
+        self.write = write
+        self.arrays = arrays
+        self.scalar = scalar
+        self.tables = tables
+        self.qualifier = qualifier
         self.defined: list[str] = []
         self._last_words = ""
         self._found: dict[tuple[Any, ...], str] = {}

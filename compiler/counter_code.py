@@ -28,7 +28,9 @@ class Value:
     """
 
     def __init__(self, text: "_VectorText", name: str, whole: bool) -> None:
-        self.text, self.name, self.whole = text, name, whole
+        self.text = text
+        self.name = name
+        self.whole = whole
 
     def _with(self, operator: str, other: "Value | int | float") -> "Value":
         name = other.name if isinstance(other, Value) else self.text.constant(other)

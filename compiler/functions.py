@@ -98,7 +98,7 @@ class Specialised:
         unchanged: int | None = None,
         given_turned: bool = False,
     ) -> None:
-        self.inputs = [_leaf(array) for part in parts for array in leaves(part)]
+        self.inputs: list[Leaf] = [_leaf(array) for part in parts for array in leaves(part)]
         with namespace.tracing(graph):
             places = iter(range(len(self.inputs)))
             traced = [map_arrays(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
@@ -107,15 +107,15 @@ class Specialised:
         if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
             raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
         count = iter(range(len(made)))
-        self.template = map_arrays(lambda _: next(count), answer)
-        self.outputs = [_leaf(array) for array in made]
+        self.template: Any = map_arrays(lambda _: next(count), answer)
+        self.outputs: list[Leaf] = [_leaf(array) for array in made]
         given = {
             (_leaf(array), array.nodes.tobytes()): i
             for i, array in enumerate(array for part in traced for array in leaves(part))
             if array.nodes.size
         }
         same = [given.get((_leaf(array), array.nodes.tobytes())) for array in made]
-        self.same = [
+        self.same: list[int | None] = [
             i if unchanged is None or (i == output and output < unchanged) else None
             for output, i in enumerate(same)
         ]
@@ -126,7 +126,7 @@ class Specialised:
             for row, node in enumerate(array.nodes.ravel().tolist())
         ]
         self.program: StraightLineProgram = program(graph, wanted)
-        self.lane_first = [False] * (len(self.inputs) + len(self.outputs))
+        self.lane_first: list[bool] = [False] * (len(self.inputs) + len(self.outputs))
         self.lane_first[-1] = turned
         self.lane_first[0] |= given_turned
         self.code: Code | None = None
@@ -197,10 +197,12 @@ class Call:
     def __init__(
         self, code: Code, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
     ) -> None:
-        self.table, self.arrays, self._constants = table, arrays, constants
+        self._constants = constants
+        self.table = table
+        self.arrays = arrays
         self._code, self._uncounted = code, 0
         self.native: Native | None = None
-        self.address = address_of(table)
+        self.address: int = address_of(table)
 
     def expect(self, lanes: int, in_sequence: bool = False) -> Native:
         """Return the code for running over so many lanes in all, see :meth:`.native.Code.expect`."""
@@ -306,7 +308,10 @@ class CompiledFunction:
     def __init__(
         self, function: Callable[..., Any], graph: Graph, turned: bool = False, unchanged: int | None = None
     ) -> None:
-        self.function, self.graph, self.turned, self.unchanged = function, graph, turned, unchanged
+        self.function = function
+        self.graph = graph
+        self.turned = turned
+        self.unchanged = unchanged
         self._specialised: dict[Any, Specialised] = {}
 
     def specialise(self, *parts: Any) -> Specialised:

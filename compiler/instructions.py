@@ -27,13 +27,15 @@ class Instructions:
 
     def __init__(self, lane_first: Sequence[bool], block: LaneBlock, head: list[str] | None = None) -> None:
         self.lane_first = lane_first
-        self.block, self.numbers, self.truths = block, block.numbers, block.truths
+        self.block = block
+        self.numbers: str = block.numbers
+        self.truths: str = block.truths
         self.lines: list[str] = []
-        self.head = self.lines if head is None else head
+        self.head: list[str] = self.lines if head is None else head
         self._arguments: dict[int, tuple[str, str]] = {}
         self._first_rows: dict[int, str] = {}
         self._names = 0
-        self.constants = self._entry("ptr", 0)
+        self.constants: str = self._entry("ptr", 0)
 
     def new(self, expression: str, name: str | None = None, lines: list[str] | None = None) -> str:
         """Name of a new value."""

@@ -50,7 +50,8 @@ class LoopText(Instructions):
         self, loop: Loop, lane_first: Sequence[bool], block: LaneBlock, tables: DistanceTables
     ) -> None:
         super().__init__(lane_first, block, [])
-        self.loop, self.tables = loop, tables
+        self.loop = loop
+        self.tables = tables
         self._values: dict[Operand, str] = {}
         self._ways: dict[int | tuple[int, ...], str] = {}
         self._bases: dict[tuple[str, str], str] = {}

@@ -20,7 +20,7 @@ from .program import COMPARISONS, Graph, without_collection
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
 finfo = numpy.finfo
-bool = numpy.dtype("bool")
+bool: numpy.dtype = numpy.dtype("bool")
 pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
@@ -78,13 +78,16 @@ class Traced:
 
     __slots__ = ("dtype", "nodes")
     device = None
-    __bool__ = __index__ = _refuse
-    __float__ = __int__ = __complex__ = _refuse_number
+    __bool__ = _refuse
+    __index__ = _refuse
+    __float__ = _refuse_number
+    __int__ = _refuse_number
+    __complex__ = _refuse_number
     __setitem__ = _refuse_entry
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
-        self.nodes = numpy.asarray(nodes)
-        self.dtype = numpy.dtype(dtype)
+        self.nodes: numpy.ndarray = numpy.asarray(nodes)
+        self.dtype: numpy.dtype = numpy.dtype(dtype)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> numpy.ndarray:
         """Array of objects, on which NumPy's own arithmetic makes expressions, too."""
@@ -108,12 +111,12 @@ class Traced:
     def __array_namespace__(self, api_version: str | None = None) -> ModuleType:
         return importlib.import_module(__name__)
 
-    shape = property(lambda self: self.nodes.shape)
-    ndim = property(lambda self: self.nodes.ndim)
-    size = property(lambda self: self.nodes.size)
-    real = property(lambda self: self)
+    shape: Any = property(lambda self: self.nodes.shape)
+    ndim: Any = property(lambda self: self.nodes.ndim)
+    size: Any = property(lambda self: self.nodes.size)
+    real: Any = property(lambda self: self)
     T = property(lambda self: Traced(self.nodes.T, self.dtype))
-    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))  # noqa: N815  (the standard's name)
+    mT: Any = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))  # noqa: N815  (the standard's name)
 
     def __len__(self) -> int:
         return len(self.nodes)

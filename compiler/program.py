@@ -124,7 +124,7 @@ class Graph:
         self.values: list[float | bool | None] = []
         self.logical: list[bool] = []
         self.groups: list[int] = []
-        self.group = 0
+        self.group: int = 0
         self.tables: list[numpy.ndarray] = []
         self.digests: list[bytes] = []
         """Of the tables."""
@@ -445,8 +445,11 @@ class ProgramSteps(Sequence[ProgramStep]):
         arguments: numpy.ndarray,
         logical: numpy.ndarray,
     ) -> None:
-        self.names, self.kinds, self.begins = names, kinds, begins
-        self.arguments, self.logical = arguments, logical
+        self.names = names
+        self.kinds = kinds
+        self.begins = begins
+        self.arguments = arguments
+        self.logical = logical
         self._made: list[ProgramStep] | None = None
 
     @functools.cached_property

@@ -51,7 +51,8 @@ class VectorFunction:
 
     def __init__(self, function: Callable[[Any], Any] | numpy.ndarray, size: int, given: int = 0) -> None:
         graph = Graph()
-        self.inputs, self.given = size, given
+        self.inputs = size
+        self.given = given
         with namespace.tracing(graph):
             rows = [graph.input(0, row) for row in range(size + given)]
             x = Traced(numpy.array(rows, dtype=numpy.int64), namespace.float64)
@@ -65,12 +66,13 @@ class VectorFunction:
             raise ValueError(
                 f"must return a vector, such as a list of numbers, got an array of shape {shape}"
             )
-        (self.size,) = shape
+        self.size: int = shape[0]
         nodes = [node for gradient in gradients for node in gradient.nodes[:size].tolist()]
         self._value = _program(graph, answer.nodes.tolist())
         self._jacobian = _program(graph, nodes)
         known = [graph.values[node] for node in nodes]
-        self.matrix = self.offset = None
+        self.matrix: numpy.ndarray | None = None
+        self.offset: numpy.ndarray | None = None
         if None not in known and not given:
             self.matrix = numpy.array(known, dtype=float).reshape(self.size, size)
             self.offset = self.value(numpy.zeros((size, 1)), numpy)[:, 0]

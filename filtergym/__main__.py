@@ -88,7 +88,7 @@ class Program(typer.core.TyperGroup):
     """Commands in groups, each imported when it is called: whoever asks for help need not wait for all libraries."""
 
     groups: Mapping[str, Commands]
-    listing = False
+    listing: bool = False
     """Whether commands are only named, each with its first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:

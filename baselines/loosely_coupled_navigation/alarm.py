@@ -3,7 +3,7 @@
 import numpy
 
 from ...envs.contract.model import Model
-from ...envs.contract.observation import symlog
+from ...envs.contract.observation import Reader, symlog
 from ..alarm import Alarm, innovation_evidence
 
 SYMLOG_VARIANCE = 0.38684360137
@@ -21,8 +21,9 @@ class FusionAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.innovation, self.available = model.reader("innovation_over_sigma"), model.reader("available")
-        self.axes = self.task.parameters.axes
+        self.innovation: Reader = model.reader("innovation_over_sigma")
+        self.available: Reader = model.reader("available")
+        self.axes: int = self.task.parameters.axes
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh the innovations of each axis."""

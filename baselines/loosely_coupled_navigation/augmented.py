@@ -71,7 +71,8 @@ class AugmentedFilter:
     """
 
     def __init__(self, parameters: LooselyCoupledNavigationParameters, noise: MeasurementNoise) -> None:
-        self.parameters, self.noise = parameters, noise
+        self.parameters = parameters
+        self.noise = noise
 
     def start(self, none: Array) -> AugmentedMemory:
         """Memory at the start of the track.

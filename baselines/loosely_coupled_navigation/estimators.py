@@ -48,8 +48,8 @@ class AugmentedEstimator(Filter[LooselyCoupledNavigation, Measurement, Navigator
         self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
         super().__init__(task)
-        self.filter = AugmentedFilter(task.parameters, rule(**values))
-        self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
+        self.filter: AugmentedFilter = AugmentedFilter(task.parameters, rule(**values))
+        self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial) -> Navigator:
         """Start where INS and reference agree."""

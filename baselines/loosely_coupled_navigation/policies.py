@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
 from ...envs.loosely_coupled_navigation.fault_bank import FaultBank
 from ...envs.loosely_coupled_navigation.fault_prior import FEW, TRAINING, VAGUE
@@ -103,11 +104,11 @@ class TimeVarying(Policy):
     def __init__(self, model: Model, intensity: float | None = None) -> None:
         super().__init__(model)
         p = self.task.parameters
-        self.loose = self.task
+        self.loose: Any = self.task
         self.growth = (p.equivalent_intensities[1] if intensity is None else intensity) * p.sampling_interval
-        self.available = model.reader("available")
-        self.reported_variance = model.reader("reported_variance")
-        self.innovation = model.reader("innovation_in_metres")
+        self.available: Reader = model.reader("available")
+        self.reported_variance: Reader = model.reader("reported_variance")
+        self.innovation: Reader = model.reader("innovation_in_metres")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Set the gain ``P / (P + R)``."""
@@ -155,7 +156,7 @@ class InnovationAdaptive(TimeVarying):
 
     def __init__(self, model: Model, window: float = 0.25) -> None:
         super().__init__(model)
-        self.rate = -math.expm1(-self.task.parameters.sampling_interval / window)
+        self.rate: float = -math.expm1(-self.task.parameters.sampling_interval / window)
 
     def noise(
         self,
@@ -197,7 +198,7 @@ class AugmentedGain(TimeVarying):
         self, model: Model, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
         super().__init__(model)
-        self.filter = AugmentedFilter(self.task.parameters, rule(**values))
+        self.filter: AugmentedFilter = AugmentedFilter(self.task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""

@@ -13,6 +13,7 @@ Reading: the motion is taken for one about which nothing is known. A filter with
 more; the manoeuvres are drawn so strong that it is little (``manoeuvre_acceleration``).
 """
 
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy
@@ -24,6 +25,7 @@ from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement, Truth
 from ...filters import loosely_coupled as ins_gnss
 from ...filters import receiver_faults
+from ...filters.loosely_coupled import Sampling
 from .estimators import likelihood_of_fix
 
 
@@ -52,11 +54,12 @@ class _Matched:
         "the true intensities of all noises, every change of the receiver's, each outlier, and onset, end and rate of "
         "the spoofing"
     )
-    disturbances = ("coloured", "outage", "jamming", "spoofing", "noise_changes", "outliers")
+    disturbances: tuple[str, ...] = ("coloured", "outage", "jamming", "spoofing", "noise_changes", "outliers")
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:
-        self.xp, self.sampling = task.xp, task.parameters.sampling
-        self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
+        self.xp: ModuleType = task.xp
+        self.sampling: Sampling = task.parameters.sampling
+        self.eye: Array = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, truth: Truth) -> ErrorState:
         """Start where INS and reference agree, with the true prior of the rate errors and of the receiver's."""

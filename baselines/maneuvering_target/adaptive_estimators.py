@@ -36,7 +36,9 @@ class SageHusaProcessNoise(KalmanModel):
         self, task: ManeuveringTarget, acceleration: float = 1.0, forgetting: float = 0.9, least: float = 0.1
     ) -> None:
         super().__init__(task)
-        self.variance, self.forgetting, self.least = acceleration**2, forgetting, least**2
+        self.variance: float = acceleration**2
+        self.forgetting = forgetting
+        self.least: float = least**2
 
     def start(self, initial: Initial) -> ProcessNoiseTrack:
         """Start where everyone starts."""
@@ -98,7 +100,9 @@ class VariationalBayes(KalmanModel):
         shape: float = 5.0,
     ) -> None:
         super().__init__(task)
-        self.variance, self.forgetting, self.shape = acceleration**2, forgetting, shape
+        self.variance: float = acceleration**2
+        self.forgetting = forgetting
+        self.shape = shape
 
     def start(self, initial: Initial) -> MeasurementNoiseTrack:
         """Start where everyone starts, and believe the radar."""

@@ -1,8 +1,11 @@
 """When something is wrong in ManeuveringTarget: the target turns, errors are larger, or scans are missed."""
 
+from typing import ClassVar
+
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ..alarm import Alarm, certain, innovation_evidence
 
 ROUNDING = 1e-6
@@ -17,16 +20,16 @@ class RadarAlarm(Alarm):
     """
 
     window = 50
-    false_alarms = 0.3
+    false_alarms: ClassVar[float] = 0.3
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.fixed_gains = model.control in self.task.banks and model.control != "hypotheses"
-        self.bank = self.fixed_gains and model.control != "gain"
+        self.fixed_gains: bool = model.control in self.task.banks and model.control != "hypotheses"
+        self.bank: bool = self.fixed_gains and model.control != "gain"
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
-        self.read = [model.reader(name) for name in names]
-        self.available = model.reader("available")
-        self.elapsed = model.reader("elapsed") if self.fixed_gains else None
+        self.read: list[Reader] = [model.reader(name) for name in names]
+        self.available: Reader = model.reader("available")
+        self.elapsed: Reader | None = model.reader("elapsed") if self.fixed_gains else None
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh scans, and what there is of them."""

@@ -31,7 +31,7 @@ class DeadReckoning(KalmanModel):
         heading_offset: by which these are turned clockwise, degrees.
     """
 
-    acceleration = 1.0
+    acceleration: float = 1.0
     """m/s^2, where the odometry says nothing; ours, of what has wheels or legs."""
 
     def __init__(
@@ -44,8 +44,11 @@ class DeadReckoning(KalmanModel):
         heading_offset: float = 0.0,
     ) -> None:
         super().__init__(task)
-        self.deviation, self.correlation_time, self.drift = error_deviation, correlation_time, drift
-        self.scale, self.heading_offset = scale, DEGREE * heading_offset
+        self.deviation = error_deviation
+        self.correlation_time = correlation_time
+        self.drift = drift
+        self.scale = scale
+        self.heading_offset: float = DEGREE * heading_offset
         self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:

@@ -23,7 +23,7 @@ class AllPlots(KalmanModel):
     and Fortmann 1988, section 6.4).
     """
 
-    detection_probability = 0.9
+    detection_probability: float = 0.9
 
     def density(self, plots: Plots) -> Array:
         """Plots of the scan over the area of the window, at least of one, 1/m^2, ``(N,)``."""

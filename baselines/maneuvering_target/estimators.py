@@ -52,7 +52,7 @@ class ConstantVelocity(KalmanModel):
 
     def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0) -> None:
         super().__init__(task)
-        self.variance = acceleration**2
+        self.variance: float = acceleration**2
 
     def update(self, state: EstimateState, given: FilterInput) -> EstimateState:
         """One cycle of the filter."""
@@ -89,13 +89,13 @@ class KalmanInteractingMultipleModel(KalmanModel):
     ) -> None:
         super().__init__(task)
         modes = range(len(stay))
-        self.variances = [sigma**2 for sigma in accelerations]
-        self.transition = task.constant(
+        self.variances: list[float] = [sigma**2 for sigma in accelerations]
+        self.transition: Array = task.constant(
             [[stay[i] if i == j else (1.0 - stay[i]) / (len(stay) - 1) for j in modes] for i in modes]
         )
         # All modes are left equally often in the long run, so they are met in proportion to how long they last.
         lasting = [1.0 / (1.0 - probability) for probability in stay]
-        self.probabilities = task.constant([scans / sum(lasting) for scans in lasting])
+        self.probabilities: Array = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Give an estimate of position and velocity the state in which the filters are mixed."""
@@ -154,8 +154,8 @@ class TurnModel(ConstantVelocityModel):
 
     def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
         super().__init__(task)
-        self.variance = acceleration**2
-        self.change = DEGREE * turn_rate_change / task.parameters.sampling_interval
+        self.variance: float = acceleration**2
+        self.change: float = DEGREE * turn_rate_change / task.parameters.sampling_interval
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
@@ -193,8 +193,8 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         stay: Sequence[float] = (0.95, 0.8, 0.8),
     ) -> None:
         super().__init__(task, accelerations[:2], stay)
-        self.turn = TurnModel(task, accelerations[2], turn_rate_change)
-        self.turn_variance = (DEGREE * turn_rate_start) ** 2
+        self.turn: TurnModel = TurnModel(task, accelerations[2], turn_rate_change)
+        self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Add the turn rate of straight flight."""
@@ -232,7 +232,7 @@ class UnscentedTurn(TurnModel, KalmanModel):
         turn_rate_start: float = 2.0,
     ) -> None:
         super().__init__(task, acceleration, turn_rate_change)
-        self.turn_variance = (DEGREE * turn_rate_start) ** 2
+        self.turn_variance: float = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial) -> EstimateState:
         """Start where everyone starts, with a turn rate about zero."""

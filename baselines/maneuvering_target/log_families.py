@@ -38,7 +38,8 @@ class ConstantAcceleration(KalmanModel):
 
     def __init__(self, task: ManeuveringTarget, jerk: float = 0.3, acceleration: float = 1.0) -> None:
         super().__init__(task)
-        self.variance, self.start_variance = jerk**2, acceleration**2
+        self.variance: float = jerk**2
+        self.start_variance: float = acceleration**2
         self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
 
     def start(self, initial: Initial) -> EstimateState:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.maneuvering_target.banks import GainBank
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
@@ -35,8 +36,8 @@ class InteractingMultipleModel(Policy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.log_likelihood = model.reader("log_likelihood")
-        self.log_predicted = model.reader("log_predicted")
+        self.log_likelihood: Reader = model.reader("log_likelihood")
+        self.log_predicted: Reader = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Posterior mode probabilities, ``(N, M)``."""
@@ -76,7 +77,7 @@ class FixedGain(ConstantPolicy):
 
     def __init__(self, model: Model, alpha: float) -> None:
         super().__init__(model)
-        self.action = (gain_bank(model).action_for_alpha(alpha),)
+        self.action: tuple[float, ...] = (gain_bank(model).action_for_alpha(alpha),)
 
 
 class FixedLow(FixedGain):
@@ -115,10 +116,12 @@ class AdaptiveGain(Policy):
 
     def __init__(self, model: Model, false_alarm_probability: float = 1e-3, ramp_scans: float = 7.0) -> None:
         super().__init__(model)
-        self.threshold = -2.0 * math.log(false_alarm_probability)
+        self.threshold: float = -2.0 * math.log(false_alarm_probability)
         self.ramp_scans = ramp_scans
-        self.low, self.high = min(self.task.parameters.gains), max(self.task.parameters.gains)
-        self.squared, self.available = model.reader("log_squared_innovation"), model.reader("available")
+        self.low: float = min(self.task.parameters.gains)
+        self.high: float = max(self.task.parameters.gains)
+        self.squared: Reader = model.reader("log_squared_innovation")
+        self.available: Reader = model.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Go down the ramp, or start it again at an alarm; a scan that missed the target is no step of it."""

@@ -106,7 +106,8 @@ class KnownTurn(KalmanModel):
 class KnownInputBound(ConstantVelocityModel):
     """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
 
-    kind, traceable = "bound", True
+    kind = "bound"
+    traceable = True
     knows = "the acceleration in every scan"
     disturbances = DISTURBANCES
 

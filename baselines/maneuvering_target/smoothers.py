@@ -138,7 +138,7 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
         )
 
 
-SMOOTHERS = {
+SMOOTHERS: dict[str, Any] = {
     "kalman-smoother": ConstantVelocitySmoother,
     "imm-smoother": KalmanIMMSmoother,
     "imm-turn-smoother": KalmanTurnIMMSmoother,

@@ -46,7 +46,7 @@ FEW = {
     for H in (3, 5, 9, 15)
 }
 
-ESTIMATORS = {
+ESTIMATORS: dict[str, Any] = {
     "kalman-imm": KalmanInteractingMultipleModel,
     "kalman-imm-turn": KalmanTurnInteractingMultipleModel,
     "semi-markov": SemiMarkov,
@@ -88,7 +88,7 @@ def _imm_turn(values: Mapping[str, float]) -> Settings:
     )
 
 
-TURNS = {
+TURNS: dict[int, dict[str, tuple[float, float]]] = {
     0: {},
     1: {"turn": (0.5, 7.0)},
     2: {"turn_gentle": (0.5, 3.0), "turn_steep": (3.0, 7.0)},

@@ -1,10 +1,12 @@
 """When something is wrong in RadarEsmTracking: the class, or what the ESM hears, is not as the paper's rule assumes."""
 
 import math
+from typing import ClassVar
 
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...filters import class_fusion, imm
 from ..alarm import Alarm
@@ -27,22 +29,24 @@ class ClassAlarm(Alarm):
     """
 
     window = 1000  # what it finds lasts as long as the episode
-    false_alarms = 1.0  # of a bound that is far from tight; measured: 0.03 in ``paper``
+    false_alarms: ClassVar[float] = 1.0  # of a bound that is far from tight; measured: 0.03 in ``paper``
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         p = self.task.parameters
-        self.decisions = p.horizon  # an episode holds as many ESM decisions, however long an action holds
-        self.squared = model.reader("log_squared_innovation")
-        self.log_likelihood, self.last_weight = model.reader("log_likelihood"), model.reader("last_weight")
-        self.used_count, self.refused_count = model.reader("used_count"), model.reader("refused_count")
+        self.decisions: int = p.horizon  # an episode's ESM decisions, however long an action holds
+        self.squared: Reader = model.reader("log_squared_innovation")
+        self.log_likelihood: Reader = model.reader("log_likelihood")
+        self.last_weight: Reader = model.reader("last_weight")
+        self.used_count: Reader = model.reader("used_count")
+        self.refused_count: Reader = model.reader("refused_count")
         self.log_prior = imm.log_probabilities(numpy.array(p.prior))[:, None]
         recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
         self.log_recognition, self.log_composition = (
             imm.log_probabilities(table) for table in (recognition, composition)
         )
         self.log_esm = imm.log_probabilities(class_fusion.decision_probabilities(recognition, composition))
-        self.refusal = p.association_error
+        self.refusal: float = p.association_error
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh radar and ESM."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...envs.radar_esm_tracking.exact_bayes import FEW, TRAINING, VAGUE, ClassPrior, ExactBayes
 from ...evaluation.competitors.kinds import ConstantPolicy, Policy, RandomPolicy
@@ -34,7 +35,7 @@ class FixedWeights(ConstantPolicy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.action = (1.0,) * len(self.task.modes)
+        self.action: tuple[float, ...] = (1.0,) * len(self.task.modes)
 
 
 class _Posterior(Policy):
@@ -48,8 +49,9 @@ class _Posterior(Policy):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         p = self.task.parameters
-        self.accumulated = model.reader("accumulated_log_likelihood")
-        self.used_count, self.refused_count = model.reader("used_count"), model.reader("refused_count")
+        self.accumulated: Reader = model.reader("accumulated_log_likelihood")
+        self.used_count: Reader = model.reader("used_count")
+        self.refused_count: Reader = model.reader("refused_count")
         self.log_prior = imm.log_probabilities(numpy.array(p.prior))[:, None]
         self.log_recognition = imm.log_probabilities(numpy.array(p.recognition))
         self.log_composition = imm.log_probabilities(numpy.array(p.composition))
@@ -114,7 +116,8 @@ class JointType(_Posterior):
 
     def __init__(self, model: Model, refused: float = 0.0, esm: float = 1.0) -> None:
         super().__init__(model)
-        self.refused, self.esm = refused, esm
+        self.refused = refused
+        self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Prior, radar, and all decisions as statements about one type."""
@@ -139,7 +142,7 @@ class ForgettingJointType(JointType):
     def __init__(self, model: Model, change: float = 0.002, refused: float = 0.0, esm: float = 1.0) -> None:
         super().__init__(model, refused, esm)
         self.change = change
-        self.log_start = self.log_prior[:, None] + self.log_composition[..., None]
+        self.log_start: numpy.ndarray = self.log_prior[:, None] + self.log_composition[..., None]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Radar under the class before, change of class, decisions about the type now."""
@@ -169,9 +172,11 @@ class Leaky(_Posterior):
         super().__init__(model)
         classes = len(self.task.modes)
         others = (1.0 - numpy.eye(classes)) / (classes - 1)
-        self.transition = (1.0 - leak) * numpy.eye(classes) + leak * others
-        self.last_weight, self.log_likelihood = model.reader("last_weight"), model.reader("log_likelihood")
-        self.decision, self.refused = model.reader("decision"), model.reader("decision_refused")
+        self.transition: numpy.ndarray = (1.0 - leak) * numpy.eye(classes) + leak * others
+        self.last_weight: Reader = model.reader("last_weight")
+        self.log_likelihood: Reader = model.reader("log_likelihood")
+        self.decision: Reader = model.reader("decision")
+        self.refused: Reader = model.reader("decision_refused")
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:

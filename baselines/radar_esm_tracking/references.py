@@ -5,6 +5,7 @@ m and m/s, with ``e(k) = psi e(k-1) + w``: the augmented filter of a first-order
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.2).
 """
 
+from types import ModuleType
 from typing import NamedTuple
 
 from ...envs.contract.filter import Likelihood
@@ -36,14 +37,16 @@ class _KnownDraw:
         "the true class at every scan, in which scans there is glint, how strong and how lasting the radar's coloured "
         "errors are, and how its white ones are correlated"
     )
-    disturbances = ("glint",)
+    disturbances: tuple[str, ...] = ("glint",)
     traceable = True
 
     def __init__(self, task: RadarEsmTracking) -> None:
-        self.task, self.xp, p = task, task.xp, task.parameters
-        self.start_covariance = task.constant(task.design_models(p)[1])
-        self.coloured = p.radar_coloured[1] > 0.0
-        self.deviations = p.range_sigma, p.range_rate_sigma
+        p = task.parameters
+        self.task = task
+        self.xp: ModuleType = task.xp
+        self.start_covariance: Array = task.constant(task.design_models(p)[1])
+        self.coloured: bool = p.radar_coloured[1] > 0.0
+        self.deviations: tuple[float, float] = p.range_sigma, p.range_rate_sigma
         # Range and range rate are measured, with their coloured errors.
         self.H = task.constant(
             [[float(j in (i, i + 3)) for j in range(5 if self.coloured else 3)] for i in range(2)]

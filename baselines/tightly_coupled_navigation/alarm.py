@@ -3,6 +3,7 @@
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ..alarm import LARGER, Alarm, certain, scale_ratio
 
 
@@ -15,7 +16,8 @@ class SensorAlarm(Alarm):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.nis, self.repeat = model.reader("nis"), model.reader("accelerometers_repeat")
+        self.nis: Reader = model.reader("nis")
+        self.repeat: Reader = model.reader("accelerometers_repeat")
         self.available = model.reader("pseudorange_available"), model.reader("rate_available")
         self.others = [sensor.readings.stop - sensor.readings.start for sensor in self.task.sensors[2:]]
 

@@ -29,7 +29,7 @@ class HuberBank(HypothesisBank):
     ) -> None:
         super().__init__(task, "evidence")
         self.manoeuvre = manoeuvre
-        self.of_reading = [
+        self.of_reading: list[float] = [
             thresholds.get(sensor.name, math.inf)
             for sensor in task.sensors
             for _ in range(sensor.readings.start, sensor.readings.stop)
@@ -69,7 +69,7 @@ class Huber(Filter[TightlyCoupledNavigation, Measurement, HuberState]):
     ) -> None:
         super().__init__(task)
         everywhere = {sensor.name: EFFICIENT for sensor in task.sensors}
-        self.bank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
+        self.bank: HuberBank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
 
     def start(self, initial: Initial) -> HuberState:
         """Start every filter where everyone starts."""

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.tightly_coupled_navigation.fault_hypotheses import (
     TRAINING,
     VAGUE,
@@ -69,7 +70,7 @@ class FixedRobust(ConstantPolicy):
     ) -> None:
         super().__init__(model)
         throughout = min(accelerometers / self.task.parameters.noise_reach, 1.0)
-        self.action = (0.0, 0.0, throughout, 0.0, 1.0, pseudoranges, rates)
+        self.action: tuple[float, ...] = (0.0, 0.0, throughout, 0.0, 1.0, pseudoranges, rates)
 
 
 class NisAdaptive(Policy):
@@ -104,10 +105,13 @@ class NisAdaptive(Policy):
         base: float = 0.0,
     ) -> None:
         super().__init__(model)
-        self.average_nis = model.reader("average_nis")
-        self.nats = 2.0 * math.log(self.task.parameters.noise_scale)
-        self.threshold, self.rates, self.accelerometers = threshold, rates, accelerometers
-        self.own, self.base = own, base
+        self.average_nis: Reader = model.reader("average_nis")
+        self.nats: float = 2.0 * math.log(self.task.parameters.noise_scale)
+        self.threshold = threshold
+        self.rates = rates
+        self.accelerometers = accelerometers
+        self.own = own
+        self.base = base
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Turn excesses into logarithms of factors."""

@@ -42,13 +42,13 @@ class _KnownMode:
 
     traceable = True
     disturbances = ("stuck", "noisy", "hidden", "no_rates", "coloured", "reflections", "ramp", "aperture")
-    knows_acceleration = 0.0
+    knows_acceleration: float = 0.0
     """Standard deviation of what it is told of it, m/s^2."""
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         self.task = task
-        self.axis = task.axis[..., 0]
-        self.size = gnss_ins.SIZE + task.satellites
+        self.axis: Array = task.axis[..., 0]
+        self.size: int = gnss_ins.SIZE + task.satellites
 
     def start(self, initial: Initial, truth: Truth) -> KnownModeState:
         """Start where everyone starts."""
@@ -167,7 +167,7 @@ class KnownMode(_KnownMode):
         increment = p.true_increment_sigma if p.course == "random" else TOLD_INCREMENT_SIGMA
         rest, _, singer = task.models
         line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, p.reset_acceleration_sigma)
-        self.noises = self.process_noises((rest, line, singer))
+        self.noises: Array = self.process_noises((rest, line, singer))
 
     def update(
         self, memory: KnownModeState, measurement: Measurement, truth: Truth
@@ -212,7 +212,7 @@ class KnownModeBound(_KnownMode):
         increment = p.true_increment_sigma if p.course == "random" else 0.0
         rest = gnss_ins.rest_model(p.sampling_interval, 0.0, 0.0)
         line = gnss_ins.constant_velocity_model(p.sampling_interval, increment, 0.0)
-        self.noises = self.process_noises((rest, line, task.models[SINGER]))
+        self.noises: Array = self.process_noises((rest, line, task.models[SINGER]))
 
     def update(
         self, memory: KnownModeState, measurement: Measurement, truth: Truth

@@ -31,7 +31,7 @@ class SteadyKalman(Filter[UavAutopilot, Measurement, Initial]):
         super().__init__(task)
         model, steady = task.design.model, task.design.steady
         self.F, self.B, self.gain = (task.constant(part) for part in (model.F, model.B, steady.gain))
-        self.settled = task.constant(steady.posterior)[:, :, None]
+        self.settled: Array = task.constant(steady.posterior)[:, :, None]
 
     def start(self, initial: Start) -> Initial:
         """Start where everyone starts."""
@@ -91,14 +91,14 @@ class AdaptiveKalman(Filter[UavAutopilot, Measurement, AdaptiveState]):
         self, task: UavAutopilot, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
         super().__init__(task)
-        self.sensor_noise = rule(**values)
+        self.sensor_noise: MeasurementNoise = rule(**values)
         model, pack = task.design.model, packed_covariance.pack
         self.F, self.B = task.constant(model.F), task.constant(model.B)
-        self.propagator = task.constant(packed_covariance.propagator(model.F))
+        self.propagator: Array = task.constant(packed_covariance.propagator(model.F))
         self.scaled, self.other = (
             task.constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise)
         )
-        self.n = len(model.F)
+        self.n: int = len(model.F)
 
     def start_filter(self, initial: Start) -> SensorAware:
         """Filter where everyone starts, with sensors as stated."""
@@ -164,8 +164,9 @@ class AdaptiveGusts(AdaptiveKalman):
         self, task: UavAutopilot, rule: type[MeasurementNoise], gust_memory: float, **values: float
     ) -> None:
         super().__init__(task, rule, **values)
-        self.gust_memory, self.forgetting = gust_memory, 1.0 - 1.0 / gust_memory
-        self.last = packed_covariance.position(self.n, self.n - 1, self.n - 1)
+        self.gust_memory = gust_memory
+        self.forgetting: float = 1.0 - 1.0 / gust_memory
+        self.last: int = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def first_memory(self, initial: Start) -> tuple[SensorAware, adaptation.Level]:
         """Gusts as designed."""
@@ -213,7 +214,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         high: float = 2.0,
     ) -> None:
         super().__init__(task, VariationalBayesMeasurementNoise, memory=memory)
-        self.levels = low, 1.0, high
+        self.levels: tuple[float, float, float] = low, 1.0, high
         change = (1.0 - stay) / 2.0
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
 

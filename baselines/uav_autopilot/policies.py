@@ -11,6 +11,7 @@ from typing import Any
 import numpy
 
 from ...envs.contract.model import Model
+from ...envs.contract.observation import Reader
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.level_bank import TRAINING, VAGUE, LevelBank, LevelPrior
 from ...evaluation.competitors.kinds import Policy, RandomPolicy
@@ -56,14 +57,15 @@ class InnovationAdaptive(Policy):
         weights: tuple[float, ...] | None = None,
     ) -> None:
         super().__init__(model)
-        self.forget, self.memory = 1.0 / window, memory
-        self.unit = 1.0 / self.task.parameters.gain_decades
+        self.forget: float = 1.0 / window
+        self.memory = memory
+        self.unit: float = 1.0 / self.task.parameters.gain_decades
         self.offset = offset
         m = len(self.task.sensors)
         self.weights = numpy.array([1.0 / m] * m if weights is None else (*weights, *[0.0] * m)[:m])
-        self.innovation = model.reader("innovation")
-        self.available = model.reader("available")
-        self.last_action = model.reader("action")
+        self.innovation: Reader = model.reader("innovation")
+        self.available: Reader = model.reader("available")
+        self.last_action: Reader = model.reader("action")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Update the window and scale the noise."""

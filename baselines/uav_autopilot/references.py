@@ -3,6 +3,8 @@
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
+from types import ModuleType
+
 import numpy
 
 from ...envs.contract.filter import Initial, Likelihood
@@ -44,10 +46,11 @@ class _KnownNoise:
     kind = "reference"
     traceable = True
     knows: str
-    disturbances = ("noisy_sensors", "coloured", "bias", "dropouts")
+    disturbances: tuple[str, ...] = ("noisy_sensors", "coloured", "bias", "dropouts")
 
     def __init__(self, task: UavAutopilot) -> None:
-        self.task, self.xp = task, task.xp
+        self.task = task
+        self.xp: ModuleType = task.xp
         model, n, m = task.design.true_model, len(task.components), len(task.sensors)
         errors = m if task.parameters.sensor_coloured[1] else 0
         pack, size = packed_covariance.pack, n + errors
@@ -60,22 +63,23 @@ class _KnownNoise:
         rest = enlarge(numpy.zeros((n, n))) + numpy.diag([0.0] * n + [1.0] * errors)
         self.F = task.constant(enlarge(model.F) + rest)
         self.B = task.constant(numpy.concatenate([model.B, numpy.zeros((errors, 1))]))
-        self.propagator = task.constant(packed_covariance.propagator(enlarge(model.F) + rest))
-        self.scaled = task.constant(pack(enlarge(model.scaled_noise))[:, None])
-        self.other = task.constant(pack(enlarge(model.other_noise))[:, None])
-        self.variances = task.constant(task.sensor_variances)[:, None]
-        self.diagonal = packed_covariance.diagonal(size)
+        self.propagator: Array = task.constant(packed_covariance.propagator(enlarge(model.F) + rest))
+        self.scaled: Array = task.constant(pack(enlarge(model.scaled_noise))[:, None])
+        self.other: Array = task.constant(pack(enlarge(model.other_noise))[:, None])
+        self.variances: Array = task.constant(task.sensor_variances)[:, None]
+        self.diagonal: list[int] = packed_covariance.diagonal(size)
         placed = numpy.zeros((size * (size + 1) // 2, errors))
         placed[self.diagonal[n:], range(errors)] = 1.0
-        self.placed = task.constant(placed)
+        self.placed: Array = task.constant(placed)
         """Where the variances of the errors stand in the packed triangle."""
-        self.initial_covariance = task.constant(
+        self.initial_covariance: Array = task.constant(
             pack(enlarge(numpy.diag(numpy.square(task.parameters.value("initial_sigmas")))))[:, None]
         )
         gust = numpy.zeros((len(placed), 1))
         gust[self.diagonal[n - 1]] = float(task.parameters.plant == "U")
-        self.gust = task.constant(gust)
-        self.n, self.size = n, size
+        self.gust: Array = task.constant(gust)
+        self.n: int = n
+        self.size: int = size
 
     def start_covariance(self, truth: Truth) -> Array:
         """Packed covariance of the start: the gust starts at the level of the first part."""
@@ -161,7 +165,7 @@ class KnownNoiseBound(_KnownNoise):
     """
 
     kind = "bound"
-    knows = Matched.knows
+    knows: str = Matched.knows
 
     def start(self, initial: Start, truth: Truth) -> Array:
         """Covariance of the state's own distribution at the start, packed."""

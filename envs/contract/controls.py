@@ -99,7 +99,7 @@ class SettingsBank(Bank[Any, Any, Any]):
         super().__init__(task, control)
         self.own = self.strong(task)
         factors = self.own.settings.values()
-        self.log_reach = task.constant([math.log(factor) for factor in factors])[:, None]
+        self.log_reach: Array = task.constant([math.log(factor) for factor in factors])[:, None]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

@@ -29,7 +29,7 @@ class Draws:
 
     def __init__(self, uniforms: Array, xp: ModuleType) -> None:
         self.xp = xp
-        self.used = 0
+        self.used: int = 0
         self.drawn: dict[str, Array] = {}
         self._uniforms = uniforms
         self._average: Array = None

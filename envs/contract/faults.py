@@ -68,7 +68,8 @@ class Disturbance(ABC):
     row_uniforms: int = 0
 
     def __init__(self, task: TaskBase) -> None:
-        self.parameters, self.xp = task.parameters, task.xp
+        self.parameters: Any = task.parameters
+        self.xp: ModuleType = task.xp
 
     @classmethod
     def is_in(cls, parameters: Any) -> bool:
@@ -153,11 +154,11 @@ class Disturbances:
     """
 
     def __init__(self, parts: Sequence[Disturbance], drawn: Sequence[Disturbance] | None = None) -> None:
-        self.parts = tuple(parts)
-        self.drawn = tuple(parts if drawn is None else drawn)
-        self.initial_normals = sum(part.initial_normals for part in parts)
-        self.normals = sum(part.normals for part in parts)
-        self.row_uniforms = sum(part.row_uniforms for part in parts)
+        self.parts: tuple[Disturbance, ...] = tuple(parts)
+        self.drawn: tuple[Disturbance, ...] = tuple(parts if drawn is None else drawn)
+        self.initial_normals: int = sum(part.initial_normals for part in parts)
+        self.normals: int = sum(part.normals for part in parts)
+        self.row_uniforms: int = sum(part.row_uniforms for part in parts)
 
     @classmethod
     def of(
@@ -370,8 +371,10 @@ class ColouredErrors(Disturbance):
 
     def __init__(self, task: TaskBase, interval: float, count: int, present: bool) -> None:
         super().__init__(task)
-        self.interval, self.count = interval, count
-        self.initial_normals = self.normals = count if present else 0
+        self.interval = interval
+        self.count = count
+        self.normals: int = count if present else 0
+        self.initial_normals: int = self.normals
 
     @abstractmethod
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import gymnasium
@@ -110,8 +111,8 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
-        self.parameters = task.parameters  # type: ignore[attr-defined]
-        self.xp = task.xp  # type: ignore[attr-defined]
+        self.parameters: Any = task.parameters  # type: ignore[attr-defined]
+        self.xp: ModuleType = task.xp  # type: ignore[attr-defined]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

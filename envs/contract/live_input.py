@@ -48,10 +48,12 @@ class LiveInput:
     start_values: Mapping[str, str]
 
     def __init__(self, task: "Task", initial: Any, measurement: Any, tracks: int) -> None:
-        self.task, self.tracks = task, tracks
+        self.task = task
+        self.tracks = tracks
         self.lanes: tuple[int, ...] = () if tracks == 1 else (tracks,)
         self.parameters: Any = task.parameters
-        self.initial, self.measurement = initial, measurement
+        self.initial = initial
+        self.measurement = measurement
         self._fields = {name: one for name, one in measurement._asdict().items() if hasattr(one, "dtype")}
         self.values, self.start_values = self.describe()
 
@@ -203,7 +205,8 @@ class LiveValues:
     """
 
     def __init__(self, input: LiveInput, values: Mapping[str, Any]) -> None:
-        self.input, self.values = input, values
+        self.input = input
+        self.values = values
 
     def has(self, *names: str) -> bool:
         """Whether all of these are given."""

@@ -58,7 +58,7 @@ class Model:
         self.filter = filter
         self._blocks = Blocks(filter.blocks, filter.quantities, self.task.xp)
         self.fields = self._blocks.fields
-        self.observation_limits = self._blocks.limits
+        self.observation_limits: numpy.ndarray = self._blocks.limits
         self.action_space = filter.action_space
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Model":

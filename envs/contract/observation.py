@@ -162,8 +162,8 @@ class Blocks:
     """
 
     def __init__(self, blocks: Sequence[Block], quantities: Sequence[Quantity], xp: ModuleType) -> None:
-        self.blocks = tuple(blocks)
-        self.quantities = {quantity.name: quantity for quantity in quantities}
+        self.blocks: tuple[Block, ...] = tuple(blocks)
+        self.quantities: dict[str, Quantity] = {quantity.name: quantity for quantity in quantities}
         self.xp = xp
         self.fields: tuple[Field, ...] = tuple(
             Field(name, block.unit, block.shown.text + block.text, block.over_interval)
@@ -171,7 +171,7 @@ class Blocks:
             for name in _field_names(block)
         )
         limits = [block.shown.limits for block in self.blocks for _ in _field_names(block)]
-        self.limits = numpy.array(limits).reshape(-1, 2).T
+        self.limits: numpy.ndarray = numpy.array(limits).reshape(-1, 2).T
         """Lower and upper bounds of what is shown, ``(2, fields)``."""
         names = [field.name for field in self.fields]
         known = [*(block.name for block in self.blocks), *self.quantities]
@@ -266,7 +266,9 @@ class DecisionMeans:
 
     def __init__(self, fields: Sequence[Field], interval: int) -> None:
         self.interval = interval
-        self.columns = [i for i, f in enumerate(fields) if f.over_interval == "mean"] if interval > 1 else []
+        self.columns: list[int] = [
+            i for i, f in enumerate(fields) if interval > 1 and f.over_interval == "mean"
+        ]
 
     def add(self, total: Array, observation: Array) -> Array:
         """Add these fields of an observation, ``(fields, N)``, to their sum since the last decision."""

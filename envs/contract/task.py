@@ -53,6 +53,9 @@ from .observation import Array
 from .task_base import TaskBase
 from .world import World
 
+Banks = Mapping[str, type[Bank[Any, Any, Any]]]
+"""Of each control, the bank that it steers."""
+
 
 class Component(NamedTuple):
     """One component of the estimation error."""
@@ -125,8 +128,9 @@ class Task(TaskBase):
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
     World: ClassVar[type[World[Any, Any, Any]]]
     """Truth and sensors."""
-    banks: ClassVar[Mapping[str, type[Bank[Any, Any, Any]]]]
+    banks: ClassVar[Banks]
     """What the action can steer, and the bank that it steers; the first is the default."""
+    controls: ClassVar[tuple[str, ...]]
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     reward: ClassVar[Reward]

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from types import ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
 from .draws import Draws
@@ -49,8 +50,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
-        self.parameters = task.parameters
-        self.xp = task.xp
+        self.parameters: Any = task.parameters
+        self.xp: ModuleType = task.xp
 
     @abstractmethod
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:

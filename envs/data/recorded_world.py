@@ -107,7 +107,7 @@ class _ForeignWorld(World[Task, Any, Any]):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
-        self.simulated = task.World(task)
+        self.simulated: World[Any, Any, Any] = task.World(task)
 
     def mask_missing(self, measurement: Any) -> Any:
         """Return a measurement with NaN in place of what was not received, as the task's own world does."""
@@ -145,7 +145,7 @@ class RecordedWorld(_ForeignWorld):
         self._initial, self._measurement = measure_once(plain, tables.measurements)
         # RecordedArrays of NumPy are read by compiled code as they are.
         kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
-        self.tables = RecordedArrays(
+        self.tables: RecordedArrays = RecordedArrays(
             {name: kept(values) for name, values in tables.measurements.items()},
             {name: kept(values) for name, values in tables.initial.items()},
             None if tables.truth is None else kept(tables.truth),
@@ -262,7 +262,8 @@ class LiveWorld(_ForeignWorld):
         super().__init__(task)
         self.initial, measurement = measure_examples(type(task)(task.parameters))
         self.measurement = self.simulated.add_recorded_fields(measurement) if second_sensor else measurement
-        self.initial_normals, self.normals = _count_numbers(self.initial), _count_numbers(self.measurement)
+        self.initial_normals: int = _count_numbers(self.initial)
+        self.normals: int = _count_numbers(self.measurement)
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Unknown, Any]:
         """Make an initial estimate of its numbers."""

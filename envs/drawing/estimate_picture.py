@@ -10,6 +10,7 @@ from typing import Any
 import numpy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from ..contract.model import Model
@@ -33,7 +34,7 @@ class EstimatePicture(Picture):
         track: of the whole episode, for limits that need not move, see :meth:`values`.
     """
 
-    strips_left = 0.56
+    strips_left: float = 0.56
     strip_columns = 1
     steered = False
 
@@ -41,11 +42,11 @@ class EstimatePicture(Picture):
         super().__init__(model)
         names = [component.name for component in self.task.components]
         planes = [parts for parts in self.task.groups.values() if len(parts) > 1]
-        self.plane = bool(planes)
-        self.drawn = [names.index(name) for name in (planes[0][:2] if planes else names[:1])]
-        self.measured = "seen" in track
+        self.plane: bool = bool(planes)
+        self.drawn: list[int] = [names.index(name) for name in (planes[0][:2] if planes else names[:1])]
+        self.measured: bool = "seen" in track
         path = numpy.concatenate([track[name] for name in ("truth", "estimate") if name in track])
-        self.limits = [_extent(path[:, i]) for i in self.drawn]
+        self.limits: list[tuple[float, float]] = [_extent(path[:, i]) for i in self.drawn]
 
     def values(self, track: Mapping[str, numpy.ndarray], k: int) -> dict[str, float]:
         """Return what the history keeps of a measurement.
@@ -90,8 +91,8 @@ class EstimatePicture(Picture):
         ]
         panel.set_xlabel(labels[0] if self.plane else self.clock, fontsize=9)
         panel.set_ylabel(labels[-1], fontsize=9)
-        (self.true,) = panel.plot([], [], color=BLACK, linewidth=1.6, label="truth", zorder=3)
-        (self.seen,) = panel.plot(
+        self.true: Line2D = panel.plot([], [], color=BLACK, linewidth=1.6, label="truth", zorder=3)[0]
+        self.seen: Line2D = panel.plot(
             [],
             [],
             color=ORANGE,
@@ -100,10 +101,10 @@ class EstimatePicture(Picture):
             markersize=4,
             label="measured" if self.measured else "_",
             zorder=2,
-        )
-        (self.believed,) = panel.plot([], [], color=BLUE, linewidth=1.3, label="estimate", zorder=4)
-        (self.now,) = panel.plot([], [], color=BLUE, linestyle="", marker="o", markersize=6, zorder=5)
-        self.ellipse = Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3, zorder=5)
+        )[0]
+        self.believed: Line2D = panel.plot([], [], color=BLUE, linewidth=1.3, label="estimate", zorder=4)[0]
+        self.now: Line2D = panel.plot([], [], color=BLUE, linestyle="", marker="o", markersize=6, zorder=5)[0]
+        self.ellipse: Ellipse = Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3, zorder=5)
         panel.add_patch(self.ellipse)
         panel.legend(
             loc="lower left",

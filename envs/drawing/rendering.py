@@ -111,7 +111,7 @@ class Picture:
 
     clock = "measurement"
     """What a measurement is called on the time axis and in the title."""
-    strips_left = 0.065
+    strips_left: float = 0.065
     """Where the strips begin, as a share of the figure's width: what is left of it belongs to the panels."""
     strip_columns = 0
     """Columns of strips; 0 for as many as their number asks for."""
@@ -276,14 +276,16 @@ class EpisodePicture:
         frames_per_second: float,
         picture: Picture | None = None,
     ) -> None:
-        self.model, self.scenario, self.mode = model, scenario, mode
+        self.model = model
+        self.scenario = scenario
+        self.mode = mode
         self.frames_per_second = frames_per_second
         self.caption = ""
         """What the title says beside environment, scenario and control, such as the policy's name."""
-        self.picture = picture_of(model) if picture is None else picture
+        self.picture: Picture = picture_of(model) if picture is None else picture
         self.history: dict[str, list[float]] = {}
         self.observations: list[numpy.ndarray] = []
-        self.count = 0
+        self.count: int = 0
         self._figure: Figure | None = None
         self._limits: Sequence[tuple[float, ...]] = ()
         self._ground: Any = None
@@ -486,7 +488,7 @@ class EpisodePictures:
         self.count = count
         if model.backend == "torch":
             model = model.on_numpy()
-        self.pictures = [
+        self.pictures: list[EpisodePicture] = [
             EpisodePicture(model, scenario, "rgb_array", frames_per_second)
             for _ in range(min(count, MAX_PICTURES))
         ]

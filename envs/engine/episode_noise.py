@@ -91,15 +91,16 @@ class EpisodeNoise:
     """
 
     def __init__(self, task: Task, count: int) -> None:
-        self.task, self._layout = task, task.noise
+        self._layout = task.noise
+        self.task = task
         self._rows = task.noise.normals + task.noise.row_uniforms
         self.generators: list[numpy.random.Generator] = []
         self._set_width(round_up_lanes(count))
 
     def _set_width(self, width: int) -> None:
         self.width = width
-        self.identities = numpy.zeros((2, width), dtype=numpy.uint64)
-        self.measurement = numpy.full(width, -1, dtype=numpy.int64)
+        self.identities: numpy.ndarray = numpy.zeros((2, width), dtype=numpy.uint64)
+        self.measurement: numpy.ndarray = numpy.full(width, -1, dtype=numpy.int64)
         self._forget()
 
     def _forget(self) -> None:

@@ -22,6 +22,7 @@ from ...compiler.functions import Specialised, map_arrays, round_up_lanes
 from ...filters.array_namespace import host_array, map_nested
 from ..contract.model import Episode, Model
 from ..contract.observation import Array, DecisionMeans
+from ..contract.task import Task
 from .compiled import can_step, share_world
 from .episode_noise import EpisodeNoise
 from .programs import Report
@@ -122,7 +123,9 @@ class ModelStepper:
     """
 
     def __init__(self, model: Model, width: int, report: Report | None = None) -> None:
-        self.model, self.width, self.report_function = model, width, report
+        self.model = model
+        self.width = width
+        self.report_function = report
         self._episode: Any = None
         self.shown: Array = None
         """What is shown, ``(fields, width)``; None until it is computed."""
@@ -264,9 +267,10 @@ class Lanes:
         report: Report | None = None,
     ) -> None:
         self.model = model
-        self.task = task = model.task
-        self.count = count
-        self.width = round_up_lanes(count)
+        self.task: Task = model.task
+        task = self.task
+        self.count: int = count
+        self.width: int = round_up_lanes(count)
         self.beside = beside
         self._models = [model] if beside is None else [model, beside.model]
         self._on_start, self._report = on_start, report
@@ -274,12 +278,12 @@ class Lanes:
         """Those of compiled models, by what they report."""
         self._moving: Sequence[EpisodeStepper] = []
         """Steppers that hold the episodes, of the task and of what runs beside it; none before the first episode."""
-        self.noise = EpisodeNoise(task, count)
+        self.noise: EpisodeNoise = EpisodeNoise(task, count)
         self._some: dict[int, EpisodeNoise] = {}
         """Noise of lanes that restart while others fly on, by their number."""
-        self.decisions = numpy.zeros(count, dtype=numpy.int64)
+        self.decisions: numpy.ndarray = numpy.zeros(count, dtype=numpy.int64)
         horizon = task.horizon // task.decision_interval
-        self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
+        self.decisions_per_episode: int = horizon if longest is None else min(horizon, longest)
         self._lengths = numpy.full(count, self.decisions_per_episode)
         """Decisions of each lane's episode."""
         self._means = DecisionMeans(model.fields, task.decision_interval)

@@ -76,7 +76,8 @@ class _ComputedOnce:
     """
 
     def __init__(self, compute: Callable[[Any], Any]) -> None:
-        self.compute, self.__doc__ = compute, compute.__doc__
+        self.__doc__ = compute.__doc__
+        self.compute = compute
 
     def __get__(self, holder: Any, owner: type) -> Any:
         found = holder.__dict__[self.compute.__name__] = self.compute(holder)

@@ -52,14 +52,15 @@ class Stepper:
         update, advance, predict, episode = model.programs.later
         tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
-        self.width, self._threads, self._model, self._report = width, model.threads, model, report
+        self._threads, self._model, self._report = model.threads, model, report
+        self.width = width
         self._world_of, self._shared = world_of, 0 if world_of is None else truths + measured
         count = itertools.count()
         self._template = map_arrays(lambda _: next(count), episode)
         self._kinds = [array.dtype.kind for array in leaves(episode)]
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
 
-        self.action = empty_lanes(update.inputs[-1].shape, width)
+        self.action: numpy.ndarray = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
         self._first_action = self.action[..., 0]
         fields = predict.outputs[-1].shape[0] if world_of is None else 0

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy
 
+from ..contract.model import Model
 from ..engine.backend import make_model
 from ..engine.catalogue import nearest
 from ..engine.scenario_choice import ScenarioChoice
@@ -48,7 +49,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         ImportError: for the compiled backend without llvmlite.
     """
 
-    metadata = {  # noqa: RUF012 (as in gymnasium.Env)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in gymnasium.Env)
         "render_modes": ["human", "rgb_array"],
         "render_fps": FRAMES_PER_SECOND,
     }
@@ -79,8 +80,8 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self._late: LatePicture | None = None
         if render_mode is not None:
             self._picture_of(self._first_distribution.names[0])
-        self.observation_space = self._observation_space()
-        self.action_space = self.model.action_space
+        self.observation_space: gymnasium.Space[Any] = self._observation_space()
+        self.action_space: gymnasium.Space[Any] = self.model.action_space
         is_row = isinstance(self.action_space, gymnasium.spaces.Box) and len(self.action_space.shape) == 1
         self._plain_action = self.action_space.shape if is_row else None
 
@@ -112,7 +113,7 @@ class TaskEnv(EnvBase, gymnasium.Env[Any, Any]):
         self.fleet.seed(0, self.np_random)
         self.fleet.restart()
         self._forget_errors([0])
-        self.model = self.fleet.model_of(0)
+        self.model: Model = self.fleet.model_of(0)
         if self._late is not None and self._late.model is not self.model:
             self._late.close()
             self._picture_of(self.fleet.scenario_of(0))

@@ -6,6 +6,7 @@ This module imports matplotlib; the environment imports it only when a render mo
 import numpy
 
 from ...filters.array_namespace import host_array
+from ..contract.model import Model
 from ..contract.observation import Array
 from ..drawing.rendering import EpisodePicture
 from ..engine.lanes import Lanes
@@ -23,7 +24,7 @@ class LatePicture:
     """
 
     def __init__(self, picture: EpisodePicture) -> None:
-        self.model = picture.model
+        self.model: Model = picture.model
         self._picture = picture
         self._lanes = Lanes(picture.model, 1)
         self._identity: numpy.ndarray | None = None

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy
@@ -83,11 +83,11 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         ImportError: for a backend whose library is not installed.
     """
 
-    metadata = {  # noqa: RUF012 (as in gymnasium.vector.VectorEnv)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in gymnasium.vector.VectorEnv)
         "render_modes": ["rgb_array"],
         "render_fps": FRAMES_PER_SECOND,
     }
-    reset_options = ("reset_mask", "shortened_by", "scenario", "parameters")
+    reset_options: ClassVar[tuple[str, ...]] = ("reset_mask", "shortened_by", "scenario", "parameters")
     pictures: "EpisodePictures | None" = None
     """What keeps and draws the first few episodes; None without a render mode."""
 
@@ -130,7 +130,7 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             make_model, self._class, control, backend=backend, device=device, threads=threads
         )
         self._open(make, scenario, keywords, num_envs, None if max_episode_steps == -1 else max_episode_steps)
-        self.device = self.task.device
+        self.device: Any = self.task.device
         self.autoreset_mode = autoreset_mode
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = num_envs
@@ -144,10 +144,10 @@ class TaskVectorEnv(EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 )
             name = self._first_distribution.names[0]
             self.pictures = EpisodePictures(self.model, name, num_envs, FRAMES_PER_SECOND)
-        self.single_observation_space = self._observation_space()
-        self.single_action_space = self.model.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.single_observation_space: gymnasium.Space[Any] = self._observation_space()
+        self.single_action_space: gymnasium.Space[Any] = self.model.action_space
+        self.observation_space: gymnasium.Space[Any] = batch_space(self.single_observation_space, num_envs)
+        self.action_space: gymnasium.Space[Any] = batch_space(self.single_action_space, num_envs)
         self._in_use = _OneThread()
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)

@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy
@@ -266,10 +267,10 @@ class StateSpaceProblem(Task):
     def set_up(self) -> None:
         """Put the models that the filters believe on the task's arrays."""
         own = self.definition
-        self.believed = [Equations(self, model) for model in own.filters]
+        self.believed: list[Equations] = [Equations(self, model) for model in own.filters]
         count = len(own.filters)
-        self.modes = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
-        self.transition = self.constant([list(row) for row in own.transition])
+        self.modes: tuple[str, ...] = tuple(f"hypothesis_{j}" for j in range(count)) if count > 1 else ()
+        self.transition: Array = self.constant([list(row) for row in own.transition])
 
     def _sampling_interval(self) -> float | None:
         """Return the time between measurements, s; None where it differs."""
@@ -285,19 +286,20 @@ class Equations:
     """
 
     def __init__(self, task: StateSpaceProblem, model: StateSpaceModel) -> None:
-        self.model, self.xp = model, task.xp
-        self.components = [component.name for component in task.components]
+        self.model = model
+        self.xp: ModuleType = task.xp
+        self.components: list[str] = [component.name for component in task.components]
         self._R = self._constant(task, model.R)
         self._Q = self._constant(task, model.Q)
         self._sources = {name: self._constant(task, own) for name, own in model.sources.items()}
         self._F, self._H = (
             None if one.matrix is None else task.constant(one.matrix) for one in (model.f, model.h)
         )
-        self.channels = task.definition.channels
-        self.periods = {row: one.period for one in self.channels if one.period for row in one.numbers}
+        self.channels: tuple[Channel, ...] = task.definition.channels
+        self.periods: dict[int, float] = {i: c.period for c in self.channels if c.period for i in c.numbers}
         """Of the numbers of a measurement that are angles."""
-        self.angles = task.periods
-        self.gated = any(channel.gate for channel in self.channels)
+        self.angles: dict[int, float] = task.periods
+        self.gated: bool = any(channel.gate for channel in self.channels)
         self._input_variances = [one.noise**2 for one in task.definition.inputs.values()]
 
     @staticmethod

@@ -57,10 +57,11 @@ class InputCourses:
     """
 
     def __init__(self, inputs: Sequence[Input], xp: ModuleType) -> None:
-        self.inputs, self.xp = tuple(inputs), xp
-        self.noisy = [j for j, one in enumerate(inputs) if one.noise > 0.0]
-        self.initial_normals = len(inputs)
-        self.normals = len(inputs) + len(self.noisy)
+        self.inputs: tuple[Input, ...] = tuple(inputs)
+        self.xp = xp
+        self.noisy: list[int] = [j for j, one in enumerate(inputs) if one.noise > 0.0]
+        self.initial_normals: int = len(inputs)
+        self.normals: int = len(inputs) + len(self.noisy)
 
     def begin(self, normals: Array) -> Array | None:
         """Inputs before the first measurement, ``(p, N)``, of standard normal numbers likewise; None without any."""

@@ -7,7 +7,7 @@ import numpy
 
 from ...compiler.vector_functions import VectorFunction
 from ..contract.live_input import LiveInput, Memory
-from .equations import StateSpaceProblem, find_invalid_noise
+from .equations import StateSpaceDefinition, StateSpaceProblem, find_invalid_noise
 
 UNEVEN = 0.01
 """Share of the sampling interval by which a time may be off, as in tables of regular measurements."""
@@ -20,12 +20,13 @@ class StateSpaceInput(LiveInput):
     """
 
     def __init__(self, task: StateSpaceProblem, initial: Any, measurement: Any, tracks: int) -> None:
-        self.definition = task.definition
-        self.measured, self.inputs = tuple(task.definition.measured), tuple(task.definition.inputs)
+        self.definition: StateSpaceDefinition = task.definition
+        self.measured: tuple[str, ...] = tuple(task.definition.measured)
+        self.inputs: tuple[str, ...] = tuple(task.definition.inputs)
         self.groups = [one for one in task.definition.channels if one.name not in (*self.measured, "values")]
         super().__init__(task, initial, measurement, tracks)
         own = task.definition
-        self.fuses = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
+        self.fuses: bool = all(model.stands_still(own.mean, own.usual_inputs) for model in own.filters)
         self._noise_varies = any(isinstance(model.R, VectorFunction) for model in own.filters)
         self._names = ["values", *(channel.name for channel in self.groups), *self.measured]
 

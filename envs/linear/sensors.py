@@ -136,12 +136,14 @@ class Receptions:
         channels: Sequence[Channel],
         deviations: numpy.ndarray,
     ) -> None:
-        self.parameters, self.xp = parameters, xp
-        self.channels, self.deviations = channels, deviations
-        self.due = [channel for channel in self.channels if channel.interval is not None]
-        self.losing = [channel for channel in self.channels if channel.availability < 1.0]
-        self.pauses = self.parameters.gaps > 0.0
-        self.row_uniforms = len(self.losing) + len(self.channels) * self.pauses
+        self.parameters = parameters
+        self.xp = xp
+        self.channels = channels
+        self.deviations = deviations
+        self.due: list[Channel] = [channel for channel in self.channels if channel.interval is not None]
+        self.losing: list[Channel] = [channel for channel in self.channels if channel.availability < 1.0]
+        self.pauses: bool = self.parameters.gaps > 0.0
+        self.row_uniforms: int = len(self.losing) + len(self.channels) * self.pauses
 
     def begin(self, draws: Draws, zero: Array) -> SensorStates | None:
         """State at the start of the track, of zeros ``(N,)``; None where nothing has to be remembered."""

@@ -73,32 +73,35 @@ class StateSpaceWorld(World[StateSpaceProblem, StateSpaceTruth, StateSpaceMeasur
     def __init__(self, task: StateSpaceProblem) -> None:
         super().__init__(task)
         own = task.definition
-        self.equations = [Equations(task, model) for model in own.world]
-        self.sensor_roots = [self._root(model.R) for model in own.world]
-        self.process_roots = [self._root(model.Q) for model in own.world]
-        self.courses = InputCourses(tuple(own.inputs.values()), task.xp)
-        self.timed, self.jitters = own.world[0].timed, self.parameters.jitter > 0.0
+        self.equations: list[Equations] = [Equations(task, model) for model in own.world]
+        self.sensor_roots: list[Array] = [self._root(model.R) for model in own.world]
+        self.process_roots: list[Array] = [self._root(model.Q) for model in own.world]
+        self.courses: InputCourses = InputCourses(tuple(own.inputs.values()), task.xp)
+        self.timed: bool = own.world[0].timed
+        self.jitters: bool = self.parameters.jitter > 0.0
         if self.jitters and not self.timed:
             raise ValueError(
                 f"{task.id} knows no time, so jitter must be 0, got {self.parameters.jitter}: write f(x, dt) and Q(dt)"
             )
-        self.initial_root = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
+        self.initial_root: Array = task.constant(semidefinite_root(own.covariance[..., None])[..., 0])
         first = own.world[0]
         n, m = len(own.mean), first.h.size
-        self.states, self.noises = n, n + m
-        self.initial_normals = n + self.courses.initial_normals
-        self.normals = self.noises + self.courses.normals
-        self.switches = own.switching and len(own.world) > 1
-        self.loses = self.parameters.availability < 1.0
-        self.drawn = int(self.switches) + int(self.jitters) + int(self.loses)
+        self.states: int = n
+        self.noises: int = n + m
+        self.initial_normals: int = n + self.courses.initial_normals
+        self.normals: int = self.noises + self.courses.normals
+        self.switches: bool = own.switching and len(own.world) > 1
+        self.loses: bool = self.parameters.availability < 1.0
+        self.drawn: int = int(self.switches) + int(self.jitters) + int(self.loses)
         usual = usual_sensor_noise(first, own.mean, self.parameters.sampling_interval, own.inputs)
-        self.receptions = Receptions(task.parameters, task.xp, own.channels, numpy.sqrt(numpy.diag(usual)))
-        self.delayed = self.drawn + self.receptions.row_uniforms
-        self.delays = self.parameters.late > 0.0
-        self.row_uniforms = self.delayed + len(own.channels) * self.delays
+        deviations = numpy.sqrt(numpy.diag(usual))
+        self.receptions: Receptions = Receptions(task.parameters, task.xp, own.channels, deviations)
+        self.delayed: int = self.drawn + self.receptions.row_uniforms
+        self.delays: bool = self.parameters.late > 0.0
+        self.row_uniforms: int = self.delayed + len(own.channels) * self.delays
         turning = {j for one in own.channels if one.period for j in one.numbers}
         # An angle is no reading of a component that turns on beyond it.
-        self.places = [None if j in turning else j for j in components_measured(first.h)]
+        self.places: list[int | None] = [None if j in turning else j for j in components_measured(first.h)]
 
     def _root(self, covariance: numpy.ndarray | VectorFunction) -> Array | None:
         """Root of a covariance that is the same for all measurements; None of any other."""
@@ -328,8 +331,8 @@ class StateSpace(StateSpaceProblem):
     """
 
     Parameters = StateSpaceParameters
-    World = StateSpaceWorld
-    reward = Reward("weighted squared error of the components", "log-relative")
+    World: ClassVar[type[StateSpaceWorld]] = StateSpaceWorld
+    reward: ClassVar[Reward] = Reward("weighted squared error of the components", "log-relative")
 
 
 REACH = {"noise": ("noise_decades",), "gain": ("gain_factor",), "evidence": ("evidence_scale",)}

@@ -79,7 +79,8 @@ class StateSpaceBank(Bank[StateSpaceProblem, StateSpaceMeasurement, ExtendedKalm
         super().__init__(task, control)
         self.equations: Equations = task.believed[0]
         own = self.equations.model
-        self.states, self.sensors = own.f.size, own.h.size
+        self.states: int = own.f.size
+        self.sensors: int = own.h.size
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
@@ -237,8 +238,8 @@ class StateSpaceKalmanNetBank(StateSpaceBank):
         super().__init__(task, control)
         usual = task.definition.usual_noise(self.parameters.sampling_interval)
         sigma = numpy.sqrt(numpy.diag(usual))
-        self.deviations = task.constant(sigma)[:, None]
-        self.scales = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
+        self.deviations: Array = task.constant(sigma)[:, None]
+        self.scales: Array = task.constant(1.0 / numpy.where(sigma > 0.0, sigma, 1.0))[:, None]
 
     @property
     def answers(self) -> Sequence[str]:
@@ -369,8 +370,10 @@ class MultipleModelBank(Bank[StateSpaceProblem, StateSpaceMeasurement, Mixture])
         of_sensors: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(task, control)
-        self.count, self.factor, self.of_sources = len(task.believed), process_noise, of_sources
-        self.sensor_factors = measurement_noise, of_sensors
+        self.count: int = len(task.believed)
+        self.factor = process_noise
+        self.of_sources = of_sources
+        self.sensor_factors: tuple[Any, Mapping[str, Any] | None] = measurement_noise, of_sensors
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

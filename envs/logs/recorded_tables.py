@@ -66,8 +66,10 @@ class Columns:
         given: Mapping[str, Any],
         log_time: numpy.ndarray | None = None,
     ) -> None:
-        self.name, self.table, self.given = name, table, given
-        self.log_time = self.time if log_time is None else log_time
+        self.name = name
+        self.table = table
+        self.given = given
+        self.log_time: numpy.ndarray = self.time if log_time is None else log_time
         self.notes: list[str] = []
         """What was done to the table, a line each."""
         self.origin: PlaneOrigin | None = None

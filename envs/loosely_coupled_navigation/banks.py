@@ -120,9 +120,9 @@ class KalmanBucyBank(Bank[Task, Measurement, Any]):
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
         p = self.parameters
-        self.axes = AXES[: p.axes] if p.axes > 1 else ()
-        self.forgetting = -math.expm1(-1.0 / p.averaging_measurements)
-        self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
+        self.axes: tuple[str, ...] = AXES[: p.axes] if p.axes > 1 else ()
+        self.forgetting: float = -math.expm1(-1.0 / p.averaging_measurements)
+        self.eye: Array = task.constant(numpy.eye(p.axes))[:, :, None]
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -362,7 +362,7 @@ class GainBank(KalmanBucyBank):
         p = self.parameters
         self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
         smallest = math.log(p.smallest_gain)
-        self.middle = min(max(math.log(p.steady_state_gains[1]), 0.9 * smallest), 0.1 * smallest)
+        self.middle: float = min(max(math.log(p.steady_state_gains[1]), 0.9 * smallest), 0.1 * smallest)
         """Logarithm of the gain at action 0: of the paper's, where that leaves room on both sides."""
 
     @property
@@ -443,13 +443,13 @@ rounding, and it reports to be certain."""
 class SchemeBank(KalmanBucyBank):
     """Controls ``mode`` and ``weights``: three filters run side by side without mixing; the action reports."""
 
-    filters = SCHEMES
+    filters: tuple[str, ...] = SCHEMES
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
         least = LEAST_GROWTH * self.parameters.receiver_variance
         growth = [max(each, least) for each in self.parameters.plain_growth]
-        self.plain_growth = task.constant(growth)[:, None, None]
+        self.plain_growth: Array = task.constant(growth)[:, None, None]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

@@ -1,7 +1,7 @@
 """What may befall the receiver of LooselyCoupledNavigation: a class for each."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters.array_namespace import namespace
 from ..contract.causes import MISSED, OUTLIER, Cause, Moment
@@ -192,7 +192,7 @@ class Outage(_Once):
     """The receiver has no fix."""
 
     name = "outage"
-    causes = (
+    causes: ClassVar[tuple[Cause, ...]] = (
         MISSED._replace(name="outage", phrase="in outages of the receiver"),
         Cause("after outage", f"in the {AFTERMATH:g} measurements after an outage", _follows_outage),
     )
@@ -218,7 +218,7 @@ class Jamming(_Hidden):
     """The noise of the receiver rises; nobody says so. Its strength is the standard deviation over that without."""
 
     name = "jamming"
-    causes = (_within("jamming", "under jamming"),)
+    causes: ClassVar[tuple[Cause, ...]] = (_within("jamming", "under jamming"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
         """Draw how much."""
@@ -241,7 +241,7 @@ class Spoofing(_Hidden):
     """Every axis is pulled off; its strength is the rate, m/s."""
 
     name = "spoofing"
-    causes = (_within("spoofing", "under spoofing"),)
+    causes: ClassVar[tuple[Cause, ...]] = (_within("spoofing", "under spoofing"),)
 
     def complete(self, state: Spell, draws: Draws) -> Spell:
         """Draw how fast."""
@@ -266,7 +266,7 @@ class ReceiverOutliers(Outliers):
     """Fixes that are noisier than the others, each one on its own."""
 
     name = "outliers"
-    causes = (OUTLIER,)
+    causes: ClassVar[tuple[Cause, ...]] = (OUTLIER,)
 
     @staticmethod
     def limits(parameters: LooselyCoupledNavigationParameters) -> tuple[float, float]:

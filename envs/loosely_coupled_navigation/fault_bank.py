@@ -30,7 +30,7 @@ a prediction with ``f5 Q`` and ``f6 W``, as these only add. Without a fix nothin
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -120,30 +120,32 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
     def __init__(self, task: Task, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.settings = {
+        self.settings: Mapping[str, float] = {
             "pull": 1.05, "modelled": 1.05, "level": 1.5, "receiver": 1.25, "inertial": 2.0, "wandering": 2.0
         }  # fmt: skip
-        self.prior, p = prior._replace(**changed), task.parameters
-        prior, self.interval = self.prior, p.sampling_interval
-        self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
-        self.spacing = max(round(prior.longest / (prior.onsets * self.interval)), 1)
-        self.noises = Noises(*(task.constant(each)[:, None, None] for each in draw_noises(prior, p)))
-        self.others = Noises(*(each[1:] for each in self.noises))
-        self.noise_weights = task.constant(
+        p = task.parameters
+        self.prior: FaultPrior = prior._replace(**changed)
+        prior = self.prior
+        self.interval: float = p.sampling_interval
+        self.eye: Array = task.constant(numpy.eye(p.axes))[:, :, None]
+        self.spacing: int = max(round(prior.longest / (prior.onsets * self.interval)), 1)
+        self.noises: Noises = Noises(*(task.constant(each)[:, None, None] for each in draw_noises(prior, p)))
+        self.others: Noises = Noises(*(each[1:] for each in self.noises))
+        self.noise_weights: Array = task.constant(
             numpy.array([prior.modelled] + [(1.0 - prior.modelled) / prior.points] * prior.points)
         )[:, None, None]
-        self.factors = task.constant(numpy.array([*prior.levels]))[:, None]
+        self.factors: Array = task.constant(numpy.array([*prior.levels]))[:, None]
         uniform = numpy.full(len(prior.levels), 1.0 / len(prior.levels))
         exact = numpy.isclose(prior.levels, 1.0).astype(float)
-        self.uniform = task.constant(uniform)[:, None]
-        self.fresh = task.constant((1.0 - prior.distrust) * exact + prior.distrust * uniform)[:, None]
+        self.uniform: Array = task.constant(uniform)[:, None]
+        self.fresh: Array = task.constant((1.0 - prior.distrust) * exact + prior.distrust * uniform)[:, None]
         every = range((1 + prior.points) + prior.points * prior.onsets)
         raised = [[float(h > prior.points) for h in every], [float(h == 0) for h in every]]
-        self.raised = task.constant(raised)[:, :, None]
+        self.raised: Array = task.constant(raised)[:, :, None]
         """Whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
         highest = math.log(prior.levels[-1]) or 1.0
-        self.heights = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
-        self.onsets = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
+        self.heights: Array = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
+        self.onsets: Array = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
 
     def start(self, initial: Initial) -> FaultState:
         """Start where INS and reference agree, without a pull."""

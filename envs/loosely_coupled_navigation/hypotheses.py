@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
-from ..contract.controls import SettingsBank
+from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     Array,
@@ -50,15 +50,16 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, KalmanBucyBank):
     """The bank over faults, steered by factors of its weights, of its levels and of its noises."""
 
-    strong = FaultBank
+    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultBank
 
     def __init__(self, task: Task, control: str) -> None:
         super().__init__(task, control)
         prior = self.own.prior
-        self.noise_names = ("modelled", *(f"point_{j}" for j in range(1, prior.points + 1)))
-        self.groups = (*self.noise_names, "young_pull", "old_pull")
+        points = (f"point_{j}" for j in range(1, prior.points + 1))
+        self.noise_names: tuple[str, ...] = ("modelled", *points)
+        self.groups: tuple[str, ...] = (*self.noise_names, "young_pull", "old_pull")
         """Of hypotheses whose probabilities are shown: by their noises, and those of pulls too young to end, or not."""
-        self.level_names = tuple(str(i) for i in range(1, len(prior.levels) + 1))
+        self.level_names: tuple[str, ...] = tuple(str(i) for i in range(1, len(prior.levels) + 1))
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -11,12 +11,12 @@ it with white noise, and where the scenario says so with a coloured error e besi
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ...extensions import load_present
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LostTracks, Paper, TrainedBanks
-from ..contract.task import Component, PaperPolicy, Reward, Task
+from ..contract.task import Banks, Component, PaperPolicy, Reward, Task
 from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES
@@ -102,8 +102,8 @@ class LooselyCoupledNavigation(Task):
     id = ID
     interface = 4
     Parameters = LooselyCoupledNavigationParameters
-    World = InsGnssWorld
-    banks = {
+    World: ClassVar[type[InsGnssWorld]] = InsGnssWorld
+    banks: ClassVar[Banks] = {
         "noise": NoiseBank,
         "gain": GainBank,
         "hypotheses": HypothesesBank,
@@ -111,15 +111,15 @@ class LooselyCoupledNavigation(Task):
         "weights": SchemeBank,
     }
     scenarios = SCENARIOS
-    modes = SCHEMES
+    modes: tuple[str, ...] = SCHEMES
     # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
-    reward = Reward(
+    reward: ClassVar[Reward] = Reward(
         "squared error of position over the nominal variance of a measurement",
         "log-relative",
         unit=0.16,
         log_unit=0.02,
     )
-    paper_policy = PaperPolicy("gain", (0.0,))
+    paper_policy: PaperPolicy = PaperPolicy("gain", (0.0,))
     companions: tuple[Any, ...] = (
         Paper(
             "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
@@ -167,7 +167,7 @@ class LooselyCoupledNavigation(Task):
         p = self.parameters
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         group = "position" if p.axes > 1 else ""
-        self.components = tuple(Component(name, "m", group=group) for name in names)
+        self.components: tuple[Component, ...] = tuple(Component(name, "m", group=group) for name in names)
         action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
         self.companions = (LostTracks(float(p.axes)), *type(self).companions)

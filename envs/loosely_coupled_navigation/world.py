@@ -1,7 +1,7 @@
 """The motion of LooselyCoupledNavigation, its INS, and the receiver; equations in ``filters/loosely_coupled.py``."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
@@ -69,19 +69,20 @@ class Measurement(NamedTuple):
 class InsGnssWorld(World[Task, Truth, Measurement]):
     """A motion of harmonics, an inertial system with three rate errors, and a satellite receiver."""
 
-    own_parameters = ("duration",)
+    own_parameters: ClassVar[tuple[str, ...]] = ("duration",)
     parameters: LooselyCoupledNavigationParameters
-    received_field, stated_field = "fix", "reported_deviation"
+    received_field = "fix"
+    stated_field = "reported_deviation"
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         axes = self.parameters.axes
-        self.disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
-        self.initial_normals = 2 * axes + self.disturbances.initial_normals
-        self.normals = 3 * axes + self.disturbances.normals
-        self.row_uniforms = self.disturbances.row_uniforms
-        self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
-        self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
+        self.disturbances: Disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
+        self.initial_normals: int = 2 * axes + self.disturbances.initial_normals
+        self.normals: int = 3 * axes + self.disturbances.normals
+        self.row_uniforms: int = self.disturbances.row_uniforms
+        self.phase: Array = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
+        self.no_covariance: Array = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
     def reading_deviations(self, measurement: Measurement) -> Array:
         """What the receiver reports."""

@@ -116,9 +116,9 @@ class RadarBank(Bank[TargetProblem, Measurement, Any]):
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         self.T = self.parameters.sampling_interval
-        self.regular = task.regular
-        self.forgetting = math.exp(-1.0 / self.parameters.averaging_measurements)
-        self.average = f"exponential average over {self.parameters.averaging_measurements:g} scans"
+        self.regular: bool = task.regular
+        self.forgetting: float = math.exp(-1.0 / self.parameters.averaging_measurements)
+        self.average: str = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
     def exponential_average(self, measurement: Measurement, old: Array, new: Array) -> Array:
         """Exponential average with a new value taken in, if there is one."""
@@ -337,10 +337,10 @@ class FilterBank(RadarBank):
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
         p = self.parameters
-        self.count = len(p.gains)
-        self.gain_alpha = task.constant(p.gains)[:, None]
-        self.gain_beta = alpha_beta.benedict_bordner_beta(self.gain_alpha)
-        self.transition = task.constant(p.transition)
+        self.count: int = len(p.gains)
+        self.gain_alpha: Array = task.constant(p.gains)[:, None]
+        self.gain_beta: Array = alpha_beta.benedict_bordner_beta(self.gain_alpha)
+        self.transition: Array = task.constant(p.transition)
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
@@ -486,7 +486,7 @@ class GainsBank(FilterBank):
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
-        self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
+        self.logit: Array = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

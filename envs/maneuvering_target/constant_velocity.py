@@ -1,12 +1,14 @@
 """The constant-velocity model of ManeuveringTarget, over the time between two scans, whatever it is."""
 
 import math
+from types import ModuleType
 from typing import Any
 
 from ...filters import kalman
 from ...filters.small_matrices import outer
 from ..contract.filter import Likelihood
 from ..contract.observation import Array
+from .parameters import ManeuveringTargetParameters
 from .problem import TargetProblem
 from .world import Measurement
 
@@ -15,13 +17,15 @@ class ConstantVelocityModel:
     """The constant-velocity model in x and y."""
 
     def __init__(self, task: TargetProblem) -> None:
-        self.task, self.parameters, self.xp = task, task.parameters, task.xp
+        self.task = task
+        self.parameters: ManeuveringTargetParameters = task.parameters
+        self.xp: ModuleType = task.xp
         moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
-        self.unmoved = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
-        self.moved = task.constant(moved)[:, :, None] - self.unmoved
-        self.correlated = task.constant([[float(entry > 0.0) for entry in row] for row in noise])[:, :, None]
+        self.unmoved: Array = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
+        self.moved: Array = task.constant(moved)[:, :, None] - self.unmoved
+        self.correlated: Array = task.constant([[float(q > 0.0) for q in row] for row in noise])[:, :, None]
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-        self.identity = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
+        self.identity: Array = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 
     def motion(self, T: Array) -> tuple[Array, Array]:
         """Transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over intervals.

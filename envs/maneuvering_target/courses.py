@@ -8,6 +8,7 @@ each.
 import itertools
 import math
 from abc import ABC, abstractmethod
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from ...filters import coordinated_turn
@@ -32,7 +33,9 @@ class Course(ABC):
     parameters: ManeuveringTargetParameters
 
     def __init__(self, task: Task) -> None:
-        self.task, self.parameters, self.xp = task, task.parameters, task.xp
+        self.parameters = task.parameters
+        self.task = task
+        self.xp: ModuleType = task.xp
 
     @abstractmethod
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
@@ -382,7 +385,7 @@ class Table(Course):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
-        self.table = task.constant(self.parameters.track)
+        self.table: Array = task.constant(self.parameters.track)
         """Rows x, y, vx, vy, ``(4, horizon + 2)``; of several flights one after another."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
@@ -419,7 +422,7 @@ class TableOfSeveral(Table):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
-        self.ends = [0, *itertools.accumulate(scans + 2 for scans in self.parameters.track_scans)]
+        self.ends: list[int] = [0, *itertools.accumulate(scans + 2 for scans in self.parameters.track_scans)]
         """Columns of the table at which flights begin, and its width."""
 
     def begin(self, draws: Draws, ones: Array) -> tuple[Tracks, Motion]:

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import imm
 from ...filters.ordered_sums import ordered_sum
 from ...filters.small_matrices import apply, product, transpose
-from ..contract.controls import SettingsBank
+from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
@@ -55,7 +55,7 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, RadarBank):
     """The semi-Markov Gaussian sum, steered by factors of its weights, covariances and measurement noise."""
 
-    strong = SemiMarkov
+    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = SemiMarkov
 
     def __init__(self, task: TargetProblem, control: str) -> None:
         super().__init__(task, control)
@@ -70,7 +70,7 @@ class HypothesesBank(SettingsBank, RadarBank):
             *([h for kind in kinds for h in kind[1:-1]] for kinds in together),
             *([kind[-1] for kind in kinds] for kinds in together),
         )
-        self.groups = dict(zip(GROUPS, members, strict=True))
+        self.groups: dict[str, list[int]] = dict(zip(GROUPS, members, strict=True))
 
     @property
     def blocks(self) -> Sequence[Block]:

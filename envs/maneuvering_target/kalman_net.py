@@ -181,7 +181,8 @@ class KalmanNetBank(Bank[TargetProblem, Measurement, KalmanNetState]):
         super().__init__(task, control)
         # Columns of the identity.
         columns = numpy.eye(4)[:, :, None]
-        self.positions, self.velocities = task.constant(columns[:, :2]), task.constant(columns[:, 2:])
+        self.positions: Array = task.constant(columns[:, :2])
+        self.velocities: Array = task.constant(columns[:, 2:])
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -64,16 +64,16 @@ class ManeuveringTargetPicture(Picture):
     """Track, close-up, normalised innovation, gain or weights, position error."""
 
     clock = "scan"
-    strips_left = 0.545
+    strips_left: float = 0.545
     strip_columns = 1
 
     task: TargetProblem
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.flight = numpy.empty((2, 0))
+        self.flight: numpy.ndarray = numpy.empty((2, 0))
         self.maneuvers: list[tuple[float, float]] = []
-        self.largest_sigma = 1.0
+        self.largest_sigma: float = 1.0
 
     # --- the history
 
@@ -192,30 +192,30 @@ class ManeuveringTargetPicture(Picture):
         close_up.set_ylabel("y minus true y, km", fontsize=9, labelpad=1)
         cross: dict[str, Any] = {"linestyle": "", "marker": "x", "color": ORANGE}
         dot: dict[str, Any] = {"linestyle": "", "marker": "o", "color": BLUE}
-        (self.true,) = track.plot([], [], color=BLACK, linewidth=1.2, zorder=2)
-        (self.measured,) = track.plot([], [], **cross, markersize=4, markeredgewidth=0.9, zorder=3)
-        (self.estimated,) = track.plot(
+        self.true: Line2D = track.plot([], [], color=BLACK, linewidth=1.2, zorder=2)[0]
+        self.measured: Line2D = track.plot([], [], **cross, markersize=4, markeredgewidth=0.9, zorder=3)[0]
+        self.estimated: Line2D = track.plot(
             [], [], color=BLUE, marker="o", markersize=2.6, linewidth=1.0, zorder=4
-        )
-        (self.target,) = track.plot(
+        )[0]
+        self.target: Line2D = track.plot(
             [], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=5
-        )
-        (self.arrived,) = track.plot(
+        )[0]
+        self.arrived: Line2D = track.plot(
             [], [], linestyle="", marker="s", markersize=7, markerfacecolor="none", markeredgewidth=1.4,
             color=VERMILLION, zorder=6,
-        )  # fmt: skip
-        (self.radar,) = track.plot(
+        )[0]  # fmt: skip
+        self.radar: Line2D = track.plot(
             [0.0], [0.0], linestyle="", marker="^", markersize=8, color=GREEN, zorder=5
-        )
-        self.ellipses = [
+        )[0]
+        self.ellipses: list[Ellipse] = [
             Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3) for _ in range(2)
         ]
         track.add_patch(self.ellipses[0])
         close_up.add_patch(self.ellipses[1])
-        (self.past_measured,) = close_up.plot([], [], **cross, alpha=0.35, markersize=4, zorder=2)
-        (self.past_estimated,) = close_up.plot([], [], **dot, alpha=0.3, markersize=3, zorder=3)
+        self.past_measured: Line2D = close_up.plot([], [], **cross, alpha=0.35, markersize=4, zorder=2)[0]
+        self.past_estimated: Line2D = close_up.plot([], [], **dot, alpha=0.3, markersize=3, zorder=3)[0]
         (self.last_measured,) = close_up.plot([], [], **cross, markersize=8, markeredgewidth=1.8, zorder=4)
-        (self.last_estimated,) = close_up.plot([], [], **dot, markersize=6, zorder=5)
+        self.last_estimated: Line2D = close_up.plot([], [], **dot, markersize=6, zorder=5)[0]
         close_up.plot([0.0], [0.0], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=6)
         ring = Line2D([], [], linestyle="", marker="o", markersize=10, markerfacecolor="none", color=BLUE)
         ground = Line2D([], [], linestyle="", marker="s", markersize=10, color=PALE)
@@ -243,7 +243,7 @@ class ManeuveringTargetPicture(Picture):
         half = 0.5 * kilometres_per_inch * numpy.array([width, height])
         self.track.set_xlim(middle[0] - half[0], middle[0] + half[0])
         self.track.set_ylim(middle[1] - half[1], middle[1] + half[1])
-        self.reach = math.ceil(CLOSE_UP_SIGMAS * self.largest_sigma * 10.0) / 10.0
+        self.reach: float = math.ceil(CLOSE_UP_SIGMAS * self.largest_sigma * 10.0) / 10.0
         self._set_reach(self.reach)
 
     def _set_reach(self, reach: float) -> None:

@@ -12,7 +12,7 @@ class TargetProblem(Task):
 
     def set_up(self) -> None:
         """Find out whether the scans are regular."""
-        self.regular = self.parameters.regular and (
+        self.regular: bool = self.parameters.regular and (
             self.recording is None or has_regular_scans(self.recording, self.parameters)
         )
         """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""

@@ -1,5 +1,6 @@
 """The scans of ManeuveringTarget's radar: when they come, and whether they see the target."""
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy
@@ -42,7 +43,9 @@ class RegularScans:
     parameters: ManeuveringTargetParameters
 
     def __init__(self, task: Task, course: Course) -> None:
-        self.parameters, self.xp, self.course = task.parameters, task.xp, course
+        self.parameters = task.parameters
+        self.xp: ModuleType = task.xp
+        self.course = course
 
     def begin(self, draws: Draws, motion: Motion) -> Any:
         """Draw what holds for an episode, whose track begins with a measurement on time: here nothing."""

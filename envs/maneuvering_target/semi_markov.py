@@ -18,7 +18,7 @@ missed the target is prediction only.
 import functools
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from ...filters import contaminated_normal, coordinated_turn, imm, kalman, semi_markov
@@ -154,13 +154,15 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
 
     def __init__(self, task: TargetProblem, prior: SemiMarkovPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.settings = {
+        self.settings: Mapping[str, float] = {
             "begun": 3.0, "ended": 9.0, "turning": 1.5, "straight": 1.25, "manoeuvre": 1.25, "noise": 1.25
         }  # fmt: skip
-        self.prior = prior = prior._replace(**changed)
-        self.ages, self.hazard = len(prior.hazards), task.constant(prior.hazards)[:, None]
+        prior = prior._replace(**changed)
+        self.prior = prior
+        self.ages: int = len(prior.hazards)
+        self.hazard: Array = task.constant(prior.hazards)[:, None]
         sizes = [(size, prior.turn_spread, 1.0 - prior.hard_turns) for size in prior.turns]
-        self.turns = [
+        self.turns: list[Turn] = [
             Turn(side * size, spread, share / (2 * len(sizes)))
             for size, spread, share in sizes
             for side in (1.0, -1.0)
@@ -174,7 +176,7 @@ class SemiMarkov(ConstantVelocityModel, SteerableFilter[TargetProblem, Measureme
         every = range(self.kinds[-1][-1] + 1)
         begun, turning = [kind[0] for kind in self.kinds], range(self.kinds[0][-1] + 1, len(every))
         raised = [[float(h in those) for h in every] for those in (begun, [0], turning)]
-        self.raised = task.constant(raised)[:, :, None]
+        self.raised: Array = task.constant(raised)[:, :, None]
         """Whose weights each of the first three settings multiplies, ``(3, H, 1)``."""
 
     def start(self, initial: Initial) -> SemiMarkovState:

@@ -7,6 +7,7 @@ whole problem turns and moves the estimates.
 """
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from ...filters.small_matrices import apply, product, transpose
 from ..contract.observation import Array, Block
@@ -31,8 +32,9 @@ class RadarStudentBank(StudentBank[object, Measurement]):
 
     parameters: ManeuveringTargetParameters
     # An alpha-beta filter without training: a half, and a quarter of the innovation over the scan period.
-    gain = ((0, 0.5), (1, 0.5), (0, 0.25), (1, 0.25))
-    axes, motions = FRAME, (2, 3)
+    gain: ClassVar[Sequence[tuple[int, float]]] = ((0, 0.5), (1, 0.5), (0, 0.25), (1, 0.25))
+    axes: ClassVar[Sequence[str]] = FRAME
+    motions: ClassVar[Sequence[int]] = (2, 3)
 
     def rotate(self, mean: Array) -> Array:
         """Turn positions and velocities alike, ``(4, 4, N)``."""

@@ -86,7 +86,8 @@ class StudentBank(Bank[TaskT, Measurement, StudentState]):
 
     def __init__(self, task: TaskT, control: str) -> None:
         super().__init__(task, control)
-        self.size, self.measured = len(self.gain), len(self.axes)
+        self.size: int = len(self.gain)
+        self.measured: int = len(self.axes)
 
     @abstractmethod
     def rotate(self, mean: Array) -> Array:

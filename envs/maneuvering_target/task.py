@@ -5,14 +5,14 @@ algorithm over two alpha-beta filters" (in Russian). Equation numbers are theirs
 the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``filters/polar.py``.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ...extensions import load_present
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward
+from ..contract.task import Banks, Component, PaperPolicy, Reward
 from . import ID
 from .banks import FilterBank, GainBank, GainsBank
 from .causes import CAUSES
@@ -98,8 +98,8 @@ class ManeuveringTarget(TargetProblem):
     # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain then.
     interface = 2
     Parameters = ManeuveringTargetParameters
-    World = RadarWorld
-    banks = {
+    World: ClassVar[type[RadarWorld]] = RadarWorld
+    banks: ClassVar[Banks] = {
         "evidence": FilterBank,
         "gains": GainsBank,
         "gain": GainBank,
@@ -108,7 +108,7 @@ class ManeuveringTarget(TargetProblem):
         "weights": FilterBank,
     }
     scenarios = SCENARIOS
-    components = (
+    components: tuple[Component, ...] = (
         Component("position_x", "m", group="position"),
         Component("position_y", "m", group="position"),
         Component("velocity_x", "m/s", group="velocity"),
@@ -116,13 +116,13 @@ class ManeuveringTarget(TargetProblem):
     )
     # What a turn costs rules the noise of the reward, and who does nothing bears it too; a logarithm, because a few
     # hard turns would hide what an action changes on all other flights.
-    reward = Reward(
+    reward: ClassVar[Reward] = Reward(
         "squared position error over the squared range sigma",
         "log-relative",
         unit=8.0,
     )
-    paper_policy = PaperPolicy("evidence", (0.0, 0.0))
-    companions = (
+    paper_policy: PaperPolicy = PaperPolicy("evidence", (0.0, 0.0))
+    companions: tuple[Any, ...] = (
         Paper(
             "P. A. Bakulev, M. I. Sychev, Nguyen Trong Luu, Tracking a manoeuvring target with an IMM algorithm "
             "over two alpha-beta filters (in Russian)"
@@ -161,10 +161,10 @@ class ManeuveringTarget(TargetProblem):
         """Name the hypotheses and the paper's action."""
         super().set_up()
         count = len(self.parameters.gains)
-        self.flights = self.parameters.track_scans
-        self.modes = tuple(f"mode_{j + 1}" for j in range(count))
+        self.flights: tuple[int, ...] = self.parameters.track_scans
+        self.modes: tuple[str, ...] = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
-        self.closes_loop = self.parameters.cluttered
+        self.closes_loop: bool = self.parameters.cluttered
 
     def feedback(self, mean: Array, covariance: Array, measurement: Any) -> ReportedTrack:
         """Track about which the radar looks for plots."""

@@ -1,7 +1,7 @@
 """The flight of ManeuveringTarget, and the radar that measures it; equations in ``filters/polar.py``."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import polar
 from ...filters.data_association import Plots
@@ -12,7 +12,7 @@ from ..contract.observation import Array
 from ..contract.task import Task
 from ..contract.world import World
 from .clutter import ReportedTrack
-from .courses import course_of
+from .courses import Course, course_of
 from .disturbances import DISTURBANCES
 from .parameters import ManeuveringTargetParameters
 from .scans import RegularScans, Reliability, UnreliableScans
@@ -81,22 +81,22 @@ class RadarWorld(World[Task, Truth, Measurement]):
         disturbances: what else may go wrong with it.
     """
 
-    own_parameters = ("flight", "track", "track_scans")
+    own_parameters: ClassVar[tuple[str, ...]] = ("flight", "track", "track_scans")
     parameters: ManeuveringTargetParameters
-    received_field, stated_field, elapsed_field = "position", "variance", "elapsed"
+    received_field = "position"
+    stated_field = "variance"
+    elapsed_field = "elapsed"
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         p = self.parameters
-        self.bearing_sigma = math.radians(p.bearing_sigma)
-        self.course = course_of(task)
+        self.bearing_sigma: float = math.radians(p.bearing_sigma)
+        self.course: Course = course_of(task)
         self.scans: RegularScans = (RegularScans if p.regular else UnreliableScans)(task, self.course)
-        self.disturbances = Disturbances.of(task, DISTURBANCES)
-        self.initial_normals, self.normals = (
-            4 + self.disturbances.initial_normals,
-            2 + self.disturbances.normals,
-        )
-        self.row_uniforms = self.scans.row_uniforms + self.disturbances.row_uniforms
+        self.disturbances: Disturbances = Disturbances.of(task, DISTURBANCES)
+        self.initial_normals: int = 4 + self.disturbances.initial_normals
+        self.normals: int = 2 + self.disturbances.normals
+        self.row_uniforms: int = self.scans.row_uniforms + self.disturbances.row_uniforms
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""

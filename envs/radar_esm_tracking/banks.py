@@ -13,6 +13,7 @@ import gymnasium
 import numpy
 
 from ...filters import class_fusion, imm
+from ...filters.class_fusion import Channels
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import bank_action_space, bank_probabilities
 from ..contract.filter import Bank
@@ -126,19 +127,28 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
         p, constant = self.parameters, task.constant
+<<<<<<< HEAD
         self.forgetting = math.exp(-1.0 / p.averaging_measurements)
         self.gate = bearing_gate(p)
         self.mixes = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
         self.class_transition = constant(p.class_transition)
         self.start_covariance = constant(task.design_models(p)[1])[..., None]
         self.last_scan = p.horizon + 1
+=======
+        self.forgetting: float = math.exp(-1.0 / p.averaging_measurements)
+        self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
+        self.mixes: bool = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
+        self.class_transition: Array = constant(p.class_transition)
+        self.start_covariance: Array = constant(task.design_models(p)[1])[..., None]
+        self.last_scan: int = p.horizon + 1
+>>>>>>> w-types
         if not self.mixes:
             channels = _design_channels(task.design_models, p)
-            self.channels = class_fusion.Channels(*(constant(table) for table in channels))
+            self.channels: Channels = class_fusion.Channels(*(constant(table) for table in channels))
         esm = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
         silence = numpy.ones((task.classes, 1))
-        self.log_esm = imm.log_probabilities(constant(numpy.concatenate([esm, silence], axis=1)))
-        self.log_prior = imm.log_probabilities(constant(p.prior))[:, None]
+        self.log_esm: Array = imm.log_probabilities(constant(numpy.concatenate([esm, silence], axis=1)))
+        self.log_prior: Array = imm.log_probabilities(constant(p.prior))[:, None]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:

@@ -150,22 +150,30 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
 
     def __init__(self, task: RadarEsmProblem, prior: ClassPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
+<<<<<<< HEAD:envs/radar_esm_tracking/exact_bayes.py
         self.prior = prior = prior._replace(**changed)
         p, self.classes = task.parameters, task.classes
         self.settings = dict.fromkeys(p.class_names, 1.15) | {
             "changed": 1.3, "second_emitter": 2.0, "process": 2.0, "radar": 1.35
         }  # fmt: skip
         self.spacing = p.esm_period
+=======
+        prior = prior._replace(**changed)
+        self.prior = prior
+        p = task.parameters
+        self.classes: int = task.classes
+        self.spacing: int = p.esm_period
+>>>>>>> w-types:baselines/radar_esm_tracking/exact_bayes.py
         models, start = task.design_models(p)
         decay = math.exp(-p.sampling_interval / prior.correlation_time)
         if prior.coloured:
             models, start = class_fusion.add_coloured_errors(models, start, prior.coloured**2, decay)
-        self.states = start.shape[0]
+        self.states: int = start.shape[0]
         self.F, self.Q, self.start_covariance = (
             task.constant(matrix)[..., None, None] for matrix in (models.Phi, models.Q, start)
         )
-        self.variance = task.constant([p.range_sigma**2, p.range_rate_sigma**2])[:, None, None, None]
-        self.deviation = math.hypot(p.radar_bearing_sigma, p.esm_bearing_sigma)
+        self.variance: Array = task.constant([p.range_sigma**2, p.range_rate_sigma**2])[:, None, None, None]
+        self.deviation: float = math.hypot(p.radar_bearing_sigma, p.esm_bearing_sigma)
         recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
         redrawn = class_fusion.decision_probabilities(recognition, composition)
         # Labels of the target: its type, or the class whose types are drawn anew.
@@ -173,23 +181,23 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
             [(1.0 - prior.redrawn) * composition, prior.redrawn * numpy.eye(self.classes)], axis=1
         )
         used = labels.sum(axis=0) > 0.0
-        self.labels = labels[:, used]
-        self.confusion = numpy.concatenate([recognition, redrawn])[used]
+        self.labels: numpy.ndarray = labels[:, used]
+        self.confusion: numpy.ndarray = numpy.concatenate([recognition, redrawn])[used]
         self.other_confusion = recognition
         others = (1.0 - numpy.eye(self.classes)) / (self.classes - 1)
-        self.others = others @ composition
+        self.others: numpy.ndarray = others @ composition
         """Probability of a second emitter's type by class of the target, ``(S, I)``."""
-        self.prior_of_class = task.constant(p.prior)[:, None]
+        self.prior_of_class: Array = task.constant(p.prior)[:, None]
         q, f, g = prior.second_emitter, prior.silence_start, prior.silence_end
         share = (1.0 - prior.calm) / (len(q) * len(f) * len(g))
         rates = [(*point, share) for point in itertools.product(q, f, g)]
         silences = list(itertools.product(f, g)) if prior.calm else []
         rates += [(0.0, *point, prior.calm / len(silences)) for point in silences]
         grid = emitters.surroundings(task.types, prior.separation, prior.sides, rates)
-        self.start_table = task.constant(emitters.start_table(grid, int(used.sum())))
+        self.start_table: Array = task.constant(emitters.start_table(grid, int(used.sum())))
         disturbed = numpy.ones_like(grid.weight, dtype=bool)
         disturbed[len(disturbed) - len(silences) * task.types :] = False
-        self.disturbed = task.constant(disturbed.astype(float))
+        self.disturbed: Array = task.constant(disturbed.astype(float))
         self.by_type = [numpy.flatnonzero(grid.other_type == i).tolist() for i in range(task.types)]
         self.disturbed_by_type = [[v for v in points if disturbed[v, 0]] for points in self.by_type]
         self.grid = emitters.Surroundings(grid.other_type, *(task.constant(part) for part in grid[1:]))

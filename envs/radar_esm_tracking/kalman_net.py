@@ -76,10 +76,10 @@ class KalmanNetBank(ClassBank):
         models, _ = task.design_models(self.parameters)
         classes = range(task.classes)
         propagators = [packed_covariance.propagator(models.Phi[..., s]) for s in classes]
-        self.propagator = task.constant(numpy.stack(propagators, axis=-1))[..., None]
-        self.process_noise = packed_covariance.pack(task.constant(models.Q)[..., None])
-        self.radar_variances = [float(variance) for variance in numpy.diagonal(models.R)]
-        self.answers = (
+        self.propagator: Array = task.constant(numpy.stack(propagators, axis=-1))[..., None]
+        self.process_noise: Array = packed_covariance.pack(task.constant(models.Q)[..., None])
+        self.radar_variances: list[float] = [float(variance) for variance in numpy.diagonal(models.R)]
+        self.answers: tuple[str, ...] = (
             *(f"evidence_{name}" for name in task.modes),
             *NOISES,
             *(f"caution_{name}" for name in NOISES),

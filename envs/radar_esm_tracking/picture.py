@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ..contract.model import Episode, Model
 from ..drawing.rendering import (
@@ -40,7 +41,7 @@ class RadarEsmTrackingPicture(Picture):
     """Acceleration by truth, filters and estimate; ESM decisions; probabilities; errors."""
 
     clock = "scan"
-    strips_left = 0.56
+    strips_left: float = 0.56
     strip_columns = 1
 
     task: RadarEsmProblem
@@ -48,7 +49,7 @@ class RadarEsmTrackingPicture(Picture):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
         self.change: float | None = None
-        self.height = LEAST_HEIGHT
+        self.height: float = LEAST_HEIGHT
 
     # --- the history
 
@@ -123,7 +124,7 @@ class RadarEsmTrackingPicture(Picture):
             axes.set_axisbelow(True)
         top.set_title("acceleration, m/s²", loc="left", fontsize=9, pad=4)
         top.tick_params(labelbottom=False)
-        self.filters = [
+        self.filters: list[Line2D] = [
             top.plot(
                 [],
                 [],
@@ -136,8 +137,8 @@ class RadarEsmTrackingPicture(Picture):
             )[0]
             for mode, (color, style) in zip(self.task.modes, CURVES, strict=False)
         ]
-        (self.estimate,) = top.plot([], [], color=ORANGE, linewidth=2.2, label="reported", zorder=3)
-        (self.true,) = top.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=4)
+        self.estimate: Line2D = top.plot([], [], color=ORANGE, linewidth=2.2, label="reported", zorder=3)[0]
+        self.true: Line2D = top.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=4)[0]
         top.legend(ncols=6, **legend)
 
         types = self.task.types
@@ -147,20 +148,20 @@ class RadarEsmTrackingPicture(Picture):
         bottom.set_ylim(CLASS_ROW - 0.5, types - 0.5)
         bottom.set_xlabel(self.clock, fontsize=9)
         bottom.axhline(CLASS_ROW + 0.5, color=GREY, linewidth=0.8)
-        (self.true_type,) = bottom.plot(
+        self.true_type: Line2D = bottom.plot(
             [], [], color=GREY, linewidth=5.0, alpha=0.5, drawstyle="steps-mid", label="true type", zorder=2
-        )
+        )[0]
         if self.task.parameters.emitter == "redrawn":
             self.true_type.set_label("_type drawn anew for each decision")
-        (self.used,) = bottom.plot(
+        self.used: Line2D = bottom.plot(
             [], [], linestyle="", marker="o", markersize=5, color=BLUE, label="used", zorder=3
-        )
-        (self.refused,) = bottom.plot(
+        )[0]
+        self.refused: Line2D = bottom.plot(
             [], [], linestyle="", marker="x", markersize=6, markeredgewidth=1.6, color=VERMILLION,
             label="refused by the gate", zorder=3,
-        )  # fmt: skip
+        )[0]  # fmt: skip
         # The colours are those of the weights, whose legend stands beside.
-        self.classes = [
+        self.classes: list[Line2D] = [
             bottom.plot([], [], linestyle="", marker="s", markersize=4, color=color, zorder=3)[0]
             for _, (color, _) in zip(self.task.modes, CURVES, strict=False)
         ]

@@ -3,6 +3,7 @@
 import numpy
 
 from ...filters import class_fusion, singer
+from ...filters.class_fusion import Models
 from ..contract.task import Task
 from .parameters import RadarEsmTrackingParameters
 
@@ -15,9 +16,10 @@ class RadarEsmProblem(Task):
     def set_up(self) -> None:
         """Count classes and types, and make the models of the classes."""
         p = self.parameters
-        self.classes, self.types = len(p.manoeuvrability), len(p.recognition)
+        self.classes: int = len(p.manoeuvrability)
+        self.types: int = len(p.recognition)
         models, _ = self.design_models(p)
-        self.models = class_fusion.Models(*(self.constant(matrix) for matrix in models))
+        self.models: Models = class_fusion.Models(*(self.constant(matrix) for matrix in models))
 
     @staticmethod
     def design_models(p: RadarEsmTrackingParameters) -> tuple[class_fusion.Models, numpy.ndarray]:

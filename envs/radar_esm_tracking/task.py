@@ -5,7 +5,7 @@ support measures (ESM) station with recognition of the target's class (in Russia
 theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/singer.py``.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ...extensions import load_present
 from ...filters.ordered_sums import weighted_sum
@@ -13,7 +13,7 @@ from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward
+from ..contract.task import Banks, Component, PaperPolicy, Reward
 from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
@@ -126,10 +126,15 @@ class RadarEsmTracking(RadarEsmProblem):
     id = ID
     interface = 4
     Parameters = RadarEsmTrackingParameters
+<<<<<<< HEAD
     World = RadarEsmWorld
     banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank, "hypotheses": HypothesesBank}
+=======
+    World: ClassVar[type[RadarEsmWorld]] = RadarEsmWorld
+    banks: ClassVar[Banks] = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
+>>>>>>> w-types
     scenarios = SCENARIOS
-    components = (
+    components: tuple[Component, ...] = (
         Component("range", "m"),
         Component("range_rate", "m/s"),
         Component("acceleration", "m/s^2"),
@@ -137,14 +142,14 @@ class RadarEsmTracking(RadarEsmProblem):
     modes: tuple[str, ...] = ("S0", "S1", "S2")
     # The noise of the track is most of the cost, and no weight changes it; a logarithm, because a few mistaken classes
     # would hide what an action changes in all other episodes.
-    reward = Reward(
+    reward: ClassVar[Reward] = Reward(
         "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
         "and acceleration_scale",
         "log-relative",
         unit=0.3,
         log_unit=0.05,
     )
-    paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
+    paper_policy: PaperPolicy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
     companions: tuple[Any, ...] = (
         Paper(
             "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "

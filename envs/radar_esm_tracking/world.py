@@ -101,35 +101,35 @@ class RadarEsmWorld(World[RadarEsmProblem, Truth, Measurement]):
     def __init__(self, task: RadarEsmProblem) -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
-        self.disturbances = Disturbances.of(task, DISTURBANCES)
-        self.radar_is_coloured = p.radar_coloured[1] > 0.0
+        self.disturbances: Disturbances = Disturbances.of(task, DISTURBANCES)
+        self.radar_is_coloured: bool = p.radar_coloured[1] > 0.0
         further = 2 if self.radar_is_coloured else 0
         self.own_initial_normals, self.own_normals = 5 + further, 7 + further
         """Normal numbers that come before those of the disturbances."""
-        self.initial_normals = self.own_initial_normals + self.disturbances.initial_normals
-        self.normals = self.own_normals + self.disturbances.normals
-        self.row_uniforms = 4 + self.disturbances.row_uniforms
+        self.initial_normals: int = self.own_initial_normals + self.disturbances.initial_normals
+        self.normals: int = self.own_normals + self.disturbances.normals
+        self.row_uniforms: int = 4 + self.disturbances.row_uniforms
         models, start = task.design_models(p)
         # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
         root = numpy.sqrt if p.process_noise == "acceleration" else numpy.linalg.cholesky
         roots = numpy.stack([root(Q) for Q in numpy.moveaxis(models.Q, -1, 0)], axis=-1)
         lower = [roots[i, j] for i in range(3) for j in range(i + 1)]
-        self.motion_table = constant(numpy.stack([*models.Phi[:, 2], *lower]))
+        self.motion_table: Array = constant(numpy.stack([*models.Phi[:, 2], *lower]))
         """Response to the acceleration and root of the noise, a column for each class."""
-        self.acceleration_sigma = constant(p.acceleration_sigma)
-        self.start_covariance = constant(start @ numpy.array(p.prior))[..., None]
-        self.cost_factors = constant(
+        self.acceleration_sigma: Array = constant(p.acceleration_sigma)
+        self.start_covariance: Array = constant(start @ numpy.array(p.prior))[..., None]
+        self.cost_factors: Array = constant(
             [[1.0 / scale] for scale in (p.range_scale, p.range_rate_scale, p.acceleration_scale)]
         )
         # Thresholds of category, a column for each class or type that lanes look up.
         known = numpy.eye(task.classes)
         share = p.prior if p.true_class == "random" else known[p.class_names.index(p.true_class)]
-        self.class_thresholds = _thresholds([share])[:, 0].tolist()
-        self.type_thresholds = constant(_thresholds(p.composition))
-        self.decision_thresholds = constant(_thresholds(p.recognition))
-        self.never = (p.horizon + 2) * p.sampling_interval
+        self.class_thresholds: Any = _thresholds([share])[:, 0].tolist()
+        self.type_thresholds: Array = constant(_thresholds(p.composition))
+        self.decision_thresholds: Array = constant(_thresholds(p.recognition))
+        self.never: float = (p.horizon + 2) * p.sampling_interval
         """Time of a change that does not happen, s."""
-        self.class_change = p.class_change or (self.never, self.never)
+        self.class_change: tuple[float, float] = p.class_change or (self.never, self.never)
 
     # --- the target and its emissions
 

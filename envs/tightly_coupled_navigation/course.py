@@ -7,13 +7,14 @@ alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="k
 """
 
 import math
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy
 
 from ..contract.draws import Draws, draw_between
 from ..contract.observation import Array
-from .parameters import DEGREE, LINE, REST, SINGER
+from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
 from .problem import NavigationProblem
 
 
@@ -36,8 +37,10 @@ class Course:
     """
 
     def __init__(self, task: NavigationProblem) -> None:
-        self.task, self.parameters, self.xp = task, task.parameters, task.xp
-        self.singer_root = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
+        self.task = task
+        self.parameters: TightlyCoupledNavigationParameters = task.parameters
+        self.xp: ModuleType = task.xp
+        self.singer_root: Array = task.constant(numpy.linalg.cholesky(task.models[SINGER].noise))
 
     def begin(self, draws: Draws, zeros: Array) -> tuple[Legs, Array, Array]:
         """Draw the legs.

@@ -51,8 +51,9 @@ class _OfSatellites(Disturbance):
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
-        self.task, self.satellites = task, task.satellites
-        self.places = task.constant(range(task.satellites))[:, None]
+        self.task = task
+        self.satellites: int = task.satellites
+        self.places: Array = task.constant(range(task.satellites))[:, None]
 
     def change_rows(self, values: Array, first: int, changed: Array) -> Array:
         """Values of the readings, ``(m, N)``, with some of them changed, from the first on."""
@@ -262,8 +263,8 @@ class Reflections(_OfSatellites):
 
     def __init__(self, task: NavigationProblem) -> None:
         super().__init__(task)
-        self.row_uniforms = self.satellites if self.parameters.urban else 0
-        self.normals = 2 * self.row_uniforms
+        self.row_uniforms: int = self.satellites if self.parameters.urban else 0
+        self.normals: int = 2 * self.row_uniforms
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Reception:
         """Draw C/N0, in open country too: every scenario takes the same numbers."""

@@ -32,7 +32,7 @@ their levels, of accelerometers. Where a rate is missing its levels stay what th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -184,28 +184,29 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
 
     def __init__(self, task: NavigationProblem, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.settings = {
+        self.settings: Mapping[str, float] = {
             "begun": 4.0, "manoeuvre": 1.05, "renewal": 4.0, "levels": 1.5,
             "motion": 2.0, "pseudoranges": 2.0, "rates": 2.0, "accelerometers": 4.0,
         }  # fmt: skip
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         T, S, n = task.common.T, task.satellites, gnss_ins.SIZE + task.satellites
         self.size = n
         noise, known = numpy.zeros((n, n, 3, 1)), gnss_ins.SIZE
         for i, model in enumerate(task.models):
             noise[:known, :known, i, 0] = gnss_ins.process_noise(model, task.common)
-        self.noise = task.constant(noise)
+        self.noise: Array = task.constant(noise)
         open_sky = math.exp(-T / prior.correlation_time)
         # Arrays: of two plain numbers torch would choose in single precision.
-        self.open_sky = task.constant(open_sky)
-        self.gained = task.constant(prior.coloured**2 * (1.0 - open_sky**2))
-        self.ending = task.constant(1.0 - math.exp(-T / prior.leg))
-        self.lost = task.constant(1.0 - math.exp(-T / prior.hold))
-        self.jump = task.constant(1.0 - math.exp(-T * prior.jump))
-        self.acceleration = task.constant(prior.acceleration)
+        self.open_sky: Array = task.constant(open_sky)
+        self.gained: Array = task.constant(prior.coloured**2 * (1.0 - open_sky**2))
+        self.ending: Array = task.constant(1.0 - math.exp(-T / prior.leg))
+        self.lost: Array = task.constant(1.0 - math.exp(-T / prior.hold))
+        self.jump: Array = task.constant(1.0 - math.exp(-T * prior.jump))
+        self.acceleration: Array = task.constant(prior.acceleration)
         self.last_error = task.constant(prior.error_mean[-1]), task.constant(prior.error_sigma[-1])
         squares = numpy.array(prior.levels) ** 2
-        self.level_variance = [
+        self.level_variance: list[Array] = [
             task.constant(squares * task.sensor_variance[S + j])[:, None, None] for j in range(S)
         ]
         L = len(squares)
@@ -217,7 +218,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         self.first_levels = task.constant(numpy.array([1.0 - 1e-3] + [1e-3 / (L - 1)] * (L - 1)))[:, None]
 
         heights = [math.log(level) / math.log(prior.levels[-1]) for level in prior.levels]
-        self.heights = task.constant(heights)[:, None]
+        self.heights: Array = task.constant(heights)[:, None]
 
     def start(self, initial: Initial) -> FaultState:
         """Start every filter from what is known of the start."""

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
-from ..contract.controls import SettingsBank
+from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Initial, Likelihood
 from ..contract.observation import (
     BOUNDED_LOG,
@@ -62,8 +62,8 @@ class HypothesesState(NamedTuple):
 class FaultHypothesesBank(SettingsBank, SatelliteBank):
     """The bank over motion and faults, steered by factors of its probabilities and of its noises."""
 
-    strong = FaultHypotheses
-    hypotheses = (*HYPOTHESES, "begun")
+    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = FaultHypotheses
+    hypotheses: Sequence[str] = (*HYPOTHESES, "begun")
 
     @property
     def actions(self) -> Sequence[str]:

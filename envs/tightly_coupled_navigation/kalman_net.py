@@ -42,7 +42,7 @@ DROPPED = ("log_likelihood", "log_predicted")
 class KalmanNetBank(RobustBank):
     """One filter, whose noises, gain and motion the action sets."""
 
-    hypotheses = HYPOTHESES[SINGER:]
+    hypotheses: Sequence[str] = HYPOTHESES[SINGER:]
     reach: float = 1.0  # it learns through the filter, and does not explore
 
     def __init__(self, task: NavigationProblem, control: str) -> None:
@@ -52,8 +52,8 @@ class KalmanNetBank(RobustBank):
         still = model._replace(noise=0.0 * model.noise)
         common = gnss_ins.process_noise(still, task.common)
         moving = gnss_ins.process_noise(model, task.common) - common
-        self.manoeuvre = list(self.actions).index("manoeuvre")
-        self.axis = task.axis[:, :, only]
+        self.manoeuvre: int = list(self.actions).index("manoeuvre")
+        self.axis: Array = task.axis[:, :, only]
         self.common_noise, self.manoeuvre_noise = (
             task.constant(Q)[:, :, None, None] for Q in (common, moving)
         )

@@ -12,7 +12,7 @@ from ..contract.parameters import TaskParameters, check_length, parameter, squar
 REST, LINE, SINGER = 0, 1, 2
 HYPOTHESES = ("rest", "constant-velocity", "singer")
 DEGREE = math.pi / 180.0
-KNOWN_BY = {
+KNOWN_BY: dict[str, tuple[str, ...]] = {
     "pseudorange_sigma": ("initial_position_sigma", "initial_clock_sigma"),
     "rate_sigma": (
         "initial_velocity_sigma", "initial_drift_sigma", "rest_velocity_sigma", "increment_sigma",

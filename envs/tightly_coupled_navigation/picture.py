@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ...filters import gnss_ins
 from ..contract.model import Episode, Model
@@ -24,7 +25,7 @@ MOTION_ROW = -1.0
 """Where the true hypothesis is drawn below the faults."""
 LEAST_REACH = 30.0
 """Half width of the course that is shown at least, m."""
-ACTIONS = {
+ACTIONS: dict[str, tuple[str, ...]] = {
     "gain": ("action",),
     "robust": ("action", "readings"),
     "hypotheses": ("action: odds", "noises"),
@@ -35,7 +36,7 @@ ACTIONS = {
 class TightlyCoupledNavigationPicture(Picture):
     """Course, acceleration, sensor faults; weights or noise factors, innovations, errors."""
 
-    strips_left = 0.56
+    strips_left: float = 0.56
     strip_columns = 1
 
     task: NavigationProblem
@@ -152,22 +153,22 @@ class TightlyCoupledNavigationPicture(Picture):
         course.set_title("course from above", loc="left", fontsize=9, pad=4)
         course.set_xlabel("east, m", fontsize=9, labelpad=1)
         course.set_ylabel("north, m", fontsize=9, labelpad=1)
-        (self.true,) = course.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)
-        (self.estimated,) = course.plot(
+        self.true: Line2D = course.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)[0]
+        self.estimated: Line2D = course.plot(
             [], [], color=BLUE, linewidth=1.2, linestyle="--", label="estimate", zorder=3
-        )
-        (self.user,) = course.plot(
+        )[0]
+        self.user: Line2D = course.plot(
             [], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, linestyle="", zorder=5
-        )
+        )[0]
         (self.believed,) = course.plot([], [], color=BLUE, marker="o", markersize=5, linestyle="", zorder=4)
         course.legend(ncols=2, **legend)
 
         motion.set_title("size of the acceleration, m/s²", loc="left", fontsize=9, pad=4)
         motion.set_xlim(0.5, self.task.horizon + 0.5)
-        (self.felt,) = motion.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)
-        (self.thought,) = motion.plot(
+        self.felt: Line2D = motion.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)[0]
+        self.thought: Line2D = motion.plot(
             [], [], color=BLUE, linewidth=1.2, linestyle="--", label="estimate", zorder=3
-        )
+        )[0]
         motion.legend(ncols=2, **legend)
 
         sensors.set_title(
@@ -177,15 +178,15 @@ class TightlyCoupledNavigationPicture(Picture):
         sensors.set_ylim(-1.6, len(FAULTS) - 0.4)
         sensors.set_yticks([MOTION_ROW, *range(len(FAULTS))], ["true motion", *FAULTS], fontsize=7)
         sensors.set_xlabel(self.clock, fontsize=9, labelpad=1)
-        self.fault_lines = [
+        self.fault_lines: list[Line2D] = [
             sensors.plot([], [], color=BLACK, linewidth=5.0, solid_capstyle="butt")[0] for _ in FAULTS
         ]
         # In the colours of their weights.
-        self.modes = [
+        self.modes: list[Line2D] = [
             sensors.plot([], [], color=color, linewidth=5.0, solid_capstyle="butt")[0]
             for _, (color, _) in zip(HYPOTHESES, CURVES, strict=False)
         ]
-        (self.now,) = sensors.plot([], [], color=BLACK, linewidth=0.8)
+        self.now: Line2D = sensors.plot([], [], color=BLACK, linewidth=0.8)[0]
 
     def arrange(self) -> None:
         """Limits of the start; they grow with the flight, which is not known in advance."""

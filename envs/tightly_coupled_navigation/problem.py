@@ -3,9 +3,10 @@
 import numpy
 
 from ...filters import gnss_ins, satellites
+from ...filters.gnss_ins import AxisModel, CommonModel
 from ..contract.observation import Array
 from ..contract.task import Task
-from .parameters import DEGREE, TightlyCoupledNavigationParameters
+from .parameters import DEGREE, SensorGroup, TightlyCoupledNavigationParameters
 
 
 class NavigationProblem(Task):
@@ -17,15 +18,15 @@ class NavigationProblem(Task):
         """List the sensors, tabulate the satellites and discretise the models."""
         p, constant = self.parameters, self.constant
         T = p.sampling_interval
-        self.closes_loop = bool(p.aperture)
-        self.satellites = len(p.satellites)
-        self.sensors = p.sensors
+        self.closes_loop: bool = bool(p.aperture)
+        self.satellites: int = len(p.satellites)
+        self.sensors: tuple[SensorGroup, ...] = p.sensors
         each = [s for s in self.sensors for _ in range(s.readings.start, s.readings.stop)]
-        self.sensor_sigma = constant([s.sigma for s in each])[:, None]
-        self.sensor_variance = [s.sigma**2 for s in each]
+        self.sensor_sigma: Array = constant([s.sigma for s in each])[:, None]
+        self.sensor_variance: list[float] = [s.sigma**2 for s in each]
         apertures = [s.aperture for s in each if s.aperture is not None]
-        self.apertures = constant(apertures)[:, None]
-        self.tracked = slice(0, len(apertures))
+        self.apertures: Array = constant(apertures)[:, None]
+        self.tracked: slice = slice(0, len(apertures))
         """Readings that tracking loops make: pseudoranges and rates."""
 
         times = p.epoch + T * numpy.arange(p.horizon + 2)
@@ -33,7 +34,7 @@ class NavigationProblem(Task):
         self._satellite_position = constant(local)
         self._satellite_velocity = constant(velocity)
 
-        self.common = gnss_ins.common_model(
+        self.common: CommonModel = gnss_ins.common_model(
             T,
             p.frequency_density,
             p.frequency_walk_density,
@@ -41,15 +42,15 @@ class NavigationProblem(Task):
             p.attitude_rate_sigma * DEGREE,
             p.attitude_rate_time,
         )
-        self.models = (
+        self.models: tuple[AxisModel, AxisModel, AxisModel] = (
             gnss_ins.rest_model(T, p.rest_velocity_sigma, p.reset_acceleration_sigma),
             gnss_ins.constant_velocity_model(T, p.increment_sigma, p.reset_acceleration_sigma),
             gnss_ins.singer_model(T, p.singer_alpha, p.singer_sigma),
         )
-        self.axis = constant(numpy.stack([m.transition for m in self.models], axis=-1)[..., None])
+        self.axis: Array = constant(numpy.stack([m.transition for m in self.models], axis=-1)[..., None])
         noises = [gnss_ins.process_noise(m, self.common) for m in self.models]
-        self.process_noise = constant(numpy.stack(noises, axis=-1)[..., None])
-        self.transition = constant(p.transition)
+        self.process_noise: Array = constant(numpy.stack(noises, axis=-1)[..., None])
+        self.transition: Array = constant(p.transition)
 
     def _row(self, number: Array) -> Array:
         """Where a measurement stands in the tables; an episode that is over stays at the end."""

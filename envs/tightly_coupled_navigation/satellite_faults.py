@@ -35,7 +35,8 @@ class OneFault(FaultHypotheses):
 
     def __init__(self, task: NavigationProblem, prior: FaultPrior, wrong: int, walk: float) -> None:
         super().__init__(task, prior)
-        self.wrong, self.walk = wrong, task.constant(walk**2 * task.common.T)
+        self.wrong = wrong
+        self.walk: Array = task.constant(walk**2 * task.common.T)
 
     def _error_process(self, between: Array) -> tuple[Any, Any]:
         """That of the prior, but of its own pseudorange a random walk."""
@@ -87,8 +88,8 @@ class SatelliteFaults(Filter[NavigationProblem, Measurement, SatelliteFaultState
         prior = prior._replace(**{"jump": 0.5, "jump_sigma": 35.0, **changed})
         healthy = FaultHypotheses(task, prior._replace(jump=0.0))
         faulty = [OneFault(task, prior, j, walk) for j in range(task.satellites)]
-        self.members = [healthy, *faulty]
-        self.begins = 1.0 - math.exp(-begins * task.common.T)
+        self.members: list[Any] = [healthy, *faulty]
+        self.begins: float = 1.0 - math.exp(-begins * task.common.T)
 
     def start(self, initial: Initial) -> SatelliteFaultState:
         """Start every member from what is known of the start; nothing is wrong yet."""

@@ -16,7 +16,7 @@ adaptation time of 0.01 s must be at least one step. What is read of its motion 
 step 3 in :mod:`.banks`.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ...extensions import load_present
 from ...filters import gnss_ins
@@ -24,7 +24,7 @@ from ..contract.causes import Causes
 from ..contract.companions import Actions, ArrayMeanings, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Model
 from ..contract.observation import Array
-from ..contract.task import Component, PaperPolicy, Reward
+from ..contract.task import Banks, Component, PaperPolicy, Reward
 from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
@@ -108,8 +108,8 @@ class TightlyCoupledNavigation(NavigationProblem):
     id = ID
     interface = 3
     Parameters = TightlyCoupledNavigationParameters
-    World = NavigationWorld
-    banks = {
+    World: ClassVar[type[NavigationWorld]] = NavigationWorld
+    banks: ClassVar[Banks] = {
         "robust": RobustBank,
         "gain": NoiseBank,
         "hypotheses": FaultHypothesesBank,
@@ -118,7 +118,7 @@ class TightlyCoupledNavigation(NavigationProblem):
         "weights": HypothesisBank,
     }
     scenarios = SCENARIOS
-    components = (
+    components: tuple[Component, ...] = (
         *(Component(f"position_{axis}", "m", group="position") for axis in ("east", "north", "up")),
         Component("clock_bias", "m"),
         *(Component(f"velocity_{axis}", "m/s", group="velocity") for axis in ("east", "north", "up")),
@@ -130,17 +130,17 @@ class TightlyCoupledNavigation(NavigationProblem):
         *(Component(f"{angle}_error", "rad", group="attitude") for angle in ("heading", "pitch", "roll")),
         *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
-    modes = HYPOTHESES
+    modes: tuple[str, ...] = HYPOTHESES
     # A few lost tracks rule the mean, and who does nothing bears them, too.
-    reward = Reward(
+    reward: ClassVar[Reward] = Reward(
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix",
         "log-relative",
         unit=10.0,
         log_unit=0.1,
     )
-    paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
-    companions = (
+    paper_policy: PaperPolicy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
+    companions: tuple[Any, ...] = (
         Paper(
             "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "
             "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"

@@ -81,19 +81,19 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         p, task, constant = self.parameters, self.task, self.task.constant
-        self.disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
-        self.own_normals = gnss_ins.SIZE + len(task.sensor_variance)
-        self.initial_normals = gnss_ins.SIZE + self.disturbances.initial_normals
-        self.normals = self.own_normals + self.disturbances.normals
-        self.row_uniforms = self.disturbances.row_uniforms
-        self.course = Course(task)
-        self.clock_root = constant(numpy.linalg.cholesky(task.common.clock_noise))
+        self.disturbances: Disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
+        self.own_normals: int = gnss_ins.SIZE + len(task.sensor_variance)
+        self.initial_normals: int = gnss_ins.SIZE + self.disturbances.initial_normals
+        self.normals: int = self.own_normals + self.disturbances.normals
+        self.row_uniforms: int = self.disturbances.row_uniforms
+        self.course: Course = Course(task)
+        self.clock_root: Array = constant(numpy.linalg.cholesky(task.common.clock_noise))
         sigmas = [p.initial_position_sigma] * 3 + [p.initial_clock_sigma]
         sigmas += [p.initial_velocity_sigma] * 3 + [p.initial_drift_sigma]
         sigmas += [p.initial_acceleration_sigma] * 3
         sigmas += [p.initial_attitude_sigma * DEGREE] * 3 + [p.attitude_rate_sigma * DEGREE] * 3
-        self.initial_sigma = constant(sigmas)[:, None]
-        self.known = constant(KNOWN_AT_START)[:, None]
+        self.initial_sigma: Array = constant(sigmas)[:, None]
+        self.known: Array = constant(KNOWN_AT_START)[:, None]
 
     # --- the episode
 

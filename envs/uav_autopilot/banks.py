@@ -76,10 +76,10 @@ class AutopilotBank(Bank[AutopilotProblem, Measurement, Any]):
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         constant, n, m = task.constant, len(task.components), len(task.sensors)
-        self.sensor_identity = constant(numpy.eye(m)[:, :, None])
-        self.sensor_sigmas = constant(self.parameters.value("sensor_sigmas"))[:, None]
-        self.trace_weights = constant(1.0 / (n * numpy.diag(task.design.steady.posterior))[:, None])
-        self.forget = 1.0 / self.parameters.averaging_measurements
+        self.sensor_identity: Array = constant(numpy.eye(m)[:, :, None])
+        self.sensor_sigmas: Array = constant(self.parameters.value("sensor_sigmas"))[:, None]
+        self.trace_weights: Array = constant(1.0 / (n * numpy.diag(task.design.steady.posterior))[:, None])
+        self.forget: float = 1.0 / self.parameters.averaging_measurements
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -213,14 +213,14 @@ class _KalmanBank(AutopilotBank):
         constant, n = task.constant, len(task.components)
         model, pack = task.design.model, packed_covariance.pack
         self.F, self.B = constant(model.F), constant(model.B)
-        self.propagator = constant(packed_covariance.propagator(model.F))
+        self.propagator: Array = constant(packed_covariance.propagator(model.F))
         scaled, other = (constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise))
-        self.process_noise = scaled + other
+        self.process_noise: Array = scaled + other
         self.R = constant(task.design.R[:, :, None])
-        self.sensor_entries = [
+        self.sensor_entries: list[int] = [
             packed_covariance.position(n, i, j) for i in task.measured for j in task.measured
         ]
-        self.diagonal = packed_covariance.diagonal(n)
+        self.diagonal: list[int] = packed_covariance.diagonal(n)
 
     def scaled_noise(self, scale: Array, entries: list[int]) -> Array:
         """Process noise under a scale ``(N,)``, at some packed entries, ``(entries, N)``."""
@@ -310,8 +310,8 @@ class GainBank(_KalmanBank):
     """Control ``gain``: the action scales the process noise."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
-    action_block = last_action_block(name="action")
-    no_action = (0.0,)
+    action_block: Any = last_action_block(name="action")
+    no_action: tuple[float, ...] = (0.0,)
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale by ``10 ** (gain_decades a)``."""
@@ -334,8 +334,8 @@ class NoiseBank(_KalmanBank):
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
-        self.no_action = (0.0,) * (1 + len(task.sensors))
-        self.nominal_variances = task.constant(task.sensor_variances)[:, None]
+        self.no_action: tuple[float, ...] = (0.0,) * (1 + len(task.sensors))
+        self.nominal_variances: Array = task.constant(task.sensor_variances)[:, None]
 
     @property
     def action_space(self) -> gymnasium.Space[Any]:
@@ -364,8 +364,8 @@ class ModeBank(_KalmanBank):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
     action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(len(MODES))
-    action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
-    no_action = (1.0, 0.0, 0.0, 0.0)
+    action_block: Any = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES, SHARE)
+    no_action: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
@@ -374,7 +374,7 @@ class ModeBank(_KalmanBank):
         d = task.design
         unmeasured = numpy.where(d.H.any(axis=0), 0.0, numpy.diag(d.state_covariance))
         raw = d.H.T @ d.R @ d.H + numpy.diag(unmeasured)
-        self.raw_covariance = task.constant(packed_covariance.pack(raw)[:, None])
+        self.raw_covariance: Array = task.constant(packed_covariance.pack(raw)[:, None])
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in "over-smoothed"."""

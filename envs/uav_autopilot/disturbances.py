@@ -1,7 +1,7 @@
 """What may go wrong with the sensors of UavAutopilot: a class for each. Nobody says any of it but that one answers."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ..contract.causes import MISSED, Cause, Moment
 from ..contract.draws import Draws, StepSignal, within
@@ -39,8 +39,9 @@ class _OfSensors(Disturbance):
 
     def __init__(self, task: AutopilotProblem) -> None:
         super().__init__(task)
-        self.task, self.count = task, len(task.sensors)
-        self.sigmas = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
+        self.task = task
+        self.count: int = len(task.sensors)
+        self.sigmas: Array = task.constant(task.parameters.value("sensor_sigmas"))[:, None]
 
     def chosen(self, named: tuple[str, ...] | None) -> Array:
         """One for the sensors that are named, or for all, else zero, ``(m, 1)``."""
@@ -60,7 +61,7 @@ class NoisySensors(_OfSensors):
     """The white noise of a sensor is another one, and changes in the episode."""
 
     name = "noisy_sensors"
-    causes = (
+    causes: ClassVar[tuple[Cause, ...]] = (
         Cause(
             "sensor noise",
             f"where a sensor's noise is at least {RAISED:g} times the nominal one",
@@ -108,7 +109,7 @@ class Dropouts(_OfSensors):
     """A sensor does not answer for a while, once in a period, and holds its last reading."""
 
     name = "dropouts"
-    causes = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
+    causes: ClassVar[tuple[Cause, ...]] = (MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),)
 
     def begin(self, draws: Draws, normals: Array, zero: Array) -> Holds:
         """Draw when."""
@@ -170,7 +171,7 @@ class SensorColour(ColouredErrors):
     def __init__(self, task: AutopilotProblem) -> None:
         p = task.parameters
         super().__init__(task, p.value("sampling_interval"), len(task.sensors), p.sensor_coloured[1] > 0.0)
-        self.sigmas = task.constant(p.value("sensor_sigmas"))[:, None]
+        self.sigmas: Array = task.constant(p.value("sensor_sigmas"))[:, None]
 
     def draw(self, draws: Draws, zero: Array) -> tuple[Array, Array]:
         """Draw deviation, in the sensor's unit, and correlation time, s, ``(m, N)`` each."""

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ...filters import imm, noise_levels, packed_covariance
 from ...filters.noise_levels import LevelHypotheses
 from ...filters.ordered_sums import ordered_sum
-from ..contract.controls import SettingsBank
+from ..contract.controls import SettingsBank, SteerableFilter
 from ..contract.filter import Likelihood
 from ..contract.observation import (
     Array,
@@ -62,16 +62,17 @@ class HypothesesState(NamedTuple):
 class HypothesesBank(SettingsBank, AutopilotBank):
     """The bank over levels, steered by factors of its weights and of its noises."""
 
-    strong = LevelBank
+    strong: ClassVar[type[SteerableFilter[Any, Any, Any]]] = LevelBank
 
     def __init__(self, task: AutopilotProblem, control: str) -> None:
         super().__init__(task, control)
         prior = self.own.prior
-        self.names = ("designed", *(f"level_{i}" for i in range(1, prior.gust_points + 1)))
+        levels = (f"level_{i}" for i in range(1, prior.gust_points + 1))
+        self.names: tuple[str, ...] = ("designed", *levels)
         """Of the hypotheses of each kind."""
-        self.gust_levels = grid(prior.gusts, prior.gust_points)
-        self.sensor_limits = tuple(math.log(limit) for limit in prior.sensors)
-        self.log_levels = [
+        self.gust_levels: Array = grid(prior.gusts, prior.gust_points)
+        self.sensor_limits: tuple[float, ...] = tuple(math.log(limit) for limit in prior.sensors)
+        self.log_levels: list[Any] = [
             0.5 * self.xp.log(v / R) for v, R in zip(self.own.variances, task.sensor_variances, strict=True)
         ]
 

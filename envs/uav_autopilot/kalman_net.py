@@ -63,13 +63,13 @@ class KalmanNetBank(NoiseBank):
         parts = {"disturbance": model.scaled_noise, "other": model.other_noise}
         parts = {name: Q for name, Q in parts.items() if Q.any()}
         self.noise_parts = [task.constant(packed_covariance.pack(Q)[:, None]) for Q in parts.values()]
-        self.answers = (
+        self.answers: tuple[str, ...] = (
             *parts,
             *sensors,
             *(f"agility_{name}" for name in parts),
             *(f"caution_{s}" for s in sensors),
         )
-        self.no_action = (0.0,) * len(self.answers)
+        self.no_action: tuple[float, ...] = (0.0,) * len(self.answers)
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -131,19 +131,21 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
 
     def __init__(self, task: AutopilotProblem, prior: LevelPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-        self.prior = prior = prior._replace(**changed)
+        prior = prior._replace(**changed)
+        self.prior = prior
         p, constant, n = task.parameters, task.constant, len(task.components)
         sensors, sigmas = list(task.sensors), p.value("sensor_sigmas")
         slow = [sensor for sensor in prior.slow if sensor in sensors]
-        self.n, self.size = n, n + len(slow)
-        self.rows = [
+        self.n: int = n
+        self.size: int = n + len(slow)
+        self.rows: list[tuple[int, int] | tuple[int]] = [
             (i, n + slow.index(s)) if s in slow else (i,) for s, i in zip(sensors, task.measured, strict=True)
         ]
         kinds = [kind for kind in prior.kinds if kind.lag == 1.0 or p.plant == "U"]
         error_sigmas = numpy.array([sigmas[sensors.index(sensor)] for sensor in slow])
         levels = numpy.array([1.0, *grid(prior.gusts, prior.gust_points)])
         models = [_KindModel(task, kind, error_sigmas, levels) for kind in kinds]
-        self.groups = len(kinds)
+        self.groups: int = len(kinds)
         each = len(levels)
         self.F = [constant(m.F) for m in models for _ in levels]
         self.B = [constant(m.B) for m in models for _ in levels]
@@ -155,14 +157,14 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         many = (1.0 - prior.nominal) / prior.gust_points
         share = numpy.array([kind.share for kind in kinds]) / sum(kind.share for kind in kinds)
         within = numpy.array([prior.nominal, *[many] * prior.gust_points])
-        self.probability = constant(numpy.outer(share, within).ravel())[:, None]
+        self.probability: Array = constant(numpy.outer(share, within).ravel())[:, None]
 
         def by_hypothesis(designed: float, other: float) -> Array:
             return constant([designed] + [other] * (each - 1))[:, None]
 
-        self.change = by_hypothesis(prior.leave, prior.gust_change)
-        self.arrive = by_hypothesis(0.0, 1.0 / prior.gust_points)
-        self.sensor_change = by_hypothesis(0.0, prior.sensor_change)
+        self.change: Array = by_hypothesis(prior.leave, prior.gust_change)
+        self.arrive: Array = by_hypothesis(0.0, 1.0 / prior.gust_points)
+        self.sensor_change: Array = by_hypothesis(0.0, prior.sensor_change)
         factors = grid(prior.sensors, prior.sensor_points)
         chances = numpy.full(len(factors), 1.0 / len(factors))
         kept = (1.0 - prior.kept) * chances
@@ -172,14 +174,15 @@ class LevelBank(SteerableFilter[AutopilotProblem, Measurement, Levels]):
         squared = numpy.repeat(factors[:, None] ** 2, each, axis=1)
         squared[:, 0] = 1.0
         squared, believed = (numpy.tile(values, (1, self.groups)) for values in (squared, believed))
-        self.levels = constant(chances)[:, None, None]
-        self.believed = constant(believed)[:, :, None]
-        self.variances = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
-        self.wide = [R * prior.outlier_factor**2 for R in task.sensor_variances]
-        self.settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0, **dict.fromkeys(sensors, 1.5)}
+        self.levels: Array = constant(chances)[:, None, None]
+        self.believed: Array = constant(believed)[:, :, None]
+        self.variances: list[Array] = [constant(R * squared)[:, :, None] for R in task.sensor_variances]
+        self.wide: list[float] = [R * prior.outlier_factor**2 for R in task.sensor_variances]
+        settings = {"gusts": 1.1, "designed": 1.25, "process": 2.0}
+        self.settings: dict[str, float] = {**settings, **dict.fromkeys(sensors, 1.5)}
         heights, designed = numpy.log(levels) / (math.log(levels[-1]) or 1.0), numpy.arange(each) == 0
         raised = numpy.tile([heights, designed.astype(float)], (1, self.groups))
-        self.raised = constant(raised)[:, :, None]
+        self.raised: Array = constant(raised)[:, :, None]
         """By how much the first two settings multiply each weight, logarithmically, ``(2, H, 1)``."""
 
     def start(self, initial: Initial | Start) -> Levels:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from ..contract.model import Episode, Model
 from ..drawing.rendering import Picture, Strip, error_strip
@@ -25,12 +26,12 @@ class UavAutopilotPicture(Picture):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.shown = (
+        self.shown: int = (
             self.task.measured.index(self.task.output) if self.task.output in self.task.measured else 0
         )
-        self.sensor = self.task.sensors[self.shown]
+        self.sensor: str = self.task.sensors[self.shown]
         assert isinstance(model.filter, AutopilotBank)
-        self.actions = model.filter.action_block.parts
+        self.actions: Any = model.filter.action_block.parts
 
     def records(self, state: Episode) -> dict[str, float]:
         """Signals of the loop, NIS, and the levels of the noise."""

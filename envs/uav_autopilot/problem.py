@@ -1,9 +1,9 @@
 """What world, filters and picture of UavAutopilot use of their task: the design of the loop, sensors and output."""
 
 from ..contract.observation import Array
-from ..contract.task import Task
+from ..contract.task import Component, Task
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
-from .plant import design
+from .plant import Design, design
 
 
 class AutopilotProblem(Task):
@@ -14,20 +14,20 @@ class AutopilotProblem(Task):
     def set_up(self) -> None:
         """Design the loop."""
         p = self.parameters
-        self.design = design(p)
-        self.components = COORDINATES[p.plant]
+        self.design: Design = design(p)
+        self.components: tuple[Component, ...] = COORDINATES[p.plant]
         names = [c.name for c in self.components]
         self.sensors: tuple[str, ...] = p.value("sensors")
-        self.measured = tuple(names.index(sensor) for sensor in self.sensors)
+        self.measured: tuple[int, ...] = tuple(names.index(sensor) for sensor in self.sensors)
         """Coordinate that each sensor reads."""
-        self.output = names.index(OUTPUT[p.plant])
+        self.output: int = names.index(OUTPUT[p.plant])
         """Coordinate that the command is for."""
         sigmas = dict(zip(self.sensors, p.value("sensor_sigmas"), strict=True))
-        self.sensor_variances = tuple(float(sigma) ** 2 for sigma in sigmas.values())
+        self.sensor_variances: tuple[float, ...] = tuple(float(sigma) ** 2 for sigma in sigmas.values())
         """Nominal, of each sensor."""
-        self.output_sigma = float({**NOMINAL_SIGMAS[p.plant], **sigmas}[OUTPUT[p.plant]])
+        self.output_sigma: float = float({**NOMINAL_SIGMAS[p.plant], **sigmas}[OUTPUT[p.plant]])
         """Nominal sigma of the output's sensor; of its default where the output is not measured."""
-        self.cost_unit = self.output_sigma**2
+        self.cost_unit: float = self.output_sigma**2
         """What a cost of one is in units of the weighted squares, for comparison with theory."""
         self._L = self.constant(self.design.feedback)
 

@@ -17,14 +17,14 @@ Reading: (6) prints the feedback without the command, with which a unit command 
 takes the control in force, ``B U`` of (8) and (10), command included. Reading: the noise printed in (10) has mean zero and is unknown, so it is dropped.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ...extensions import load_present
 from ..contract.causes import Causes
 from ..contract.companions import Actions, LoopRecords, LostTracks, Paper, PictureMaker, TrainedBanks
 from ..contract.model import Episode, Model
 from ..contract.observation import Array
-from ..contract.task import PaperPolicy, Reward
+from ..contract.task import Banks, Component, PaperPolicy, Reward
 from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
@@ -118,19 +118,24 @@ class UavAutopilot(AutopilotProblem):
     id = ID
     interface = 5
     Parameters = UavAutopilotParameters
-    World = AircraftWorld
-    banks = {"noise": NoiseBank, "gain": GainBank, "hypotheses": HypothesesBank, "mode": ModeBank}
+    World: ClassVar[type[AircraftWorld]] = AircraftWorld
+    banks: ClassVar[Banks] = {
+        "noise": NoiseBank,
+        "gain": GainBank,
+        "hypotheses": HypothesesBank,
+        "mode": ModeBank,
+    }
     scenarios = SCENARIOS
-    components = COORDINATES["U"]
+    components: tuple[Component, ...] = COORDINATES["U"]
     # What gusts and sensors do rules the noise of the reward, and the paper's filter bears it too.
-    reward = Reward(
+    reward: ClassVar[Reward] = Reward(
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor",
         "relative",
         unit=1.5,
     )
-    paper_policy = PaperPolicy("gain", (0.0,))
-    companions = (
+    paper_policy: PaperPolicy = PaperPolicy("gain", (0.0,))
+    companions: tuple[Any, ...] = (
         Paper(
             "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
             "unmanned aircraft using optimal Kalman filter"

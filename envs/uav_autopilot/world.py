@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...filters import linear_systems
+from ...filters.linear_systems import Regulator
 from ..contract.draws import Draws, StepSignal
 from ..contract.faults import Disturbances, undisturbed
 from ..contract.observation import Array
@@ -84,24 +85,25 @@ class AircraftWorld(World[AutopilotProblem, Truth, Measurement]):
             factor[:, numpy.any(factor != 0.0, axis=0)]
             for factor in map(linear_systems.noise_factor, (plant.scaled_noise, plant.other_noise))
         )
-        self.scaled_drives = scaled.shape[1]
+        self.scaled_drives: int = scaled.shape[1]
         """Normal numbers that the level of the disturbance multiplies; they come first."""
-        self.drives = scaled.shape[1] + other.shape[1]
+        self.drives: int = scaled.shape[1] + other.shape[1]
         """Normal numbers that drive the plant; those of the sensors follow."""
-        self.disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
-        self.own_normals = self.drives + len(task.sensors)
-        self.initial_normals = len(task.components) + self.disturbances.initial_normals
-        self.normals = self.own_normals + self.disturbances.normals
-        self.row_uniforms = self.disturbances.row_uniforms
-        self.noise_factor = constant(numpy.hstack([scaled, other]))
+        self.disturbances: Disturbances = Disturbances.of(task, DISTURBANCES, DRAWN_FIRST)
+        self.own_normals: int = self.drives + len(task.sensors)
+        self.initial_normals: int = len(task.components) + self.disturbances.initial_normals
+        self.normals: int = self.own_normals + self.disturbances.normals
+        self.row_uniforms: int = self.disturbances.row_uniforms
+        self.noise_factor: Array = constant(numpy.hstack([scaled, other]))
         self.F, self.B = constant(plant.F), constant(plant.B)
-        self.sensor_sigmas = constant(p.value("sensor_sigmas"))[:, None]
-        self.initial_sigmas = constant(p.value("initial_sigmas"))[:, None]
-        self.initial_covariance = constant(numpy.diag(numpy.square(p.value("initial_sigmas"))))[:, :, None]
-        self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
+        self.sensor_sigmas: Array = constant(p.value("sensor_sigmas"))[:, None]
+        self.initial_sigmas: Array = constant(p.value("initial_sigmas"))[:, None]
+        variances = numpy.square(p.value("initial_sigmas"))
+        self.initial_covariance: Array = constant(numpy.diag(variances))[:, :, None]
+        self.weights: list[Any] = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
-        self.optimal = task.design.optimal
-        self.manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
+        self.optimal: Regulator | None = task.design.optimal
+        self.manoeuvres: int = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
 
     def reading_deviations(self, measurement: Measurement) -> Array:
         """The nominal ones."""

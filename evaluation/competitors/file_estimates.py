@@ -203,8 +203,10 @@ class FileTrack(Filter[Task, Any, FileState]):
 
     def __init__(self, task: Task, given: TrackEstimates, names: Sequence[str]) -> None:
         super().__init__(task)
-        table, self.given, self.names = given.table, given, list(names)
-        self.stated = Stated(table.known, table.deviations)
+        table = given.table
+        self.given = given
+        self.names: list[str] = list(names)
+        self.stated: Stated | None = Stated(table.known, table.deviations)
         held = {name: numpy.flatnonzero(table.track == name) for name in {*names}}
         if {*table.track.tolist()} == {""}:
             held = {name: numpy.arange(len(table.time)) for name in held}

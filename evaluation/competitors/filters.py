@@ -52,8 +52,9 @@ class Adapter(Filter[Task, Any, Adapted]):
 
     def __init__(self, task: Task, own: Any) -> None:
         super().__init__(task)
-        self.own, self.in_python = own, not getattr(own, "traceable", False)
-        self.tells = False
+        self.own = own
+        self.in_python: bool = not getattr(own, "traceable", False)
+        self.tells: bool = False
         """Whether it has told how well it predicted, ever."""
 
     def start(self, initial: Any) -> Adapted:
@@ -100,7 +101,7 @@ class ReferenceAdapter(Adapter):
 
     def __init__(self, task: Task, own: Any) -> None:
         super().__init__(task, own)
-        self.knows = getattr(own, "knows", "") or "the truth"
+        self.knows: str = getattr(own, "knows", "") or "the truth"
 
     def initialise(self, given: FilterInput) -> Adapted:
         """Start where everyone starts, with the truth."""
@@ -154,12 +155,15 @@ class HeldInPython(Filter[Task, Any, Adapted]):
         stated: Stated | None = None,
     ) -> None:
         super().__init__(task)
-        self.own, self.name, self.count = own, name, count
-        self.stated = getattr(own, "stated", stated)
-        self.memory, self.step_number = None, 0
+        self.own = own
+        self.name = name
+        self.count = count
+        self.stated: Stated | None = getattr(own, "stated", stated)
+        self.memory: Any = None
+        self.step_number: int = 0
         self.told: Mapping[str, Array] = {}
         """What it has said beside its last estimate."""
-        self.knows = getattr(own, "knows", "")
+        self.knows: str = getattr(own, "knows", "")
 
     @property
     def fault(self) -> int:
@@ -263,7 +267,9 @@ class CheckedFilter(Filter[Task, Any, Checked]):
 
     def __init__(self, task: Task, own: Filter[Any, Any, Any]) -> None:
         super().__init__(task)
-        self.own, self.in_python, self.stated = own, own.in_python, own.stated
+        self.own = own
+        self.in_python: bool = own.in_python
+        self.stated: Stated | None = own.stated
 
     def start(self, initial: Any) -> Checked:
         """Start where everyone starts."""
@@ -410,8 +416,10 @@ class BoundFilter(AroundBank[LimitState]):
 
     def __init__(self, task: Task, own: Filter[Any, Any, Any], bank: Any) -> None:
         super().__init__(task)
-        self.own, self.bank, self.in_python = own, bank, own.in_python
-        self.knows = own.knows or "the truth"
+        self.own = own
+        self.bank = bank
+        self.in_python: bool = own.in_python
+        self.knows: str = own.knows or "the truth"
 
     def initialise(self, given: FilterInput) -> LimitState:
         """Start where everyone starts, with the truth."""

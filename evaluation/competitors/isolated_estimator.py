@@ -316,9 +316,11 @@ class Frames:
     """Reads the frames that a hello announces."""
 
     def __init__(self, hello: dict[str, Any], numpy: ModuleType, channel: BinaryIO) -> None:
-        self.hello, self.numpy, self.channel = hello, numpy, channel
-        self.tracks = hello["tracks"]
-        self.lanes = -(-self.tracks // LANES) * LANES
+        self.hello = hello
+        self.numpy = numpy
+        self.channel = channel
+        self.tracks: int = hello["tracks"]
+        self.lanes: int = -(-self.tracks // LANES) * LANES
 
     def read(self, name: str) -> Any:
         """Return the next one as a NamedTuple of arrays ``(..., N)``, filled up by its last track; None at the end."""

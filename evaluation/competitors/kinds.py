@@ -242,7 +242,8 @@ class FunctionPolicy(Policy):
         control: str | None = None,
         task_keywords: Mapping[str, Any] | None = None,
     ) -> None:
-        self.function, self.task_keywords = function, dict(task_keywords or {})
+        self.function = function
+        self.task_keywords: dict[str, Any] = dict(task_keywords or {})
         if control is not None:
             self.control = control  # type: ignore[misc]  # of the function, not of the class
 
@@ -301,7 +302,7 @@ class RandomPolicy(Policy):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self.control = model.control  # type: ignore[misc]  # it suits every control
+        self.control: str = model.control  # type: ignore[misc]  # it suits every control
 
     def begin(self, seeds: Sequence[int]) -> RandomActions:
         """Give every episode a generator of its own, of the policy's seed and the episode's."""

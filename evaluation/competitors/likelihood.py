@@ -186,8 +186,10 @@ class WindowLikelihood:
     def __init__(
         self, task: Task, windows: Windows, start: Mapping[str, float], apply: Apply, in_lanes: bool = True
     ) -> None:
-        self.task, self.apply, self.in_lanes = task, apply, in_lanes
-        self.names = tuple(start)
+        self.task = task
+        self.apply = apply
+        self.in_lanes = in_lanes
+        self.names: tuple[str, ...] = tuple(start)
         self._start = numpy.array([[value] for value in start.values()], dtype=float)
         self._compiled: CompiledFunction | None = None
         if in_lanes and AVAILABLE:
@@ -200,12 +202,13 @@ class WindowLikelihood:
 
     def _take(self, windows: Windows) -> None:
         """Compute it of other windows from now on."""
-        self.windows, self._counts = windows, windows.counts
+        self._counts = windows.counts
+        self.windows = windows
         known = numpy.concatenate([~numpy.isnan(found[:, :, 0]) for found in self._stretches(self._start)])
         if not known.any():
             raise ValueError("the estimator does not say how likely measurements were: return it from update")
         self._counts = windows.counts & known
-        self.count = int(self._counts.sum())
+        self.count: int = int(self._counts.sum())
         if not self.count:
             raise ValueError("the recording has no measurement that counts")
 

@@ -15,10 +15,11 @@ import numpy
 
 from ...compiler.functions import leaves, map_arrays, round_up_lanes
 from ...envs.contract.companions import LostTracks, find_companion
-from ...envs.contract.live_input import LiveReader
+from ...envs.contract.live_input import LiveInput, LiveReader
 from ...envs.contract.model import Episode, Model
 from ...envs.contract.observation import DecisionMeans
 from ...envs.contract.parameters import check_integer, quote_shortened, read_numbers
+from ...envs.contract.task import Task
 from ...envs.data.clock import SINCE_1970, time_unit
 from ...envs.engine.compiled import can_step
 from ...filters.array_namespace import select_nested
@@ -69,13 +70,17 @@ class OnlineFilter:
                 f"{name!r} is of kind {kind} and cannot run online: choose a policy or an estimator"
             )
         tracks = check_integer("tracks", tracks, 1)
-        self.name, self.tracks, self.watch, self._lag = name, tracks, watch, _check_lag(lag)
-        self.task = model.task
+        self._lag = _check_lag(lag)
+        self.name = name
+        self.tracks = tracks
+        self.watch = watch
+        self.task: Task = model.task
         world: Any = self.task.world
-        self.input = LiveReader.of(self.task).input(self.task, world.initial, world.measurement, tracks)
+        reader = LiveReader.of(self.task)
+        self.input: LiveInput = reader.input(self.task, world.initial, world.measurement, tracks)
         self._is_policy, interval = kind == "policy", self.task.decision_interval
         self._interval, self._means = interval, DecisionMeans(model.fields, interval)
-        self.model = model if self._is_policy else put_in_loop(model, competitor, kind, name, tracks)
+        self.model: Model = model if self._is_policy else put_in_loop(model, competitor, kind, name, tracks)
         observe, traced = None if watch is None else watch.observe, None
         is_compiled = can_step(self.model, report_estimate)
         self._policy: SteppingPolicy | None = None
@@ -85,8 +90,8 @@ class OnlineFilter:
             if is_compiled and not (watch and self._means.columns):  # means over a decision are not written
                 traced = compile_policy(model, policy, trace_policy)
             self._policy = None if traced else SteppingPolicy(model, policy)
-        self.names = tuple(component.name for component in self.task.components)
-        self.units = tuple(component.unit for component in self.task.components)
+        self.names: tuple[str, ...] = tuple(component.name for component in self.task.components)
+        self.units: tuple[str, ...] = tuple(component.unit for component in self.task.components)
         blank = Estimate(None, self.names, self.units, numpy.empty(0), numpy.empty(0))
         self._same_of_estimates = dict(vars(blank))
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)

@@ -201,10 +201,12 @@ class ProgramEstimator:
     is_program: ClassVar[bool] = True
 
     def __init__(self, task: Task, program: Program) -> None:
-        self.task, self.program = task, program
+        self.task = task
+        self.program = program
         self.tracks: int | None = None
         self.last: int | None = None
-        self.fault, self.step_number = 0, 0
+        self.fault: int = 0
+        self.step_number: int = 0
         self.feedback: numpy.ndarray | None = None
         self._feedback_field: ArrayField | None = None
         """Feedback of a track: offered in the hello, and reported from then on; None where it is not."""
@@ -221,7 +223,7 @@ class ProgramEstimator:
         """
         self.end()
         self.fault, self.step_number = 0, 0
-        self.count = N if self.tracks is None else self.tracks
+        self.count: int = N if self.tracks is None else self.tracks
         self._fields, self._initial = list(fields_of(initial)), rows_of(initial, self.count)
         self.feedback, self._feedback_field = None, None
         meaning = array_meanings(self.task).feedback

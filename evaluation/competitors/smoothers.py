@@ -32,9 +32,10 @@ class SmoothedTrack(Filter[Task, Any, int]):
 
     def __init__(self, task: Task, means: numpy.ndarray, covariances: numpy.ndarray) -> None:
         super().__init__(task)
-        self.means, self.covariances = means, covariances
+        self.means = means
+        self.covariances = covariances
         count = means.shape[-1]
-        self.lanes = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
+        self.lanes: numpy.ndarray = numpy.minimum(numpy.arange(round_up_lanes(count)), count - 1)
         """Episodes in lanes, the last one again in those beyond."""
 
     def start(self, initial: Any) -> int:

@@ -5,8 +5,10 @@ Traced for one track, its arithmetic is a straight line: what steers is then com
 
 import math
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy
 
 from ...compiler import namespace
@@ -53,12 +55,14 @@ class Decider:
     """
 
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
-        self.xp, self.ask, self._template = model.task.xp, act, memory
+        self._template = memory
+        self.xp: ModuleType = model.task.xp
+        self.ask = act
         self._shapes = [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
-        self.space = model.action_space
-        self.size = math.prod(self.space.shape or (1,))
-        self.interval = model.task.decision_interval if interval is None else interval
-        self.means = DecisionMeans(model.fields, self.interval)
+        self.space: gymnasium.Space[Any] = model.action_space
+        self.size: int = math.prod(self.space.shape or (1,))
+        self.interval: int = model.task.decision_interval if interval is None else interval
+        self.means: DecisionMeans = DecisionMeans(model.fields, self.interval)
 
     def start(self, zero: Array) -> Decisions:
         """Nothing is decided yet; all numbers are zero, ``(N,)``."""
@@ -140,8 +144,10 @@ class SteeredFilter(AroundBank[PolicyFilterState]):
 
     def __init__(self, model: Model, decider: Decider) -> None:
         super().__init__(model.task)
-        self.model, self.bank, self.decider = model, model.filter, decider
-        self.adapts_covariance = self.bank.adapts_covariance
+        self.model = model
+        self.bank: Any = model.filter
+        self.decider = decider
+        self.adapts_covariance: bool = self.bank.adapts_covariance
 
     def start(self, initial: Any) -> PolicyFilterState:
         """Start the bank; the policy begins at its first decision."""

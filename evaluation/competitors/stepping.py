@@ -61,8 +61,9 @@ class SteppingPolicy(Policy):
     ) -> None:
         super().__init__(model)
         self.policy = policy
-        self.control = model.control  # type: ignore[misc]  # made for it
-        self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
+        self.control: str = model.control  # type: ignore[misc]  # made for it
+        self.scenario = scenario
+        self.task_keywords: dict[str, Any] = dict(task_keywords or {})
         self._traced: Specialised | None = None
         self._is_traced = False
         self._bound: dict[int, tuple[list[numpy.ndarray], list[numpy.ndarray], Call]] = {}
@@ -181,7 +182,7 @@ class MeasurementMemory:
 
     def __init__(self, like: Any, tracks: int) -> None:
         width, self._like = round_up_lanes(tracks), like
-        self.parts = [empty_lanes(array.shape[:-1], width) for array in leaves(like)]
+        self.parts: list[numpy.ndarray] = [empty_lanes(array.shape[:-1], width) for array in leaves(like)]
         self._is_flat = not any(isinstance(part, tuple) for part in like)
         self._pad = None if tracks == 1 else numpy.minimum(numpy.arange(width), tracks - 1)
         self._places = self.parts if tracks > 1 else [numpy.moveaxis(part, -1, 0) for part in self.parts]
@@ -237,7 +238,7 @@ class CompiledUpdate:
         self._kinds = [array.dtype.kind for array in leaves(episode.filter)]
         self._policy_template = map_arrays(lambda i: i - 1, policy and policy.template[1])
         self._policies = [memory_of(policy.outputs[1:] if policy else (), width) for _ in range(2)]
-        self.blank_policy = map_arrays(
+        self.blank_policy: Any = map_arrays(
             lambda i: numpy.zeros_like(self._policies[0][i]), self._policy_template
         )
         self._received = [MeasurementMemory(episode.measurement, tracks) for _ in range(2)]
@@ -248,8 +249,8 @@ class CompiledUpdate:
             memory_of(watch.outputs if watch else (), width),
         )
         self._action[...] = 0.0
-        self.shown = numpy.zeros((width, predict.outputs[-1].shape[0]))
-        self.observed = fields[0].T if fields else self.shown
+        self.shown: numpy.ndarray = numpy.zeros((width, predict.outputs[-1].shape[0]))
+        self.observed: numpy.ndarray = fields[0].T if fields else self.shown
         self._states: list[list[numpy.ndarray]] = []
         """After the update in each memory, and one that was put."""
         looks, answers = [], []

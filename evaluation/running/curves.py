@@ -175,7 +175,7 @@ def curve_statistics(
         yield Statistic(("curve", "gain", *gains), values, _spread, sample=distributed)
 
 
-DIMENSIONS = {
+DIMENSIONS: dict[str, tuple[str, ...]] = {
     "rmse": ("quantity", "time"),
     "error_exceeded": ("quantity", "share"),
     "mean_cost": (),

@@ -121,7 +121,7 @@ class StackedArrays:
 
     def __init__(self, models: Mapping[str, Model], acting: Sequence[str], episodes: int, drawn: int) -> None:
         several = len({models[name].control for name in acting}) > 1
-        self.actions = {
+        self.actions: dict[str, list[str]] = {
             name: [
                 f"{models[name].control}: {part}" if several else part for part in action_names(models[name])
             ]

@@ -140,7 +140,7 @@ class Workers:
     def __init__(self, jobs: int = 1, cluster: str | None = None) -> None:
         if jobs != -1 and jobs < 1:
             raise ValueError(f"jobs must be at least 1, or -1 for all cores, got {jobs}")
-        self.engine = ""
+        self.engine: str = ""
         if cluster is not None:
             scheme, elsewhere, _ = cluster.partition("://")
             engines = (
@@ -151,8 +151,9 @@ class Workers:
             self.engine = engines[scheme]
             if elsewhere and jobs != 1:
                 raise ValueError("a cluster has as many processes as it has: leave out jobs")
-        self.jobs, self.cluster = jobs, cluster
-        self.alone = jobs == 1 and cluster is None
+        self.jobs = jobs
+        self.cluster = cluster
+        self.alone: bool = jobs == 1 and cluster is None
         """Whether this process does everything itself."""
         self._ended = ExitStack()
         self._dask: Any = None

@@ -116,7 +116,7 @@ class Bootstrap:
     ) -> None:
         self.episodes = episodes
         generator = numpy.random.default_rng(seed)
-        self.ragged = clusters is not None
+        self.ragged: bool = clusters is not None
         self._group = 1 if self.ragged else -(-episodes // SEPARATE)
         """Successive episodes that are resampled together."""
         self._clusters = None
@@ -134,7 +134,7 @@ class Bootstrap:
         self._counts = counts
         """Of every cluster, group or episode in the data and in every resample."""
         # Clusters may differ in size: the mean is over the episodes of those that were drawn.
-        self.totals = self._weigh(numpy.bincount(self._resampled(numpy.arange(episodes))))
+        self.totals: numpy.ndarray = self._weigh(numpy.bincount(self._resampled(numpy.arange(episodes))))
         self._last: tuple[slice, numpy.ndarray] | None = None
 
     def _resampled(self, episodes: numpy.ndarray) -> numpy.ndarray:

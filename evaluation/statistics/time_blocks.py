@@ -39,8 +39,8 @@ class TimeUnits:
     """
 
     def __init__(self, times: int) -> None:
-        self.unit = -(-times // UNITS)
-        self.units = -(-times // self.unit)
+        self.unit: int = -(-times // UNITS)
+        self.units: int = -(-times // self.unit)
 
     def cut(self, values: numpy.ndarray) -> numpy.ndarray:
         """Cut values ``(n, time)`` into units, ``(n, units, unit)``; zero beyond the end."""

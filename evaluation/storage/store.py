@@ -51,7 +51,7 @@ class Store:
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        self.folder = None if folder is None else writable_folder(folder)
+        self.folder: Path | None = None if folder is None else writable_folder(folder)
         self._names: set[str] = set()
 
     def _path(self, work: Work | None) -> Path | None:

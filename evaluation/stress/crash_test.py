@@ -149,8 +149,9 @@ class CrashTest:
         reference: tuple[str, Any] | None = None,
         alterations: Sequence[Alteration] = ALTERATIONS,
     ) -> None:
-        self.experiment, self.steps = experiment, steps
-        self.reference_name = "" if reference is None else reference[0]
+        self.experiment = experiment
+        self.steps = steps
+        self.reference_name: str = "" if reference is None else reference[0]
         self._seeds = episode_seeds(experiment.split, experiment.seed, experiment.episodes)
         length = max(one.length for one in alterations)
         world = experiment.task.World
@@ -165,7 +166,7 @@ class CrashTest:
             generator = numpy.random.default_rng([experiment.seed, *one.name.encode()])
             altered = one.function(whole, generator)
             self.streams[one.name] = None if altered is None else altered.received_as_live()
-        self.scale = numpy.ones(len(whole.task.components))
+        self.scale: numpy.ndarray = numpy.ones(len(whole.task.components))
         self._bootstrap = Bootstrap(experiment.episodes)
         self._kept: list[Stream] = []
         self._reference: dict[str, Run] = {}

@@ -226,7 +226,7 @@ def output_width() -> int | None:
 
 
 # No markup: names and paths are printed as they are.
-console = Output(width=output_width(), markup=False, emoji=False)
+console: Output = Output(width=output_width(), markup=False, emoji=False)
 
 
 def fill(sentence: str, width: int) -> str:

@@ -42,14 +42,17 @@ class FilterText:
     def __init__(
         self, name: str, traced: TracedFilter, scalar: Scalar, components: Sequence[tuple[str, str]]
     ) -> None:
-        self.traced, self.scalar, self.components = traced, scalar, components
+        self.traced = traced
+        self.scalar = scalar
+        self.components = components
         self.about: list[str] = []
-        self.name = own = file_stem(name)
+        self.name: str = file_stem(name)
+        own = self.name
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
         parts["estimate"] = traced.estimate
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
-        self.memory = memory_size(traced.network) if traced.network is not None else 0
-        self.has_state = bool(traced.state or self.memory)
+        self.memory: int = memory_size(traced.network) if traced.network is not None else 0
+        self.has_state: bool = bool(traced.state or self.memory)
         self.start, self.start_source = self._start()
         self.update, self.update_source = self._update()
 

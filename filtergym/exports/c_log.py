@@ -19,7 +19,7 @@ from .traced_filter import TracedFilter
 if TYPE_CHECKING:
     from .request import ExportRequest
 
-READING = {
+READING: dict[str, float] = {
     "SINCE_1970": SINCE_1970,
     "DAY": DAY,
     "LARGEST": LARGEST,
@@ -66,9 +66,9 @@ class LogText(FilterText):
         columns: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(name, traced, scalar, components)
-        self.plain_rows = log_format.plain_rows if log_format else None
-        self.plot_rows = log_format.plot_rows if log_format else None
-        self.log_columns = columns or {}
+        self.plain_rows: PlainRows | None = log_format.plain_rows if log_format else None
+        self.plot_rows: PlotRows | None = log_format.plot_rows if log_format else None
+        self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
         """Names of the columns of a table, in the order of the rows of an argument."""

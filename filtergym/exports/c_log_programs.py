@@ -514,7 +514,7 @@ static int read_odometry(long n) {{
 }}
 """
 """Reads a second sensor."""
-POSITIONS = {
+POSITIONS: dict[tuple[str, ...], str] = {
     ("latitude", "longitude", "altitude"): """if (!(fabs(a) <= 90.0 && fabs(b) <= 360.0))
             return fail("degrees are expected of latitude and longitude,", "not these", row);
         project(a, b, column[4] < 0 ? (double)NAN : row->cell[4], row->p);

@@ -73,7 +73,7 @@ class Writer(LogText):
         columns: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(name, traced, scalar, components, log_format, columns)
-        self.limit = WORST[scalar.name]
+        self.limit: float = WORST[scalar.name]
 
     def rows(self) -> str:
         """Text of a header that fills structs from rows of numbers, for main.c and the test."""

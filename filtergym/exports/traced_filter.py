@@ -85,7 +85,9 @@ class FilterSteps:
         decider: Decider | None = None,
         reports_feedback: bool = False,
     ) -> None:
-        self.filter, self.masked, self.decider = filter, masked, decider
+        self.filter = filter
+        self.masked = masked
+        self.decider = decider
         self.reports_feedback = (
             reports_feedback and bool(array_meanings(filter.task).feedback) and filter.task.closes_loop
         )
@@ -136,8 +138,9 @@ class AskedNetwork(Policy):
 
     def __init__(self, network: "LearnedPolicy", graph: Graph) -> None:
         super().__init__(network.model)
-        self.network, self.graph = network, graph
-        self.control = network.control  # type: ignore[misc]
+        self.network = network
+        self.graph = graph
+        self.control: str = network.control  # type: ignore[misc]
         self.shown: list[int] = []
 
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:

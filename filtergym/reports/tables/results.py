@@ -35,7 +35,7 @@ TRACK_TIMES = 160
 TRACK_DIGITS = {"truth": 7, "estimate": 7, "seen": 7}
 DIGITS = 4
 """Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
-REQUIRED_DIMENSIONS = {
+REQUIRED_DIMENSIONS: dict[str, tuple[str, ...]] = {
     "curves": ("policy", "time"),
     "track": ("policy", "time", "component", "unit", "estimate", "sigma"),
 }
