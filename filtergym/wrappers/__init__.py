@@ -80,9 +80,8 @@ def check_model(
             "action=, a function from actions to these inputs"
         )
     if model.inputs:
-        found = inputs_of(
-            model, numpy.asarray(space.sample() if not hasattr(space, "n") else space.start)[None]
-        )  # type: ignore[attr-defined]
+        example: Any = gymnasium.vector.utils.create_empty_array(space, 1, fn=numpy.zeros)
+        found = inputs_of(model, example)
         if found.shape != (1, len(model.inputs)):
             raise ValueError(
                 f"action of the model must return the {len(model.inputs)} inputs {', '.join(model.inputs)}, got the "
