@@ -8,8 +8,9 @@ correction of Patton, Politis and White, Econometric Reviews 28, 2009). It suppo
 Of long episodes blocks begin at every unit of a few measurements, whose sums are all that is kept of the episode.
 
 Of an episode of few blocks there is no interval: of a short series the autocorrelation is estimated too small, and
-the interval with it. Of first-order autoregressive processes the 95 % interval covers 90 to 97 % where there are
-``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third (``tests/test_time_blocks.py``).
+the interval with it. Of first-order autoregressive processes the 95 % interval covers 90 to 97 % where most series have
+``FEWEST_BLOCKS``, some 200 correlation times, and 34 to 87 % where there are a third. Where few series of a process
+pass, these are the ones whose correlation is estimated too small, and their intervals cover about half.
 Rules for the estimate of a correlation time lie on either side: 50 correlation times (emcee) and 1,000 (Sokal: Monte
 Carlo methods in statistical mechanics, in Functional Integration, 1997, 3).
 """
