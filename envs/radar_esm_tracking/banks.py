@@ -127,21 +127,12 @@ class ClassBank(Bank[RadarEsmProblem, Measurement, Filters]):
     def __init__(self, task: RadarEsmProblem, control: str) -> None:
         super().__init__(task, control)
         p, constant = self.parameters, task.constant
-<<<<<<< HEAD
-        self.forgetting = math.exp(-1.0 / p.averaging_measurements)
-        self.gate = bearing_gate(p)
-        self.mixes = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
-        self.class_transition = constant(p.class_transition)
-        self.start_covariance = constant(task.design_models(p)[1])[..., None]
-        self.last_scan = p.horizon + 1
-=======
         self.forgetting: float = math.exp(-1.0 / p.averaging_measurements)
-        self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
+        self.gate = bearing_gate(p)
         self.mixes: bool = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
         self.class_transition: Array = constant(p.class_transition)
         self.start_covariance: Array = constant(task.design_models(p)[1])[..., None]
         self.last_scan: int = p.horizon + 1
->>>>>>> w-types
         if not self.mixes:
             channels = _design_channels(task.design_models, p)
             self.channels: Channels = class_fusion.Channels(*(constant(table) for table in channels))

@@ -150,20 +150,14 @@ class ExactBayes(SteerableFilter[RadarEsmProblem, Measurement, ClassState]):
 
     def __init__(self, task: RadarEsmProblem, prior: ClassPrior = TRAINING, **changed: Any) -> None:
         super().__init__(task)
-<<<<<<< HEAD:envs/radar_esm_tracking/exact_bayes.py
-        self.prior = prior = prior._replace(**changed)
-        p, self.classes = task.parameters, task.classes
-        self.settings = dict.fromkeys(p.class_names, 1.15) | {
-            "changed": 1.3, "second_emitter": 2.0, "process": 2.0, "radar": 1.35
-        }  # fmt: skip
-        self.spacing = p.esm_period
-=======
         prior = prior._replace(**changed)
         self.prior = prior
         p = task.parameters
         self.classes: int = task.classes
+        self.settings = dict.fromkeys(p.class_names, 1.15) | {
+            "changed": 1.3, "second_emitter": 2.0, "process": 2.0, "radar": 1.35
+        }  # fmt: skip
         self.spacing: int = p.esm_period
->>>>>>> w-types:baselines/radar_esm_tracking/exact_bayes.py
         models, start = task.design_models(p)
         decay = math.exp(-p.sampling_interval / prior.correlation_time)
         if prior.coloured:

@@ -126,13 +126,13 @@ class RadarEsmTracking(RadarEsmProblem):
     id = ID
     interface = 4
     Parameters = RadarEsmTrackingParameters
-<<<<<<< HEAD
-    World = RadarEsmWorld
-    banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank, "hypotheses": HypothesesBank}
-=======
     World: ClassVar[type[RadarEsmWorld]] = RadarEsmWorld
-    banks: ClassVar[Banks] = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
->>>>>>> w-types
+    banks: ClassVar[Banks] = {
+        "evidence": ClassBank,
+        "mode": ClassBank,
+        "weights": ClassBank,
+        "hypotheses": HypothesesBank,
+    }
     scenarios = SCENARIOS
     components: tuple[Component, ...] = (
         Component("range", "m"),
