@@ -26,8 +26,9 @@ from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.metrics import Record, flight_records
-from ..evaluation.running.parallel import Workers
+from ..evaluation.running.parallel import LostProcess, Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
+from ..evaluation.running.supervision import is_supervised
 from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
 from ..evaluation.statistics.cause_split import phrases_of
 from ..evaluation.statistics.predictions import stretch_interval
@@ -340,6 +341,11 @@ def run(
                 found = run_requests(
                     others, workers, lambda done: bar.update(line, advance=done), store, whole
                 )
+            except LostProcess:
+                if workers.alone or not is_supervised():
+                    raise
+                workers = Workers()  # a process that reports whose code ends it
+                bar.update(line, completed=0)
             except ValueError as error:
                 words = (f"{one.name!r} {how}" for one in others for how in ("failed", "cannot be made"))
                 failed = [own.split("'")[1] for own in words if own in str(error)]
