@@ -58,7 +58,7 @@ Outcome = tuple[int, Any, tuple[Exception, str] | None, list[tuple[str, type[War
 """Number of a piece of work, its result, its error with the traceback, and its warnings."""
 
 
-class LostProcess(ValueError):
+class LostProcessError(ValueError):
     """A process that did part of the work has ended."""
 
 
@@ -266,7 +266,7 @@ class Workers:
                 )
                 yield from pool(joblib.delayed(_run_piece)(*call) for call in calls)
         except TerminatedWorkerError as error:
-            raise LostProcess(
+            raise LostProcessError(
                 "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
                 "fewer jobs, or go on from here by the same command where it keeps what is done"
             ) from error

@@ -26,9 +26,10 @@ from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.metrics import Record, flight_records
-from ..evaluation.running.parallel import LostProcess, Workers
+from ..evaluation.running.parallel import LostProcessError, Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
 from ..evaluation.running.supervision import is_supervised
+from ..evaluation.running.times import points_of_records
 from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
 from ..evaluation.statistics.cause_split import phrases_of
 from ..evaluation.statistics.predictions import stretch_interval
@@ -278,17 +279,18 @@ def tables_of(
     flights: list[Record],
     differences: Mapping[str, IntervalEstimate],
     width: int,
+    own: Sequence[str] = (),
 ) -> list[Table]:
-    """Return what is printed in so many columns, widest first."""
+    """Return what is printed in so many columns, widest first, with the rows of the user's own marked."""
     tables = [flights_table(found.dataset, flights, found.records, width)] if flights else []
     if found.has_truth:
-        compared = results_tables(found.records, problem.knows, width, found.dataset.attrs["paper"])
         paper = found.dataset.attrs["paper"]
+        compared = results_tables(found.records, problem.knows, width, paper, own)
         if paper not in {record.policy for record in found.records}:
             compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
     if found.recorded:
-        tables += recording_tables(found.records, differences, found.has_truth, width)
+        tables += recording_tables(found.records, differences, found.has_truth, width, own)
     return tables
 
 
@@ -341,7 +343,7 @@ def run(
                 found = run_requests(
                     others, workers, lambda done: bar.update(line, advance=done), store, whole
                 )
-            except LostProcess:
+            except LostProcessError:
                 if workers.alone or not is_supervised():
                     raise
                 workers = Workers()  # a process that reports whose code ends it
@@ -390,7 +392,8 @@ def write(
     flights = flights_of(found)
     differences = likelihood_differences(found.dataset) if found.recorded else {}
     printed, in_file = (
-        tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
+        tables_of(problem, found, flights, differences, width, marked)
+        for width, marked in ((console.width, own), (LATEX_WIDTH, ()))
     )
     sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
     for sentence in sentences:  # before anything is written, which can fail
@@ -419,7 +422,8 @@ def write(
             write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
-            for name, figure in evaluation_figures(found.curves, outputs.columns, learned=learned):
+            points = points_of_records(found.records)
+            for name, figure in evaluation_figures(found.curves, outputs.columns, None, learned, own, points):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             for name, figure in worst_figures(worst, phrases_of(found.dataset), outputs.columns):

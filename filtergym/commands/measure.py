@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-import xarray
 
 from ..baselines.problem import problem_of
 from ..envs.data.recording import Recording
@@ -15,8 +14,10 @@ from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.parallel import Workers
 from ..evaluation.running.recording import record_experiment
 from ..evaluation.running.rollout import Progress
+from ..evaluation.running.summary import Evaluation
 from ..evaluation.running.supervision import supervise
 from ..evaluation.running.threads import one_thread
+from ..evaluation.running.times import points_of_records
 from ..evaluation.storage.blind import write_blind
 from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.storage.store import UNFINISHED, Store
@@ -424,9 +425,11 @@ def benchmark(
                 f"{first.episodes:,} episodes"
             )
 
-        def save_figures(cell: Cell, curves: xarray.Dataset) -> None:
-            learned = learned_names(cell.environment)
-            for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
+        def save_figures(cell: Cell, found: Evaluation) -> None:
+            if found.curves is None or not formats:
+                return
+            learned, points = learned_names(cell.environment), points_of_records(found.records)
+            for name, figure in evaluation_figures(found.curves, columns, learned=learned, points=points):
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
