@@ -84,6 +84,8 @@ class FileOptions(NamedTuple):
     truth_offset: float = 0.0
     rename: str | None = None
     """Of the columns of a recording."""
+    sort: bool = False
+    """Whether the rows of a recording are sorted by time."""
 
 
 class Outputs(NamedTuple):
@@ -151,12 +153,13 @@ def find_data(
             truth=options.truth,
             truth_offset=options.truth_offset,
             rename=renamed(options.rename),
+            sort=options.sort,
             **keywords,
         )
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
-    check_no_recording_options(options.truth, options.rename)
+    check_no_recording_options(options.truth, options.rename, options.sort)
     if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     if scenario in named or not names_flights(scenario):

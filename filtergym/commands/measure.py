@@ -61,6 +61,7 @@ from .terminal import (
     Parameters,
     RenameOption,
     ScenarioName,
+    SortOption,
     Split,
     Threads,
     Trust,
@@ -136,6 +137,7 @@ def evaluate_policies(
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
     rename: RenameOption = None,
+    sort: SortOption = False,
     estimates: Annotated[
         Path | None,
         typer.Option(
@@ -219,7 +221,9 @@ def evaluate_policies(
         return
     keywords = parse_settings(settings)
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
-    options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename)
+    options = FileOptions(
+        site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename, sort
+    )
     outputs.check()
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
