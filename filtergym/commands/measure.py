@@ -19,7 +19,14 @@ from ..evaluation.running.supervision import supervise
 from ..evaluation.running.threads import one_thread
 from ..evaluation.running.times import points_of_records
 from ..evaluation.storage.blind import write_blind
-from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
+from ..evaluation.storage.files import (
+    hold_folder,
+    whole_file,
+    whole_files,
+    writable_file,
+    writable_folder,
+    write_text,
+)
 from ..evaluation.storage.store import UNFINISHED, Store
 from ..extensions import PREFIXES
 from ..functions import requests_of
@@ -225,6 +232,8 @@ def evaluate_policies(
         site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename, sort
     )
     outputs.check()
+    if out is not None:
+        ctx.with_resource(hold_folder(out))
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
     if isolated:
