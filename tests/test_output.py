@@ -207,8 +207,8 @@ def test_a_file_that_may_not_grow_and_a_home_that_takes_nothing(tmp_path):
     words = [*map(str, EVALUATE), "--set", "horizon=5", "--json", "records.json"]
     for most, code, backend in ((2_000, 2, "numpy"), (1 << 30, 0, "auto")):
         done = subprocess.run(
-            [sys.executable, "-c", program, str(most), *words, "--backend", backend], check=False, cwd=tmp_path, capture_output=True,
-            text=True, env={**os.environ, "HOME": "/proc", "XDG_CACHE_HOME": "/proc"},
+            [sys.executable, "-c", program, str(most), *words, "--backend", backend], check=False, cwd=tmp_path,
+            capture_output=True, text=True, env={**os.environ, "HOME": "/proc", "XDG_CACHE_HOME": "/proc"},
         )  # fmt: skip
         assert done.returncode == code, done.stderr
         if code:
