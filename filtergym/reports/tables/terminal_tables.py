@@ -305,9 +305,9 @@ def competitors_table(
             table.add_section()
             section = kind
         control_column = steered if kind == "policy" else f"({kind})"
-        marked = f"{OWN_ROW} {name}" if name in own else name
+        marked = f"{OWN_ROW}\xa0{name}" if name in own else name  # no line holds the mark alone
         table.add_row(
-            "\n".join(textwrap.wrap(marked, NARROW if compact else WIDE)),
+            "\n".join(textwrap.wrap(marked, NARROW if compact else WIDE)).replace("\xa0", " "),
             *([control_column] if control else []),
             *(column(name) for column in columns.values()),
             style="bold" if name in own else None,
