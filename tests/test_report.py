@@ -291,7 +291,7 @@ def test_only_who_is_consistent_is_called_so(result):
         ]
         return remarks([result._replace(records=records)])
 
-    assert any("1 of 1 states a covariance that does not fit" in s and "1.1" in s for s in told(1.05))
+    assert any("The winner states a covariance that does not fit" in s and "1.1" in s for s in told(1.05))
     assert "The covariance of every winner is as large as its errors." in told(0.9)
 
 
