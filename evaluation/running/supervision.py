@@ -20,6 +20,8 @@ from .rollout import Progress
 
 POLLING = 0.5
 """s after which the parent looks whether its child is still there."""
+START_SECONDS = 60.0
+"""s at least that the first measurement may take: what steps the world is compiled before it."""
 STEP = 0.1
 """s between two reports of a competitor that goes on."""
 _supervised: frozenset[str] = frozenset()
@@ -83,7 +85,7 @@ def running(name: str, progress: Progress | None = None, timed: bool = True) -> 
     if name not in _supervised:
         yield tick
         return
-    reported = time.monotonic()
+    reported = 0.0
 
     def tick_and_report(measurements: int) -> None:
         nonlocal reported
@@ -105,12 +107,12 @@ def _report(line: str) -> None:
 
 
 def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
-    """Wait for the end of a child; return the competitor in whose code it ended, and how.
+    """Wait for the end of a child, and end it where a competitor is late; return in whose code it ended, and how.
 
     Raises:
         SystemExit: if it ended elsewhere, with its status.
     """
-    running, unread, heard, status = "", b"", time.monotonic(), 0
+    running, unread, heard, status, limit = "", b"", time.monotonic(), 0, seconds
     # Ctrl-C is for the child, and so is a request to end.
     before = {
         signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN),
@@ -121,10 +123,12 @@ def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
         if select.select([reports], [], [], POLLING)[0]:
             found = os.read(reports, 1 << 16)
             *lines, unread = (unread + found).split(b"\n")
-            running = next((line.decode() for line in reversed(lines) if line != b"."), running)
-            heard = time.monotonic() if lines else heard
+            for line in lines:
+                heard, goes_on = time.monotonic(), line == b"."
+                running = running if goes_on else line.decode()
+                limit = seconds if goes_on else max(seconds, START_SECONDS)
             ended = not found
-        elif running.startswith("1") and time.monotonic() - heard > seconds:
+        elif running.startswith("1") and time.monotonic() - heard > limit:
             is_late = True
             os.kill(child, signal.SIGKILL)
         else:
@@ -139,6 +143,6 @@ def _watch(child: int, reports: int, seconds: float) -> tuple[str, str]:
     if not running:
         raise SystemExit(code if code >= 0 else 128 - code)
     if is_late:
-        return running[1:], f"it has not answered within {seconds:g} s, see --time-limit"
+        return running[1:], f"it has not answered within {limit:g} s, see --time-limit"
     ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
     return running[1:], f"it has ended the process {ending}"
