@@ -11,6 +11,7 @@ from .baselines.problem import Problem, import_problem
 from .envs.contract.parameters import quote_shortened
 from .envs.engine.catalogue import import_user_module, nearest
 from .evaluation.competitors.kinds import Competitor, CompetitorFiles, check_competitor
+from .evaluation.running.supervision import running
 from .extensions import PREFIXES, SOURCES, load, load_present
 
 MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -64,7 +65,8 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
             if os.path.isfile(f"{name}{ending}"):
                 raise ValueError(f"unknown policy {name!r}: a file is named whole, {name}{ending}")
         raise nearest("policy", name, shipped_names(problem))
-    holder = import_user_module(module, f"cannot load policy {name!r}")
+    with running(name):
+        holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
     return Competitor(name, check_competitor(name, getattr(holder, attribute)))
@@ -154,14 +156,15 @@ def isolate_names(problem: Problem, names: Sequence[str]) -> list[str]:
     Raises:
         ValueError: for one behind a gate, which acts in this process.
     """
-
-    def is_module(name: str) -> bool:
-        return problem.find(name) is None and MODULE.fullmatch(name) is not None
-
     for name in names:
-        if name.startswith("gated:") and is_module(name.removeprefix("gated:")):
+        if name.startswith("gated:") and is_module(problem, name.removeprefix("gated:")):
             raise ValueError(f"{name!r} acts in this process, beside the truth: an estimator can be isolated")
     return [
-        f"isolated:{name}" if is_module(name) and not name.startswith((*PREFIXES,)) else name
+        f"isolated:{name}" if is_module(problem, name) and not name.startswith((*PREFIXES,)) else name
         for name in names
     ]
+
+
+def is_module(problem: Problem, name: str) -> bool:
+    """Whether a name is ``module:Class`` of a user."""
+    return problem.find(name) is None and MODULE.fullmatch(name) is not None

@@ -8,8 +8,8 @@ import pytest
 from models import make_model
 
 from filtergym import evaluate
-from filtergym.envs.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
 from filtergym.baselines.radar_esm_tracking.references import Ideal
+from filtergym.envs.radar_esm_tracking.exact_bayes import TRAINING, VAGUE, ExactBayes
 from filtergym.evaluation.running.rollout import rollout
 from filtergym.evaluation.running.seeds import episode_seeds
 from filtergym.filters import class_fusion, emitter_association

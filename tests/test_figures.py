@@ -25,6 +25,7 @@ from filtergym.evaluation.figures.front_figure import FrontPanel, name_points
 from filtergym.evaluation.figures.looks import (
     COLOURS,
     MOST_HIGHLIGHTED,
+    OWN,
     by_cost,
     choose_highlights,
     group_equal_lines,
@@ -125,6 +126,18 @@ def test_kinds_always_look_the_same(curves):
         for label, line in named(draw_error_over_time(curves, look).axes[0]).items()
     }
     assert drawn == dashes
+
+
+def test_what_a_user_brings_has_a_colour_and_the_first_place(curves):
+    look = looks(curves, learned=["bptt"], own=["adaptive"])
+    assert next(iter(look)) == "adaptive"
+    assert [name for name, style in look.items() if style["color"] == OWN] == ["adaptive"]
+    assert look["adaptive"]["linewidth"] > look["imm"]["linewidth"]
+    points = [Point(name, "policy", ProcessorTime(100.0 + i, True), 5.0 * i) for i, name in enumerate(NAMES)]
+    figures = dict(evaluation_figures(curves, own=["adaptive"], points=points))
+    drawn = [text for text in figures["cost_and_time"].axes[0].texts if text.get_text() == "adaptive"]
+    assert [text.get_color() for text in drawn] == [OWN]
+    assert "cost_and_time" not in dict(evaluation_figures(curves))
 
 
 def test_who_is_told_apart_may_be_asked_for(curves):

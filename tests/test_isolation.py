@@ -1,6 +1,7 @@
 """An estimator in a process of its own: it answers what it answers anywhere, and finds no truth."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -285,6 +286,39 @@ def test_a_competitor_that_fails_costs_its_own_row(isolated, tmp_path, monkeypat
     assert "OSError: full" in errors
     assert errors.rstrip().endswith("the others are in the table")
     assert isolated or "SystemExit: 3" in errors  # a process that ends is a row of lost episodes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a class that ends its process ends the run")
+def test_a_class_that_ends_its_process_or_hangs_costs_its_own_row(tmp_path):
+    """Of a class in the process that simulates the world, too; what the others have done is written."""
+    bad = {
+        "Exits": "os._exit(3)",
+        "Kills": "os.kill(os.getpid(), 9)",
+        "Hangs": "time.sleep(60.0 * (memory == 1))",
+    }
+    text = """class {}:
+    def start(self, initial, N): self.initial = initial.mean, initial.covariance; return 0
+    def update(self, memory, measurement): {}; return *self.initial, memory + 1
+"""
+    classes = [text.format(name, act) for name, act in bad.items()]
+    (tmp_path / "wretched.py").write_text("import os, time\n" + "".join(classes))
+    (tmp_path / "unborn.py").write_text("import os\nos._exit(0)\n")
+    mine = [word for name in bad for word in ("--policy", f"wretched:{name}")]
+    options = (
+        "--policy unborn:Class --policy imm --episodes 2 --set horizon=5 --time-limit 1 --json records.json"
+    )
+    words = [sys.executable, "-m", "filtergym", "evaluate", ID, *mine, *options.split()]
+    done = subprocess.run(words, check=False, cwd=tmp_path, capture_output=True, text=True)
+    assert {own["policy"] for own in json.loads((tmp_path / "records.json").read_text())} == {"imm"}
+    assert done.returncode == 2
+    for name, ending in (
+        ("wretched:Exits", "it has ended the process with exit status 3"),
+        ("wretched:Kills", "it has ended the process by SIGKILL"),
+        ("wretched:Hangs", "it has not answered within 1 s, see --time-limit"),
+        ("unborn:Class", "it has ended the process with exit status 0"),
+    ):
+        assert f"{name!r} takes no part: {ending}" in done.stderr
+    assert done.stderr.rstrip().endswith("the others are in the table")
 
 
 def test_a_wrong_shape_is_no_answer():

@@ -435,11 +435,11 @@ def test_a_column_that_is_not_understood_can_be_ignored(tmp_path):
     [
         (
             [0.0, 1.0, 3.0, 2.0, 4.0],
-            "time decreases from 3 in row 2 to 2 in row 3: sort the rows by time, such as by pandas",
+            "time decreases from 3 in row 2 to 2 in row 3: --sort ",
         ),
         (
             [f"2026-03-14T09:12:0{second}.250Z" for second in (1, 3, 2, 4, 5)],
-            r"from 2026-03-14T09:12:03\.250Z in row 1 to 2026-03-14T09:12:02\.250Z in row 2: sort the rows",
+            r"from 2026-03-14T09:12:03\.250Z in row 1 to 2026-03-14T09:12:02\.250Z in row 2: --sort",
         ),
         ([4294967293, 4294967295, 1, 3, 5], "starts again: add 4294967296 to the times from row 2 on"),
         ([4294967.1, 4294967.2, 0.004, 0.1, 0.2], "starts again: add 4294967.296 to the times from row 2 on"),
@@ -450,3 +450,48 @@ def test_times_that_decrease_get_what_to_do(tmp_path, times, hint):
     pandas.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
     with pytest.raises(ValueError, match=hint):
         read_recording(tmp_path / "log.csv", TARGET)
+
+
+def assert_same_recording(found, other):
+    np.testing.assert_array_equal(found.measurements["position"], other.measurements["position"])
+    np.testing.assert_array_equal(found.truth, other.truth)
+    np.testing.assert_array_equal(found.seconds, other.seconds)
+    np.testing.assert_array_equal(found.log_time, other.log_time)
+    assert found.names == other.names
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%SZ", None])
+def test_rows_are_sorted_by_time_where_that_is_asked_for(tmp_path, form, command):
+    """Within each recording, as if the file had been in order; what stood after later rows is counted."""
+    times = [*TIME] if form is None else list(pandas.to_datetime(TIME, unit="s").strftime(form))
+    both = pandas.concat([aircraft(time=times).assign(recording=name) for name in ("b", "a")])
+    order = np.arange(2 * COUNT)
+    order[[0, 1]], order[[20, 24]] = (1, 0), (24, 20)
+    both.to_csv(tmp_path / "sorted.csv", index=False)
+    both.iloc[order].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(ValueError, match="--sort"):
+        read_recording(tmp_path / "log.csv", TARGET)
+    found = read_recording(tmp_path / "log.csv", TARGET, sort=True)
+    assert_same_recording(found, read_recording(tmp_path / "sorted.csv", TARGET))
+    # Of the rows that changed places, the first of the one pair and all that the second pair encloses.
+    assert "sorted by time: 5 of 120 rows stood after later ones" in found.notes
+    assert not [n for n in read_recording(tmp_path / "sorted.csv", TARGET, sort=True).notes if "sorted" in n]
+    words = ("evaluate", TARGET, "--recording", tmp_path / "log.csv", "--policy", "imm")
+    code, shown, _ = command(*words, "--sort")
+    assert (code, "sorted by time: 5 of 120 rows" in shown) == (0, True)
+    assert command(*words)[0] == 2
+    assert "--sort is for a recording" in command("evaluate", TARGET, "--policy", "imm", "--sort")[2]
+
+
+def test_a_truth_is_sorted_with_its_log_and_a_counter_is_not(tmp_path):
+    plots, rows = untold(), aircraft()
+    plots.to_csv(tmp_path / "log.csv", index=False)
+    true = rows[["time", "truth_position_x", "truth_position_y"]]
+    true.to_csv(tmp_path / "truth.csv", index=False)
+    true[::-1].to_csv(tmp_path / "back.csv", index=False)
+    found = read_recording(tmp_path / "log.csv", TARGET, truth=tmp_path / "back.csv", sort=True)
+    assert_same_recording(found, read_recording(tmp_path / "log.csv", TARGET, truth=tmp_path / "truth.csv"))
+    assert "truth: sorted by time: 59 of 60 rows stood after later ones" in found.notes
+    plots.assign(time=(TIME + 2.0**32 - 99.0) % 2.0**32).to_csv(tmp_path / "counter.csv", index=False)
+    with pytest.raises(ValueError, match="a counter that starts again"):
+        read_recording(tmp_path / "counter.csv", TARGET, sort=True)

@@ -4,6 +4,8 @@ import io
 import json
 import os
 import shutil
+import subprocess
+import sys
 
 import commands
 import pytest
@@ -152,3 +154,64 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_results_before(run, tmp_path
     code, error = run(*EVALUATE, "--seed", 1, "--out", "out")
     assert (code, error) == (2, "Error: cannot write to folder out: No space left on device\n")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+STOPS_WHILE_IT_WRITES = """
+import sys, time
+from filtergym.commands import evaluation
+def stop(figure, path):
+    path.write_bytes(b"half")
+    print("here", file=sys.__stdout__, flush=True)
+    time.sleep(60.0)
+evaluation.save = stop
+sys.stdout = sys.stderr  # of the tables
+"""
+
+
+def test_a_second_run_into_a_folder_is_refused_while_the_first_writes(run, tmp_path):
+    """What the first, which is killed then, has left is not taken for a result."""
+    program = STOPS_WHILE_IT_WRITES
+    words = [*map(str, EVALUATE), "--backend", "numpy", "--set", "horizon=5", "--out", "out"]
+    program += f"from filtergym.__main__ import main\nsys.argv = {['filtergym', *words]}\nmain()\n"
+    first = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert first.stdout.readline() == "here\n"
+        refused = "Error: another process writes to out: wait until it ends, or choose another folder\n"
+        assert run(*EVALUATE, "--out", "out") == (2, refused)
+        assert not [path for path in (tmp_path / "out").iterdir() if not path.name.startswith(".unfinished-")]
+    finally:
+        first.kill()
+        first.wait()
+        first.stdout.close()
+    assert run(*EVALUATE, "--out", "out")[0] == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert "results.json" in names
+    assert (tmp_path / "out" / "figure.png").read_bytes() == b"drawn"
+    assert not [name for name in names if name.startswith(".")]
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="limits of files and folders that take nothing are Linux's here"
+)
+def test_a_file_that_may_not_grow_and_a_home_that_takes_nothing(tmp_path):
+    """The limit ends it in one sentence and leaves no half of anything; caches are done without."""
+    program = "import resource, runpy, sys\n"
+    program += "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)\n"
+    program += "runpy.run_module('filtergym', run_name='__main__')\n"
+    words = [*map(str, EVALUATE), "--set", "horizon=5", "--json", "records.json"]
+    for most, code, backend in ((2_000, 2, "numpy"), (1 << 30, 0, "auto")):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(most), *words, "--backend", backend], check=False, cwd=tmp_path,
+            capture_output=True, text=True, env={**os.environ, "HOME": "/proc", "XDG_CACHE_HOME": "/proc"},
+        )  # fmt: skip
+        assert done.returncode == code, done.stderr
+        if code:
+            assert done.stderr == "Error: cannot write file records.json: File too large\n"
+            assert not [*tmp_path.iterdir()]
+    assert json.loads((tmp_path / "records.json").read_text())

@@ -427,8 +427,8 @@ def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
             "no column states deviations of x and y, assumed as positions scatter about their neighbours: "
         )
         assert read.notes == (
-            "c.csv: left out: time decreases from 5 in row 1 to 4 in row 2: sort the rows by time, such as by pandas' "
-            "sort_values",
+            "c.csv: left out: time decreases from 5 in row 1 to 4 in row 2: --sort (sort=True of read_recording) sorts "
+            "the rows by time",
             f"a: {assumed}sigma_x 121 m, sigma_y 121 m",
             f"b: {assumed}sigma_x 90.8 m, sigma_y 90.8 m",
             "d: left out: sampling_interval is 6.0, and of a 5.0",

@@ -211,6 +211,21 @@ def test_headline_fits_a_narrow_terminal(result, command_console):
     assert "…" not in text
 
 
+@pytest.mark.parametrize("width", [100, 200])
+def test_rows_of_ones_own_are_marked(width, result, command_console):
+    own = {r.policy for r in result.records if r.policy != "ppo"}
+    records = [
+        r._replace(policy=f"isolated:mine_{r.policy}:Filter") if r.policy in own else r
+        for r in result.records
+    ]
+    own = {r.policy for r in records} - {"ppo"}
+    tables = results_tables(records, {}, width, own=own)
+    text = command_console(width, *tables)
+    assert text.count("> isolated:mine") == len(own) * len(tables)
+    assert "> ppo" not in text
+    assert "> marks your own." in tables[-1].caption
+
+
 @pytest.mark.parametrize("width", [80, 100, 200])
 def test_no_number_is_cut_at_any_width(width, result, command_console):
     tables = results_tables(result.records, result.knows, width)
@@ -276,7 +291,7 @@ def test_only_who_is_consistent_is_called_so(result):
         ]
         return remarks([result._replace(records=records)])
 
-    assert any("1 of 1 states a covariance that does not fit" in s and "1.1" in s for s in told(1.05))
+    assert any("The winner states a covariance that does not fit" in s and "1.1" in s for s in told(1.05))
     assert "The covariance of every winner is as large as its errors." in told(0.9)
 
 
@@ -288,12 +303,12 @@ def test_remarks_follow_from_the_numbers(result):
         return remarks([result._replace(records=records)])
 
     helped = changed("geometric_cost_difference", value=-0.5, low=-0.6, high=-0.4)
-    assert helped[0].startswith("None of 1 results of learned agents")
+    assert helped[0].startswith("The learned agent is not significantly worse")
     harmed = changed("geometric_cost_difference", value=0.5, low=0.4, high=0.6)
-    assert harmed[0].startswith("1 of 1 results of learned agents is significantly worse")
+    assert harmed[0].startswith("The learned agent is significantly worse")
     assert "`ppo`" in harmed[0]
     unsure = changed("relative_cost_difference", value=0.5, low=None, high=None)
-    assert unsure[0].startswith("None of 1 results of learned agents")
+    assert unsure[0].startswith("The learned agent is not significantly worse")
     assert not any("learned agents" in sentence for sentence in remarks([result._replace(learned=[])]))
 
 

@@ -122,7 +122,7 @@ def test_an_offset_that_changes_is_none():
         (truth(TIME).assign(time="12:00:00"), "times of the log are seconds and those of the truth times of day"),
         (truth(TIME).drop(columns="y"), "column truth_position_y is missing|lacks the column"),
         (truth(TIME)[["time"]], "has the columns time, and needs time and x and y"),
-        (truth(TIME[::-1]), "time decreases from .* in row 0 to .* in row 1: sort the rows"),
+        (truth(TIME[::-1]), "time decreases from .* in row 0 to .* in row 1: --sort "),
         (truth(TIME[:1]), "it has one row"),
     ],
 )  # fmt: skip

@@ -486,17 +486,47 @@ def check_order(time: numpy.ndarray, written: numpy.ndarray | None = None) -> No
     steps = numpy.diff(time)
     if (steps < 0.0).any():
         row = int((steps < 0.0).argmax())
+        turn = _counter_turn(steps[row])
         before, after = (
             t if isinstance(t, str) else numpy.format_float_positional(t, trim="-")
             for t in (time if written is None else written)[row : row + 2]
         )
-        turn = next((turn for turn in COUNTERS if abs(steps[row] + turn) < COUNTER_SHARE * turn), None)
-        hint = "sort the rows by time, such as by pandas' sort_values"
+        hint = "--sort (sort=True of read_recording) sorts the rows by time"
         if turn is not None:
             hint = f"a counter that starts again: add {turn:.10g} to the times from row {row + 1} on"
         elif steps[row] <= -1800.0 and (steps < 0.0).sum() <= 2:
             hint += ", or write times in UTC if the clock was changed"
         raise ValueError(f"time decreases from {before} in row {row} to {after} in row {row + 1}: {hint}")
+
+
+def _counter_turn(step: float) -> float | None:
+    """Return the range of the counter that starts again at a step of time, s; None at other steps."""
+    return next((turn for turn in COUNTERS if abs(step + turn) < COUNTER_SHARE * turn), None)
+
+
+def sort_by_time(
+    table: "pandas.DataFrame", times: "pandas.Series", group: numpy.ndarray | None = None
+) -> tuple["pandas.DataFrame", tuple[str, ...]]:
+    """Sort the rows of a table by time; those of a counter that starts again stay as they are.
+
+    Args:
+        table: rows, numbered from zero.
+        times: of the rows, as they are written.
+        group: number of the recording that each row is of, ``(rows,)``; default: all are of one.
+
+    Returns:
+        The rows, those of a recording one after the other, and a sentence on how many were late, if any was.
+    """
+    import pandas
+
+    group = numpy.zeros(len(table), dtype=int) if group is None else group
+    time = pandas.Series(seconds(times).to_numpy(dtype=float))
+    each = time.groupby(group)
+    late = int((time < each.cummax()).sum())
+    if not late or any(_counter_turn(step) for step in each.diff().dropna().to_numpy()):
+        return table, ()
+    note = f"sorted by time: {late:,} of {len(table):,} rows stood after later ones"
+    return table.iloc[numpy.lexsort((time.to_numpy(), group))].reset_index(drop=True), (note,)
 
 
 def seconds(values: "pandas.Series") -> "pandas.Series":

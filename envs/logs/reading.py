@@ -26,6 +26,7 @@ def read_recording(
     truth: Any = None,
     truth_offset: float = 0.0,
     rename: Mapping[str, str | Sequence[str]] | None = None,
+    sort: bool = False,
     **keywords: Any,
 ) -> Recording:
     """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
@@ -43,6 +44,7 @@ def read_recording(
         truth_offset: s, added to the times of that file.
         rename: what columns of a table are, where they have other names, such as ``{"t": "time", "pos": "x"}``; one
             column may be several, ``{"accuracy": ["sigma_x", "sigma_y"]}``, and ``{"speed": "-"}`` ignores one.
+        sort: sort the rows of tables by time; a note says how many stood after later ones.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:
@@ -58,12 +60,12 @@ def read_recording(
     if cls is not None:
         check_names(cls, keywords)
     files = [file for one in several for file in files_of(one)]
-    true = None if truth is None else TruthFile(Path(truth), truth_offset)
+    true = None if truth is None else TruthFile(Path(truth), truth_offset, sort)
     found: list[Recording] = []
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(_read_recording(file, cls, speeds, keywords, true, rename))
+            found.append(_read_recording(file, cls, speeds, keywords, true, rename, sort))
             cls = cls or task_class(found[0].environment)
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
@@ -86,6 +88,7 @@ def _read_recording(
     keywords: Mapping[str, Any],
     truth: TruthFile | None,
     rename: Mapping[str, str | Sequence[str]] | None,
+    sort: bool,
 ) -> Recording:
     """Read one file."""
     if not file.exists():
@@ -95,15 +98,16 @@ def _read_recording(
             raise ValueError(
                 "a recording in NetCDF holds its own truth: --truth is for tables and logs of receivers"
             )
-        if rename:
-            raise ValueError("a recording in NetCDF names its own variables: --rename is for tables")
+        if rename or sort:
+            option, why = ("--rename", "names its own variables") if rename else ("--sort", "is in order")
+            raise ValueError(f"a recording in NetCDF {why}: {option} is for tables")
         recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
     elif cls is None:
         raise ValueError(
             "it does not say of which environment it is: give its id, as the argument environment or before --recording"
         )
     else:
-        recording = read_columns(file, cls, keywords, truth, rename)
+        recording = read_columns(file, cls, keywords, truth, rename, sort)
     task = make_task(cls or task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))

@@ -29,6 +29,7 @@ from .flight_tables import (
     numbers,
     read_table,
     seconds,
+    sort_by_time,
 )
 from .plausibility import LOUD, check_degrees, check_interval, limit_notes, unknown_column_notes
 from .truth_files import match_truth, offset_note, read_truth
@@ -302,6 +303,8 @@ class TruthFile(NamedTuple):
     path: Path
     offset: float = 0.0
     """Added to its times, s."""
+    sort: bool = False
+    """Whether its rows are sorted by time."""
 
 
 def read_columns(
@@ -310,6 +313,7 @@ def read_columns(
     keywords: Mapping[str, Any],
     truth: TruthFile | None = None,
     rename: Mapping[str, str | Sequence[str]] | None = None,
+    sort: bool = False,
 ) -> Recording:
     """Read a table of what sensors said.
 
@@ -320,10 +324,13 @@ def read_columns(
         truth: in a file of its own.
         rename: what some columns of the file are, in the environment's names; one column may be several, and one
             that is ``LEFT_OUT`` is ignored.
+        sort: sort the rows by time.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
     """
+    import pandas
+
     log_format = find_companion(cls, LogFormat)
     if log_format is None:
         measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
@@ -357,6 +364,10 @@ def read_columns(
         )
     if not len(read):
         raise ValueError("it has no rows below its columns, and a recording needs several")
+    if sort:
+        group = pandas.factorize(_names_of_rows(read[RECORDING]))[0] if RECORDING in read else None
+        read, told = sort_by_time(read, read[time_name], group)
+        notes = (*notes, *told)
     table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
     for name in table:
         table[name] = numbers(name, table[name])
@@ -413,7 +424,7 @@ def _add_truth(
         raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
     periods = {TRUTH + one.name: one.period for one in components if one.period is not None}
     try:
-        found = read_truth(truth.path, log_format, [one.name for one in components], TRUTH, TIME)
+        found = read_truth(truth.path, log_format, [one.name for one in components], TRUTH, TIME, truth.sort)
         columns, note = match_truth(found, times, truth.offset, periods)
     except ValueError as error:
         raise ValueError(f"truth {truth.path}: {error}") from error
@@ -498,8 +509,12 @@ def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> d
     """Rows of every recording of a table, in their order."""
     if names is None:
         return {"": table}
-    words = names.astype(object).where(names.notna(), "").astype(str)
-    return {str(name): rows for name, rows in table.groupby(words, sort=False)}
+    return {str(name): rows for name, rows in table.groupby(_names_of_rows(names), sort=False)}
+
+
+def _names_of_rows(names: "pandas.Series") -> "pandas.Series":
+    """Name of the recording of each row; empty where none is given."""
+    return names.astype(object).where(names.notna(), "").astype(str)
 
 
 def _check_times(own: Columns) -> None:

@@ -12,7 +12,16 @@ import numpy
 
 from ...filters.angles import shorten
 from ..contract.log_format import LogFormat
-from .flight_tables import COLUMNS, check_order, clock_seconds, describe_time, list_names, numbers, read_table
+from .flight_tables import (
+    COLUMNS,
+    check_order,
+    clock_seconds,
+    describe_time,
+    list_names,
+    numbers,
+    read_table,
+    sort_by_time,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -43,7 +52,12 @@ class TruthTable(NamedTuple):
 
 
 def read_truth(
-    path: Path, log_format: LogFormat, components: Sequence[str], prefix: str, times: Sequence[str]
+    path: Path,
+    log_format: LogFormat,
+    components: Sequence[str],
+    prefix: str,
+    times: Sequence[str],
+    sort: bool = False,
 ) -> TruthTable:
     """Read a file of true positions: a table, or a log of a receiver.
 
@@ -53,6 +67,7 @@ def read_truth(
         components: names of what is estimated.
         prefix: before the names of true columns.
         times: names that the column of times may have.
+        sort: sort the rows by time.
 
     Raises:
         ValueError: if it cannot be read.
@@ -67,6 +82,9 @@ def read_truth(
         raise ValueError("there is no such file")
     table, names, notes = read_table(path, {*times, *meant})
     time_name = next((name for name in times if name in table), None)
+    if sort and time_name is not None:
+        table, told = sort_by_time(table, table[time_name])
+        notes = (*notes, *told)
     found: dict[str, numpy.ndarray] = {}
     for name in table:
         if name in meant and meant[name] not in found:

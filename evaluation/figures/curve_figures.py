@@ -1,8 +1,8 @@
 """Pictures of an evaluation, all drawn from its curves (:mod:`.curves`), as wide as a paper's columns.
 
-At most six lines of a picture are told apart by colour: the paper's algorithm, the reference, the bound, the best
-learned and the best classical competitor, then the others by their cost; the rest stays grey. Policies and estimators
-are solid, smoothers dash-dotted, references dashed, bounds dotted, in every picture.
+At most six lines of a picture are told apart by colour: the user's own, the paper's algorithm, the reference, the
+bound, the best learned and the best classical competitor, then the others by their cost; the rest stays grey. Policies
+and estimators are solid, smoothers dash-dotted, references dashed, bounds dotted, in every picture.
 """
 
 import textwrap
@@ -13,8 +13,9 @@ import numpy
 import xarray
 
 from ..running.curves import stretches_of
+from ..running.times import Point
 from ..storage.dataset import windows_of, with_windows
-from .front_figure import draw_front, points_of_curves
+from .front_figure import draw_front
 from .looks import GREY, distinguish_lines, group_equal_lines, join_names, looks, styles
 from .print_layout import (
     add_title,
@@ -426,6 +427,8 @@ def evaluation_figures(
     columns: int = 2,
     highlight: Sequence[str] | None = None,
     learned: Sequence[str] = (),
+    own: Sequence[str] = (),
+    points: Sequence[Point] = (),
 ) -> Iterator[tuple[str, Any]]:
     """Every figure of an evaluation, with the name of its file; without those in which there is nothing to see.
 
@@ -434,19 +437,21 @@ def evaluation_figures(
         columns: of a paper, 1 or 2, as wide as which they are.
         highlight: names of the lines that are told apart, at most six; default: see :func:`choose_highlights`.
         learned: names of what has been learned.
+        own: names of what the user brings.
+        points: of the front of cost and time, see :func:`.times.points_of_records`; none: it is not drawn.
 
     Raises:
         ValueError: for another number of columns, unknown names, or too many.
     """
-    look = looks(curves, highlight, learned)
+    look = looks(curves, highlight, learned, own)
     if "rmse" in curves:
         yield "rmse_over_time", draw_error_over_time(curves, look, columns=columns)
     if "error_exceeded" in curves:
         yield "error_distribution", draw_error_distribution(curves, look, columns=columns)
     if {"cost_minus_paper", "cost_minus_best"} & set(curves.data_vars):
         yield "cost_difference", draw_cost_difference(curves, look, columns=columns)
-    if points_of_curves(curves):
-        yield "cost_and_time", draw_front(curves, learned, columns=columns)
+    if points:
+        yield "cost_and_time", draw_front(curves, points, learned, own, columns=columns)
     if {"anees", "anis"} & set(curves.data_vars):
         yield "consistency", draw_consistency(curves, look, columns=columns)
     if "true_class_probability" in curves:

@@ -9,8 +9,8 @@ import numpy
 import xarray
 
 from ..competitors.kinds import RANKED
-from ..running.times import Point, front, time_of
-from .looks import COLOURS
+from ..running.times import Point, front
+from .looks import COLOURS, OWN
 from .print_layout import FONT_SIZES, add_title, figure_with_axes, in_print
 
 MOST_ABOVE = 1.0
@@ -21,7 +21,7 @@ TICKS = (
     *(0, 5, 10, 15, 20, 30, 40, 50, 70, 100),
 )  # fmt: skip
 """Of the cost, %: of these as many are shown as there is room for."""
-LEARNED, PAPER, CLASSICAL, OWN = COLOURS[1], COLOURS[0], "0.45", "#9B5DE5"
+LEARNED, PAPER, CLASSICAL = COLOURS[1], COLOURS[0], "0.45"
 TOUCHES = 3.0
 """Badness of a place from which on a name touches a line, a point or another name: there only the paper's algorithm and
 the user's own are named."""
@@ -60,37 +60,27 @@ class FrontPanel(NamedTuple):
         return [point for point in self.points if point.kind in RANKED and point.cost > self.top]
 
 
-def points_of_curves(curves: xarray.Dataset) -> list[Point]:
-    """Points of all competitors whose cost and time are known; the cost is relative to the paper's algorithm, in %.
-
-    Args:
-        curves: of an evaluation.
-    """
-    names = curves["policy"].values.tolist()
-    if "mean_cost" not in curves or curves.attrs["paper"] not in names:
-        return []
-    paper = float(curves["mean_cost"].sel(policy=curves.attrs["paper"]))
-    found = []
-    for name in names:
-        run = curves.sel(policy=name)
-        time, cost = time_of(run), float(run["mean_cost"])
-        if time is not None and math.isfinite(cost):
-            found.append(Point(name, str(run["kind"].values), time, 100.0 * (cost / paper - 1.0)))
-    return found
-
-
 @in_print
-def draw_front(curves: xarray.Dataset, learned: Sequence[str] = (), *, columns: int = 2) -> Any:
+def draw_front(
+    curves: xarray.Dataset,
+    points: Sequence[Point],
+    learned: Sequence[str] = (),
+    own: Sequence[str] = (),
+    *,
+    columns: int = 2,
+) -> Any:
     """Cost against the paper's algorithm over the time of a measurement, and the front of both.
 
     Args:
         curves: of an evaluation that was timed.
+        points: of its competitors, see :func:`.times.points_of_records`.
         learned: names of what has been learned.
+        own: names of what the user brings.
         columns: of a paper, as wide as which it is.
     """
     attrs = curves.attrs
     figure, (axis,) = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.4}[columns])
-    panel = FrontPanel("", points_of_curves(curves), attrs["paper"], attrs["reference"], learned)
+    panel = FrontPanel("", points, attrs["paper"], attrs["reference"], learned, own)
     title = (
         f"{attrs['environment']}, scenario {attrs['scenario']}: cost and time of {attrs['episodes']} episodes"
     )

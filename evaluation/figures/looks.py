@@ -12,6 +12,8 @@ LINES = ("-", "--", "-.", ":")
 # Okabe and Ito's palette: distinguishable for colour-blind readers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999933")
 LINES_OF_KINDS = {"policy": "-", "estimator": "-", "smoother": "-.", "reference": "--", "bound": ":"}
+OWN = "#9B5DE5"
+"""Of what a user brings."""
 GREY = "0.72"
 """Of lines that are not told apart."""
 MOST_HIGHLIGHTED = 6
@@ -43,15 +45,19 @@ def by_cost(curves: xarray.Dataset) -> list[str]:
 
 
 def choose_highlights(
-    curves: xarray.Dataset, highlight: Sequence[str] | None = None, learned: Sequence[str] = ()
+    curves: xarray.Dataset,
+    highlight: Sequence[str] | None = None,
+    learned: Sequence[str] = (),
+    own: Sequence[str] = (),
 ) -> list[str]:
     """Names of the lines that are told apart, the most important first; of those that are the same, the first.
 
     Args:
         curves: of an evaluation.
-        highlight: names, in place of those that are found: the paper's algorithm, the reference, the bound, the best
-            learned and the best classical competitor, and then by cost.
+        highlight: names, in place of those that are found: the user's own, the paper's algorithm, the reference, the
+            bound, the best learned and the best classical competitor, and then by cost.
         learned: names of what has been learned.
+        own: names of what the user brings.
 
     Raises:
         ValueError: for unknown names, or too many.
@@ -68,7 +74,7 @@ def choose_highlights(
     kinds = dict(zip(present, curves["kind"].values.astype(str).tolist(), strict=True))
     classical = [name for name in ranked if name not in learned and name != curves.attrs["paper"]]
     wanted = [
-        *(name for name in (curves.attrs["paper"], curves.attrs["reference"]) if name in present),
+        *(name for name in (*own, curves.attrs["paper"], curves.attrs["reference"]) if name in present),
         *[name for name in present if kinds[name] == "bound"][:1],
         *[name for name in ranked if name in learned][:1],
         *classical[:1],
@@ -93,21 +99,28 @@ def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
 
 
 def looks(
-    curves: xarray.Dataset, highlight: Sequence[str] | None = None, learned: Sequence[str] = ()
+    curves: xarray.Dataset,
+    highlight: Sequence[str] | None = None,
+    learned: Sequence[str] = (),
+    own: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
     """Colour, line style and width of the lines that are told apart, in the order of the legend.
 
     Args:
         curves: of an evaluation.
         highlight: as of :func:`choose_highlights`.
-        learned: likewise; their lines are thicker.
+        learned: names of what has been learned; their lines are thicker.
+        own: names of what the user brings; their lines are thicker, and the first has a colour of its own.
     """
-    chosen = choose_highlights(curves, highlight, learned)
+    chosen = choose_highlights(curves, highlight, learned, own)
     kinds = {name: str(curves["kind"].sel(policy=name).values) for name in chosen}
     colours = {name: COLOURS[6] for name in chosen if kinds[name] not in RANKED}
     if curves.attrs["paper"] in chosen:
         colours[curves.attrs["paper"]] = COLOURS[0]
     free = [colour for colour in COLOURS[1:6] if colour not in colours.values()]
+    if mine := [name for name in own if name in chosen and name not in colours][:1]:
+        colours[mine[0]] = OWN
+        free.remove(COLOURS[3])  # which is too like it
     if curves.attrs["paper"] not in chosen:
         free.insert(0, COLOURS[0])
     rest = iter(free)
@@ -124,7 +137,7 @@ def looks(
         name: {
             "color": colours[name],
             "linestyle": LINES_OF_KINDS.get(kinds[name], "-"),
-            "linewidth": 1.6 if name in learned else 1.1,
+            "linewidth": 1.6 if name in learned or name in own else 1.1,
             "zorder": 3.0 - 0.01 * i,
         }
         for i, name in enumerate(chosen)

@@ -34,6 +34,7 @@ from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
 from .seeds import episode_seeds
+from .supervision import running
 from .threads import one_thread
 from .times import with_times
 
@@ -271,8 +272,8 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         most = experiment.drawn_episodes - piece.first
         drawn = replace(kept, drawings=True), most
     # What is timed afterwards is optimised then: nothing need be compiled in two ways.
-    with optimised_code() if experiment.timed else nullcontext():
-        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    with optimised_code() if experiment.timed else nullcontext(), running(piece.name, tick) as told:
+        flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, told, drawn)
     arrays = dict(flown.found)
     if kind == "policy":
         _check_reserved(model, arrays)
@@ -337,7 +338,8 @@ class Plan(NamedTuple):
 
     def time(self, name: str) -> ProcessorTime | None:
         """Measure the processor time of a competitor, see :func:`.rollout.measure_time`."""
-        return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
+        with running(name, timed=False):
+            return measure_time(self.models[name], self.competitors[name], self.kinds[name], self.seeds, name)
 
     def arrays(self, episodes: int, drawn: int) -> StackedArrays:
         """Return room for what is kept of so many episodes of every competitor; arguments as it has them."""

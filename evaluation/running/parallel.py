@@ -58,11 +58,15 @@ Outcome = tuple[int, Any, tuple[Exception, str] | None, list[tuple[str, type[War
 """Number of a piece of work, its result, its error with the traceback, and its warnings."""
 
 
+class LostProcessError(ValueError):
+    """A process that did part of the work has ended."""
+
+
 class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
     """Traceback of an error in another process."""
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """Let this process end with the one that began it, which may be killed and could not tell it."""
 
     def watch() -> None:
@@ -250,7 +254,7 @@ class Workers:
 
         class Processes(LokyBackend):
             def configure(self, *given: Any, **options: Any) -> Any:
-                own = {"initializer": _end_with, "initargs": (os.getpid(),)}
+                own = {"initializer": end_with, "initargs": (os.getpid(),)}
                 return super().configure(*given, **own, **options)
 
         # Whoever ends the work early, by an error or Ctrl-C, knows that the rest is not done.
@@ -263,7 +267,7 @@ class Workers:
                 )
                 yield from pool(joblib.delayed(_run_piece)(*call) for call in calls)
         except TerminatedWorkerError as error:
-            raise ValueError(
+            raise LostProcessError(
                 "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
                 "fewer jobs, or go on from here by the same command where it keeps what is done"
             ) from error

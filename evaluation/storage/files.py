@@ -100,6 +100,27 @@ def claim_folder(folder: Path) -> None:
     _CLAIMED[name] = handle
 
 
+@contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Claim a folder for a while; what was made for that and is empty afterwards is taken away.
+
+    Raises:
+        ValueError: as of :func:`claim_folder`.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    claim_folder(folder)
+    name = os.path.realpath(folder)
+    try:
+        yield
+    finally:
+        os.close(_CLAIMED.pop(name))
+        if not UNIX:
+            Path(name, LOCK).unlink(missing_ok=True)
+        for place in made:
+            with suppress(OSError):  # something is in it
+                place.rmdir()
+
+
 def _sweep_unfinished(folder: Path) -> None:
     """Remove unfinished folders whose writers are dead."""
     for place in folder.glob(f"{UNFINISHED}*"):

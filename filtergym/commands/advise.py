@@ -30,6 +30,7 @@ from .shown import report_maker
 from .terminal import (
     Parameters,
     RenameOption,
+    SortOption,
     Speeds,
     TruthOffset,
     TruthOption,
@@ -122,6 +123,7 @@ def advise_on_log(
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
     rename: RenameOption = None,
+    sort: SortOption = False,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -155,6 +157,7 @@ def advise_on_log(
         truth=truth,
         truth_offset=truth_offset,
         rename=renamed(rename),
+        sort=sort,
         **keywords,
     )
     problem = problem_of(found.environment)

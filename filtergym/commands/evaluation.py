@@ -23,8 +23,10 @@ from ..envs.logs.recording_files import is_recording
 from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
-from ..evaluation.running.parallel import Workers
+from ..evaluation.running.parallel import LostProcessError, Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
+from ..evaluation.running.supervision import is_supervised
+from ..evaluation.running.times import points_of_records
 from ..evaluation.statistics.cause_split import phrases_of
 from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.storage.estimates import check_estimates, write_estimates
@@ -75,6 +77,8 @@ class FileOptions(NamedTuple):
     truth_offset: float = 0.0
     rename: str | None = None
     """Of the columns of a recording."""
+    sort: bool = False
+    """Whether the rows of a recording are sorted by time."""
 
 
 class Outputs(NamedTuple):
@@ -142,12 +146,13 @@ def find_data(
             truth=options.truth,
             truth_offset=options.truth_offset,
             rename=renamed(options.rename),
+            sort=options.sort,
             **keywords,
         )
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
-    check_no_recording_options(options.truth, options.rename)
+    check_no_recording_options(options.truth, options.rename, options.sort)
     if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     if scenario in named or not names_flights(scenario):
@@ -241,17 +246,18 @@ def tables_of(
     problem: Problem,
     found: Evaluation,
     width: int,
+    own: Sequence[str] = (),
 ) -> list[Table]:
-    """Return what is printed in so many columns, widest first."""
+    """Return the tables in so many columns, widest first, with the rows of the user's own competitors marked."""
     tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
     if found.has_truth:
-        compared = results_tables(found.records, problem.knows, width, found.dataset.attrs["paper"])
         paper = found.dataset.attrs["paper"]
+        compared = results_tables(found.records, problem.knows, width, paper, own)
         if paper not in {record.policy for record in found.records}:
             compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
     if found.recorded:
-        tables += recording_tables(found.records, found.differences, found.has_truth, width)
+        tables += recording_tables(found.records, found.differences, found.has_truth, width, own)
     return tables
 
 
@@ -305,6 +311,11 @@ def run(
                 found = run_requests(
                     others, workers, lambda done: bar.update(line, advance=done), store, whole
                 )
+            except LostProcessError:
+                if workers.alone or not is_supervised():
+                    raise
+                workers = Workers()  # a process that reports whose code ends it
+                bar.update(line, completed=0)
             except ValueError as error:
                 words = (f"{one.name!r} {how}" for one in others for how in ("failed", "cannot be made"))
                 failed = [own.split("'")[1] for own in words if own in str(error)]
@@ -346,7 +357,10 @@ def write(
         worst: by the names of those whose cost is explained their worst episodes.
         own: names of the user's own.
     """
-    printed, in_file = (tables_of(problem, found, width) for width in (console.width, LATEX_WIDTH))
+    printed, in_file = (
+        tables_of(problem, found, width, marked)
+        for width, marked in ((console.width, own), (LATEX_WIDTH, ()))
+    )
     sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
     for sentence in sentences:  # before anything is written, which can fail
         print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
@@ -374,7 +388,8 @@ def write(
             write_text(place / "table.tex", "\n".join(map(latex_table, in_file)))
             if not refusal:
                 write_dataset(place / "results.nc", whole)
-            for name, figure in evaluation_figures(found.curves, outputs.columns, learned=learned):
+            points = points_of_records(found.records)
+            for name, figure in evaluation_figures(found.curves, outputs.columns, None, learned, own, points):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             for name, figure in worst_figures(worst, phrases_of(found.dataset), outputs.columns):

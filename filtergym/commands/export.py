@@ -14,6 +14,7 @@ from .terminal import (
     Parameters,
     RenameOption,
     ScenarioName,
+    SortOption,
     Speeds,
     Trust,
     command_line,
@@ -80,6 +81,7 @@ def export(
     ] = None,
     speeds: Speeds = "1,1000",
     rename: RenameOption = None,
+    sort: SortOption = False,
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
@@ -117,7 +119,12 @@ def export(
         if scenario is not None:
             raise ValueError("--recording takes the place of --scenario: leave one of them out")
         data = read_recording(
-            recording, problem.id, speeds=pair("--speeds", speeds), rename=renamed(rename), **keywords
+            recording,
+            problem.id,
+            speeds=pair("--speeds", speeds),
+            rename=renamed(rename),
+            sort=sort,
+            **keywords,
         )
     from ..exports.request import request_export
 

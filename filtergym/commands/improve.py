@@ -24,6 +24,7 @@ from .terminal import (
     Environment,
     Jobs,
     RenameOption,
+    SortOption,
     Speeds,
     TrainedControl,
     TrainingScenario,
@@ -59,6 +60,7 @@ def tune_policy(
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
     rename: RenameOption = None,
+    sort: SortOption = False,
     speeds: Speeds = "0.01,1000",
 ) -> None:
     """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
@@ -77,10 +79,11 @@ def tune_policy(
             truth=truth,
             truth_offset=truth_offset,
             rename=renamed(rename),
+            sort=sort,
         )
         fit_to_recording(problem, policy, found, out, seed)
         return
-    check_no_recording_options(truth, rename)
+    check_no_recording_options(truth, rename, sort)
     tunable = problem.baselines.tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-import xarray
 
 from ..baselines.problem import problem_of
 from ..envs.data.recording import Recording
@@ -15,12 +14,23 @@ from ..evaluation.figures.print_layout import check_columns, check_formats, save
 from ..evaluation.running.parallel import Workers
 from ..evaluation.running.recording import record_experiment
 from ..evaluation.running.rollout import Progress
+from ..evaluation.running.summary import Evaluation
+from ..evaluation.running.supervision import supervise
 from ..evaluation.running.threads import one_thread
+from ..evaluation.running.times import points_of_records
 from ..evaluation.storage.blind import write_blind
-from ..evaluation.storage.files import whole_file, whole_files, writable_file, writable_folder, write_text
+from ..evaluation.storage.files import (
+    hold_folder,
+    whole_file,
+    whole_files,
+    writable_file,
+    writable_folder,
+    write_text,
+)
 from ..evaluation.storage.store import UNFINISHED, Store
+from ..extensions import PREFIXES
 from ..functions import requests_of
-from ..names import find_competitor, isolate_names, learned_names
+from ..names import find_competitor, is_module, isolate_names, learned_names
 from ..offline import datasets_table, plan_datasets
 from ..protocol import protocol_names
 from ..reports.tables.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
@@ -58,6 +68,7 @@ from .terminal import (
     Parameters,
     RenameOption,
     ScenarioName,
+    SortOption,
     Split,
     Threads,
     Trust,
@@ -133,6 +144,7 @@ def evaluate_policies(
     truth: TruthOption = None,
     truth_offset: TruthOffset = 0.0,
     rename: RenameOption = None,
+    sort: SortOption = False,
     estimates: Annotated[
         Path | None,
         typer.Option(
@@ -156,10 +168,14 @@ def evaluate_policies(
         ),
     ] = False,
     time_limit: Annotated[
-        float, typer.Option(help="Of programs and isolated estimators: for each answer, s.")
+        float,
+        typer.Option(
+            help="For each answer of programs, isolated estimators and, on Linux with --jobs 1, any module:Class, s."
+        ),
     ] = 10.0,
     memory_limit: Annotated[
-        float, typer.Option(help="Likewise: address space, MB, on Linux; 0: no limit.")
+        float,
+        typer.Option(help="Of programs and isolated estimators: address space, MB, on Linux; 0: no limit."),
     ] = 4000.0,
     backend: Backend = "auto",
     threads: Threads = 1,
@@ -212,16 +228,24 @@ def evaluate_policies(
         return
     keywords = parse_settings(settings)
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
-    options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename)
+    options = FileOptions(
+        site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset, rename, sort
+    )
     outputs.check()
+    if out is not None:
+        ctx.with_resource(hold_folder(out))
     read = {} if recording is None else assumed_parameters(environment, policy or [])
     problem, data = find_data(environment, scenario, recording, options, {**read, **keywords})
     if isolated:
         policy, why = isolate_names(problem, policy or []), isolate_names(problem, why or [])
+    here = [name for name in policy or [] if is_module(problem, name) and not name.startswith((*PREFIXES,))]
+    ended = supervise(here, time_limit)
+    if ended and not (policy := [name for name in policy or [] if name not in ended]):
+        raise ValueError("; ".join(ended.values()))
     with limit_programs(time_limit, memory_limit):
         competitors = find_participants(problem, data, policy, trust)
     names, learned = [one.name for one in competitors], [one for one in competitors if one.learned]
-    check_explained(why or [], names)
+    check_explained(why := [name for name in why or [] if name not in ended], names)
     check_names(problem.task, keywords)
     experiment = problem.experiment(
         data,
@@ -251,7 +275,7 @@ def evaluate_policies(
     store.clear()
     for sentence in departure_lines(problem, data, learned, keywords):
         print_sentence(sentence)
-    if failures:
+    if failures := ended | failures:
         raise ValueError(f"{'; '.join(failures.values())}; the others are in the table")
 
 
@@ -414,9 +438,11 @@ def benchmark(
                 f"{first.episodes:,} episodes"
             )
 
-        def save_figures(cell: Cell, curves: xarray.Dataset) -> None:
-            learned = learned_names(cell.environment)
-            for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
+        def save_figures(cell: Cell, found: Evaluation) -> None:
+            if found.curves is None or not formats:
+                return
+            learned, points = learned_names(cell.environment), points_of_records(found.records)
+            for name, figure in evaluation_figures(found.curves, columns, learned=learned, points=points):
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 

@@ -146,6 +146,7 @@ RenameOption = Annotated[
         "'accuracy=sigma_x,accuracy=sigma_y'; 'speed=-' ignores one.",
     ),
 ]
+SortOption = Annotated[bool, typer.Option("--sort", help="Sort the rows of a table by time.")]
 TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
 Speeds = Annotated[
     str, typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest.")
@@ -275,9 +276,9 @@ def close_output(*_: Any, **__: Any) -> None:
         ) from console.refusal
 
 
-def check_no_recording_options(truth: Any, rename: str | None) -> None:
+def check_no_recording_options(truth: Any, rename: str | None, sort: bool) -> None:
     """Raise ValueError for options of a recording where there is none."""
-    for option, given in (("--truth", truth), ("--rename", rename)):
+    for option, given in (("--truth", truth), ("--rename", rename), ("--sort", sort or None)):
         if given is not None:
             raise ValueError(f"{option} is for a recording: --recording FILE {option} ...")
 

@@ -59,7 +59,7 @@ def _own_sentence(records: Sequence[Record], name: str, paper: str) -> str:
     covariance = "states no covariance"
     if nees is not None and nees.value is not None:
         word = consistency_word(nees)
-        covariance = f"{'' if word == 'no interval' else f'{word}, '}ANEES {nees.value:.3g}"
+        covariance = f"{'' if word == 'no interval' else f'{word}, '}ANEES {float(f'{nees.value:.3g}'):,.10g}"
     return f"`{name}`: {', '.join(clauses)}; {covariance}."
 
 
@@ -71,7 +71,7 @@ def _comparison(difference: Record, other: str, first: bool) -> str:
     if _low(difference) <= 0.0 <= _high(difference):
         return f"level with {other}"
     if value >= 1.0:
-        return f"{1.0 + value:.2g} times {'the error cost' if first else 'that'} of {other}"
+        return f"{float(f'{1.0 + value:.2g}'):,.10g} times {'the error cost' if first else 'that'} of {other}"
     what = " error cost" if first else ""
     return f"{100.0 * abs(value):.1f} % {'more' if value > 0.0 else 'less'}{what} than {other}"
 

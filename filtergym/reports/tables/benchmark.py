@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import xarray
-
 from ...baselines.problem import Problem, problem_of
 from ...envs.engine.catalogue import catalogue
 from ...envs.engine.scenario_choice import make_task
@@ -245,8 +243,8 @@ class Callbacks(NamedTuple):
     """With the number of measurements; returns what is told of progress."""
     finished: Callable[[Result], None] = lambda result: None
     """With the result of each cell, in their order."""
-    drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None
-    """With each cell and its curves."""
+    drawn: Callable[[Cell, Evaluation], None] = lambda cell, evaluation: None
+    """With each cell and its evaluation."""
 
 
 class _Results:
@@ -254,7 +252,7 @@ class _Results:
 
     Args:
         wanted: the cells.
-        callbacks: told of curves and results.
+        callbacks: told of evaluations and results.
     """
 
     def __init__(self, wanted: Sequence[Cell], callbacks: Callbacks) -> None:
@@ -269,8 +267,7 @@ class _Results:
         found[name] = summary
         if len(found) == len(cell.policies):
             evaluation = combine_summaries([found.pop(name) for name in cell.policies])
-            assert evaluation.curves is not None  # they were requested
-            self.callbacks.drawn(cell, evaluation.curves)
+            self.callbacks.drawn(cell, evaluation)
             self._results[i] = result_of(cell.problem, evaluation, learned_names(cell.environment))
         while self._told < len(self._results) and (due := self._results[self._told]) is not None:
             self.callbacks.finished(due)

@@ -49,7 +49,8 @@ def headline_table(results: Sequence[Result]) -> Table:
     for i, (result, rows) in enumerate(headline(results)):
         if i:
             table.add_row()
-        table.add_row("", Text(f"{result.short} {result.scenario}", style="bold"))
+        opponent = f", vs {result.paper}" if result.paper else ""
+        table.add_row("", Text(f"{result.short} {result.scenario}{opponent}", style="bold"))
         for *row, word in rows:
             table.add_row(*row, SHORT.get(word, word))
     table.caption = (

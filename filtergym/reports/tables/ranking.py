@@ -169,8 +169,11 @@ def remarks(results: Sequence[Result]) -> list[str]:
     agents = {(result.environment, name) for result in results for name in result.learned}
     if agents:
         cells = sum(len(result.learned) for result in results)
+        several = f"{len(harmful) or 'None'} of {cells} results of learned agents "
+        one = "" if harmful else " not"
+        several += "is" if len(harmful) == 1 else "are"
         sentences.append(
-            f"{len(harmful) or 'None'} of {cells} results of learned agents {'is' if len(harmful) == 1 else 'are'} "
+            f"{several if cells > 1 else f'The learned agent is{one}'} "
             f"significantly worse than the paper's algorithm by more than {100.0 * HARM:g} %"
             + (f"; the worst is {max(harmful)[1]}." if harmful else ".")
         )
@@ -181,10 +184,11 @@ def remarks(results: Sequence[Result]) -> list[str]:
         if consistency_word(nees).endswith(INCONSISTENT_WORDS)
     ]
     if judged:
+        several = f"Of the winners, {len(off)} of {len(judged)} {'states' if len(off) == 1 else 'state'}"
         sentences.append(
             "The covariance of every winner is as large as its errors."
             if not off
-            else f"Of the winners, {len(off)} of {len(judged)} {'states' if len(off) == 1 else 'state'} a covariance "
+            else f"{'The winner states' if len(judged) == 1 else several} a covariance "
             f"that does not fit the errors (mean NEES over its dimension, which should be one): {', '.join(off)}."
         )
     return sentences

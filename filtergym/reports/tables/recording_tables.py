@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -21,7 +21,11 @@ PREDICTIONS = (
 
 
 def recording_tables(
-    records: Sequence[Any], differences: Mapping[str, Any], has_truth: bool, width: int
+    records: Sequence[Any],
+    differences: Mapping[str, Any],
+    has_truth: bool,
+    width: int,
+    own: Collection[str] = (),
 ) -> list[Table]:
     """Compare competitors by what they expected of each measurement.
 
@@ -31,6 +35,7 @@ def recording_tables(
             of measurements.
         has_truth: whether other tables tell errors and costs.
         width: columns of the terminal; what does not fit beside each other stands below.
+        own: names of the user's own competitors, whose rows are marked.
     """
     found = {(r.policy, r.metric, r.component): r for r in records if r.window == "all"}
 
@@ -47,7 +52,7 @@ def recording_tables(
         _prediction_columns(records, found),
     ]
     parts = [part for part in parts if part]
-    tables = _beside(names, parts, width)
+    tables = _beside(functools.partial(competitors_table, names, own=own), parts, width)
     first = records[0]
     episodes = f"{first.episodes} episode{'s' if first.episodes > 1 else ''}"
     tables[0].title = f"{first.environment}, recording {first.scenario} ({episodes}; 95 % intervals)"
@@ -65,15 +70,15 @@ def recording_tables(
 Column = Callable[[str], str]
 
 
-def _beside(names: Sequence[Any], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
+def _beside(draw: Callable[..., Table], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
     """Return tables of groups of columns, as many groups beside each other as fit, the rest below."""
     for count in range(len(parts), 0, -1):
         columns = {title: column for part in parts[:count] for title, column in part.items()}
-        looks = [competitors_table(names, columns, control) for control in (True, False)]
-        looks.append(competitors_table(names, columns, False, compact=True))
+        looks = [draw(columns, control) for control in (True, False)]
+        looks.append(draw(columns, False, compact=True))
         table = first_fitting(looks, width)
         if table is not None or count == 1:
-            return [table or looks[-1], *_beside(names, parts[count:], width)]
+            return [table or looks[-1], *_beside(draw, parts[count:], width)]
     return []
 
 

@@ -4,7 +4,7 @@ import functools
 import io
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import rich.box
@@ -22,6 +22,8 @@ INCONSISTENT_WORDS = ("overconfident", "cautious")
 """With which the words on a covariance end that is not consistent."""
 INCONSISTENT = "!"
 """Marks a covariance that is off by more than a factor of two."""
+OWN_ROW = ">"
+"""Marks the row of a user's own competitor."""
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
@@ -135,7 +137,11 @@ def cost_title(paper: str) -> str:
 
 
 def results_tables(
-    records: Sequence[Any], knows: Mapping[str, str], width: int, paper: str = ""
+    records: Sequence[Any],
+    knows: Mapping[str, str],
+    width: int,
+    paper: str = "",
+    own: Collection[str] = (),
 ) -> list[Table]:
     """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
 
@@ -145,29 +151,29 @@ def results_tables(
         width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
             own, so that no number is cut.
         paper: name of the paper's algorithm that costs are compared with.
+        own: names of the user's own competitors, whose rows are marked.
     """
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     names = rank_competitors(records)
+    draw = functools.partial(competitors_table, names, own=own)
     costs, notes = _cost_columns(records, found, paper)
     exact, rounded = (_error_columns(records, found, intervals) for intervals in (True, False))
     fitting = [
-        ([competitors_table(names, {**costs, **exact}, True)], []),
-        ([competitors_table(names, {**costs, **exact}, False)], []),
-        *(
-            ([competitors_table(names, {**costs, **rounded}, False, compact)], [RMSE_NOTE])
-            for compact in (False, True)
-        ),
+        ([draw({**costs, **exact}, True)], []),
+        ([draw({**costs, **exact}, False)], []),
+        *(([draw({**costs, **rounded}, False, compact)], [RMSE_NOTE]) for compact in (False, True)),
     ]
     tables, more = next(
         ((tables, more) for tables, more in fitting if first_fitting(tables, width)),
-        (_tables_below_each_other(names, costs, exact, width), []),
+        (_tables_below_each_other(draw, costs, exact, width), []),
     )
     tables[0].title = (
         f"{first.environment}, scenario {first.scenario} "
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
     )
     notes += more
+    notes += [f"{OWN_ROW} marks your own."] if any(name in own for name, *_ in names) else []
     smoothers = [name for name, kind, _ in names if kind == "smoother"]
     notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
@@ -245,21 +251,17 @@ def _error_columns(records: Sequence[Any], found: Mapping[Any, Any], intervals: 
 
 
 def _tables_below_each_other(
-    names: Sequence[tuple[str, str, str]], costs: Columns, errors: Columns, width: int
+    draw: Callable[..., Table], costs: Columns, errors: Columns, width: int
 ) -> list[Table]:
     """Costs in one table and errors below, each in a table of its own where they do not fit beside each other."""
     costs, errors = dict(costs), dict(errors)
-    table = first_fitting(
-        [competitors_table(names, costs, False, compact) for compact in (False, True)], width
-    )
+    table = first_fitting([draw(costs, False, compact) for compact in (False, True)], width)
     if table is None:
         if TIME_TITLE in costs:
             errors = {TIME_TITLE: costs.pop(TIME_TITLE), **errors}
-        table = competitors_table(names, costs, False, compact=True)
-    below = first_fitting(
-        [competitors_table(names, errors, False, compact) for compact in (False, True)], width
-    )
-    each = [competitors_table(names, {title: error}, False, True) for title, error in errors.items()]
+        table = draw(costs, False, compact=True)
+    below = first_fitting([draw(errors, False, compact) for compact in (False, True)], width)
+    each = [draw({title: error}, False, True) for title, error in errors.items()]
     return [table, *(each if below is None else [below])]
 
 
@@ -286,8 +288,11 @@ def competitors_table(
     columns: Columns,
     control: bool,
     compact: bool = False,
+    own: Collection[str] = (),
 ) -> Table:
-    """Return a table of what each competitor has in each column; those that are not ranked in sections of their own."""
+    """Return a table of what each competitor has in each column: those that are not ranked in sections of their own,
+    and marks on the rows of what a user brings.
+    """
     table = plain_table()
     table.add_column("policy", overflow="fold")
     if control:
@@ -300,9 +305,12 @@ def competitors_table(
             table.add_section()
             section = kind
         control_column = steered if kind == "policy" else f"({kind})"
-        shown = "\n".join(textwrap.wrap(name, NARROW if compact else WIDE))
+        marked = f"{OWN_ROW}\xa0{name}" if name in own else name  # no line holds the mark alone
         table.add_row(
-            shown, *([control_column] if control else []), *(column(name) for column in columns.values())
+            "\n".join(textwrap.wrap(marked, NARROW if compact else WIDE)).replace("\xa0", " "),
+            *([control_column] if control else []),
+            *(column(name) for column in columns.values()),
+            style="bold" if name in own else None,
         )
     return table
 
