@@ -46,6 +46,7 @@ from .fitting import (
 )
 from .judgement import AS_GOOD, FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
 from .log_scores import replay_log, score_log
+from .onboard import OnboardJudgement
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -241,6 +242,8 @@ class Advice(NamedTuple):
     None where it is the advised one."""
     prices: "Prices"
     """What an update of each costs."""
+    onboard: OnboardJudgement | None = None
+    """Of a log of an autopilot, what its own filter did on withheld fixes."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
