@@ -64,7 +64,8 @@ def judge_onboard(
         makers: competitors by name, the advised one first.
         track: estimates of the vehicle's own filter.
     """
-    if not recording.origin or recording.log_time is None or recording.log_time.dtype.kind != "f":
+    times = recording.log_time
+    if not recording.origin or times is None or times.dtype.kind != "f":
         return None
     measured = recording.measurements
     there = (measured["available"] > 0.0) & (numpy.arange(judged.shape[1]) < recording.rows[:, None])
@@ -74,10 +75,12 @@ def judge_onboard(
     def squares(delay: float, where: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
         """Squared distance of the estimates so much before the fixes, and these; NaN elsewhere."""
         positions = numpy.full_like(fixes, numpy.nan)
-        positions[where] = track.at(recording.log_time[where] - delay, origin)
+        positions[where] = track.at(times[where] - delay, origin)
         return ((positions - fixes) ** 2).sum(axis=-1), positions
 
-    means = [numpy.nanmean(numpy.append(squares(delay, there & ~withheld)[0], numpy.inf)[:-1]) for delay in DELAYS]
+    means = [
+        numpy.nanmean(numpy.append(squares(delay, there & ~withheld)[0], numpy.inf)[:-1]) for delay in DELAYS
+    ]
     if not numpy.isfinite(means).any():
         return None
     delay = float(DELAYS[numpy.nanargmin(means)])
@@ -86,16 +89,15 @@ def judge_onboard(
     if not mask.any():
         return None
     replay = replay_log(problem.experiment(_without(recording, withheld), keywords=keywords), makers)
-    estimates = replay["estimate"].sel(component=["position_x", "position_y"])
-    estimates = estimates.transpose("policy", "episode", "time", "component").sel(policy=list(makers)).values
+    found = replay["estimate"].sel(policy=list(makers), component=["position_x", "position_y"])
+    estimates = found.transpose("policy", "episode", "time", "component").values
     stretches = stretches_of(mask)[:, : estimates.shape[2]]
     sums = PairSums(1 + len(makers), stretches)
     errors = ((estimates - fixes[:, : estimates.shape[2]]) ** 2).sum(axis=-1)
     sums.add(numpy.concatenate([errors, own[None, :, : estimates.shape[2]]]), 0)
-    found = {name: float(numpy.sqrt(sums.mean(i))) for i, name in enumerate([*makers, ONBOARD])}
-    return OnboardJudgement(
-        track.source, delay, int((stretches >= 0).sum()), found, sums.relative_root(0, len(makers)), positions
-    )
+    root_means = {name: float(numpy.sqrt(sums.mean(i))) for i, name in enumerate([*makers, ONBOARD])}
+    relative = sums.relative_root(0, len(makers))
+    return OnboardJudgement(track.source, delay, int((stretches >= 0).sum()), root_means, relative, positions)
 
 
 def _without(recording: Recording, withheld: numpy.ndarray) -> Recording:

@@ -31,7 +31,20 @@ ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES, LONGEST = 20, 1024, 200_000
 ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
 MODEL = "fuzzed/Model-v0"
-TABLES = (".csv", ".json", ".json.gz", ".nc", ".parquet", ".pos", ".nmea", ".ulg", ".bin", ".bag", ".db3", ".mcap")
+TABLES = (
+    ".csv",
+    ".json",
+    ".json.gz",
+    ".nc",
+    ".parquet",
+    ".pos",
+    ".nmea",
+    ".ulg",
+    ".bin",
+    ".bag",
+    ".db3",
+    ".mcap",
+)
 WHOLE = (
     "measured.nc", "truth.csv", "imu.csv", "model.csv", "tuned.json", "filter.json", "safetensors", "submission",
     "results", "run.json", "settings.yml", "kept",

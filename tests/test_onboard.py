@@ -31,8 +31,8 @@ LATITUDE, LONGITUDE, DELAY = 48.0, 11.0, 0.2
 def dataflash(path, rows):
     """Write a log of ArduPilot: messages that describe those that follow, and these."""
     content = b""
-    for name, (number, types, layout, columns) in {"FMT": (128, "BBnNZ", "<BB4s16s64s", "Type,Length,Name,Format,Columns"),
-                                                   **FORMATS}.items():  # fmt: skip
+    head = 128, "BBnNZ", "<BB4s16s64s", "Type,Length,Name,Format,Columns"
+    for name, (number, types, layout, columns) in {"FMT": head, **FORMATS}.items():
         words = name.encode(), types.encode(), columns.encode()
         content += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, 3 + struct.calcsize(layout), *words)
     for name, *values in rows:
@@ -100,10 +100,18 @@ def test_metres_of_px4_become_degrees_and_metres_again():
     fields |= {"ref_lat": np.full(count, latitude), "ref_lon": np.full(count, longitude)}
     track = _px4_track("vehicle_local_position", fields)
     # map_projection_project of PX4.
-    phi, other, step = np.radians(latitude), np.radians(track.latitude), np.radians(track.longitude - longitude)
-    angle = np.arccos(np.clip(np.sin(phi) * np.sin(other) + np.cos(phi) * np.cos(other) * np.cos(step), -1.0, 1.0))
+    phi, other, step = (
+        np.radians(latitude),
+        np.radians(track.latitude),
+        np.radians(track.longitude - longitude),
+    )
+    angle = np.arccos(
+        np.clip(np.sin(phi) * np.sin(other) + np.cos(phi) * np.cos(other) * np.cos(step), -1.0, 1.0)
+    )
     scale = np.where(angle > 0.0, angle / np.where(angle > 0.0, np.sin(angle), 1.0), 1.0) * PX4_RADIUS
-    assert scale * (np.cos(phi) * np.sin(other) - np.sin(phi) * np.cos(other) * np.cos(step)) == pytest.approx(north, abs=1e-5)
+    assert scale * (
+        np.cos(phi) * np.sin(other) - np.sin(phi) * np.cos(other) * np.cos(step)
+    ) == pytest.approx(north, abs=1e-5)
     assert scale * np.cos(other) * np.sin(step) == pytest.approx(east, abs=1e-5)
 
 
@@ -155,7 +163,9 @@ def test_a_log_of_px4_that_flew_is_judged(tmp_path):
     """Two topics of a file of pyulog's own tests."""
     pytest.importorskip("pyulog", reason="not installed: pip install 'filtergym[logs]'")
     path = tmp_path / "flight.ulg"
-    path.write_bytes(gzip.decompress((Path(__file__).parent / "golden" / "sample_px4_events.ulg.gz").read_bytes()))
+    path.write_bytes(
+        gzip.decompress((Path(__file__).parent / "golden" / "sample_px4_events.ulg.gz").read_bytes())
+    )
     recording, found = judgement(path, ["imm"])
     assert found.source == "EKF2 of PX4, vehicle_local_position"
     distance = np.linalg.norm(found.positions - recording.measurements["position"], axis=-1)

@@ -293,7 +293,8 @@ def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = 
     from pymavlink import DFReader
 
     known = {**ESTIMATES, **ORIGINS} if onboard else FIXES
-    log, found = DFReader.DFReader_binary(path), {name: [] for name in known}
+    log = DFReader.DFReader_binary(path)
+    found: dict[str, list[list[float]]] = {name: [] for name in known}
     while (message := log.recv_match(type=[*known])) is not None:
         if getattr(message, "I", 0) or getattr(message, "C", 0):  # another receiver, another core
             continue

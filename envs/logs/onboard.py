@@ -75,7 +75,13 @@ def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
     # The sample that the estimate is of; the time of its publication is some ms later.
     time, x, y, latitude, longitude = (
         fields[name][valid].astype(float)
-        for name in ("timestamp_sample" if "timestamp_sample" in fields else "timestamp", "x", "y", "ref_lat", "ref_lon")
+        for name in (
+            "timestamp_sample" if "timestamp_sample" in fields else "timestamp",
+            "x",
+            "y",
+            "ref_lat",
+            "ref_lon",
+        )
     )
     phi, angle = numpy.radians(latitude), numpy.hypot(x, y) / PX4_RADIUS
     part = numpy.sinc(angle / numpy.pi) / PX4_RADIUS  # sine over angle, and its limit
@@ -105,7 +111,9 @@ def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarra
     return _in_order(source, 1e-6 * time, latitude, origins[3][at] + east / across)
 
 
-def _in_order(source: str, time: numpy.ndarray, latitude: numpy.ndarray, longitude: numpy.ndarray) -> OnboardTrack:
+def _in_order(
+    source: str, time: numpy.ndarray, latitude: numpy.ndarray, longitude: numpy.ndarray
+) -> OnboardTrack:
     """Return the finite rows whose times increase."""
     whole = numpy.isfinite([time, latitude, longitude]).all(axis=0)
     latest = numpy.maximum.accumulate(numpy.append(-numpy.inf, numpy.where(whole, time, -numpy.inf)))[:-1]

@@ -370,8 +370,8 @@ def _onboard(advice: Advice) -> Iterator[str]:
         f"One in {ONE_IN} of the fixes was withheld. On {found.fixes:,} that judge, the estimates of {name} lie "
         f"{found.errors[name]:.3g} m from them, and those of the vehicle's own filter ({found.source}), "
         f"{found.delay:.2f} s before, {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has seen the earlier "
-        "withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where errors "
-        "of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
+        "withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where "
+        "errors of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
     )
 
 
