@@ -235,7 +235,7 @@ def test_what_is_no_program_is_refused_before_anything_runs():
 @pytest.mark.parametrize("name", ["exec:cat", "isolated:lone_module:Missing"])
 def test_what_needs_groups_of_processes_is_refused_in_one_sentence_without(name, monkeypatch, tmp_path):
     monkeypatch.delattr("os.killpg", raising=False)  # as on Windows
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lone_module.py").write_text("class Missing: ...")
     with pytest.raises(
         ValueError, match=r"^exec: and --isolated .* needs Linux or macOS: on Windows take WSL$"
