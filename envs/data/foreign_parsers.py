@@ -250,7 +250,7 @@ ULOG_FIELDS = (
 
 
 ONBOARD_TOPICS = ("vehicle_local_position", "estimator_local_position")
-"""With positions of the vehicle's own filter, likewise."""
+"""With positions of the vehicle's own filter, the first that a log has."""
 ONBOARD_FIELDS = ("timestamp", "timestamp_sample", "x", "y", "ref_lat", "ref_lon", "xy_valid")
 
 
@@ -280,12 +280,12 @@ def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False
 FIXES = {"GPS": ("TimeUS", "Lat", "Lng", "Alt", "Status"), "GPA": ("TimeUS", "HAcc")}
 """Messages of ArduPilot with positions of a receiver, and their fields."""
 ESTIMATES = dict.fromkeys(("XKF1", "NKF1"), ("TimeUS", "PN", "PE"))
-"""Likewise of the vehicle's own filter, the first that a log has: EKF3, EKF2."""
+"""Messages of the vehicle's own filter, the first that a log has: EKF3, EKF2."""
 ORIGINS = {"ORGN": ("TimeUS", "Type", "Lat", "Lng")}
 
 
 def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
-    """Return the fixes of the first receiver in a log of ArduPilot, a column each, and what it says of their errors;
+    """Return the fixes of the first receiver in a log of ArduPilot, a column each, and the stated errors;
     ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, and nothing where there
     are none.
     """

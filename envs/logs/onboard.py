@@ -34,9 +34,9 @@ class OnboardTrack(NamedTuple):
     time: numpy.ndarray
     """s by the clock of the log, increasing, ``(n,)``."""
     latitude: numpy.ndarray
-    """Degrees, likewise."""
+    """Degrees, ``(n,)``."""
     longitude: numpy.ndarray
-    """Degrees, likewise."""
+    """Degrees, ``(n,)``."""
 
     def at(self, time: numpy.ndarray, origin: PlaneOrigin) -> numpy.ndarray:
         """Return positions east and north of an origin at some times, m, ``(..., 2)``; NaN where there is no estimate

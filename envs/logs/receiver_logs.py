@@ -380,9 +380,9 @@ def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
     columns = {"time": 1e-6 * time, "altitude": altitude}
     columns |= {"latitude": numpy.where(fixed, latitude, math.nan)}
     columns |= {"longitude": numpy.where(fixed, longitude, math.nan)}
-    said, accuracy = found["GPA"]
-    if len(said):
-        at = numpy.maximum(numpy.searchsorted(said, time, side="right") - 1, 0)
+    stated, accuracy = found["GPA"]
+    if len(stated):
+        at = numpy.maximum(numpy.searchsorted(stated, time, side="right") - 1, 0)
         columns |= dict.fromkeys(("sigma_x", "sigma_y"), accuracy[at] / math.sqrt(2.0))
     notes = ["positions are of GPS, times seconds since the start of the autopilot"]
     if not fixed.all():
