@@ -250,6 +250,10 @@ class Advice(NamedTuple):
         """Of the parameters of ``fitted``."""
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
+    def make_fitted(self) -> dict[str, Any]:
+        """Return what makes each fitted filter, by name."""
+        return {name: Fits(self.fits, self.tunables, {}).make(name) for name in self.fits}
+
     @property
     def advised(self) -> JudgedFilter:
         """Who is advised."""

@@ -19,6 +19,7 @@ from ..envs.logs.onboard import OnboardTrack
 from ..evaluation.statistics.bootstrap import IntervalEstimate
 from ..evaluation.statistics.predictions import stretches_of
 from ..filters.geodesy import PlaneOrigin
+from .judgement import Share, roles_of
 from .log_scores import PairSums, replay_log
 from .problem import Problem
 
@@ -50,7 +51,7 @@ def judge_onboard(
     problem: Problem,
     recording: Recording,
     keywords: Mapping[str, Any],
-    judged: numpy.ndarray,
+    share: Share,
     makers: Mapping[str, Any],
     track: OnboardTrack,
 ) -> OnboardJudgement | None:
@@ -60,20 +61,19 @@ def judge_onboard(
         problem: of the recording.
         recording: positions in metres around its origin.
         keywords: parameters of the task.
-        judged: measurements that nothing was fitted to or chosen by, ``(E, T)``.
+        share: which of its measurements judge.
         makers: competitors by name, the advised one first.
         track: estimates of the vehicle's own filter.
     """
     times = recording.log_time
     if not recording.origin or times is None or times.dtype.kind != "f":
         return None
-    measured = recording.measurements
+    measured, judged = recording.measurements, roles_of(share, recording.seconds.shape).judged
     there = (measured["available"] > 0.0) & (numpy.arange(judged.shape[1]) < recording.rows[:, None])
     withheld = there & (numpy.cumsum(there, axis=1) % ONE_IN == 0)
     origin, fixes = PlaneOrigin(**recording.origin), measured["position"]
 
     def squares(delay: float, where: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
-        """Squared distance of the estimates so much before the fixes, and these; NaN elsewhere."""
         positions = numpy.full_like(fixes, numpy.nan)
         positions[where] = track.at(times[where] - delay, origin)
         return ((positions - fixes) ** 2).sum(axis=-1), positions

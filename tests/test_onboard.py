@@ -10,7 +10,6 @@ import pytest
 
 from filtergym import read_recording
 from filtergym.baselines.advice import FittedLog
-from filtergym.baselines.judgement import roles_of
 from filtergym.baselines.onboard import ONBOARD, _without, judge_onboard
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.logs.onboard import ARDUPILOT_RADIUS, PX4_RADIUS, _px4_track, read_onboard
@@ -118,9 +117,9 @@ def test_metres_of_px4_become_degrees_and_metres_again():
 def judgement(path, names=("kalman-imm", "imm")):
     recording = read_recording(path, TARGET, speeds=SPEEDS)
     problem = problem_of(TARGET)
-    judged = roles_of(FittedLog(problem, recording).share, recording.seconds.shape).judged
+    share = FittedLog(problem, recording).share
     makers = {one.name: one.maker for one in find_competitors(problem, names)}
-    return recording, judge_onboard(problem, recording, {}, judged, makers, read_onboard(path))
+    return recording, judge_onboard(problem, recording, {}, share, makers, read_onboard(path))
 
 
 def test_withheld_fixes_judge_the_filter_of_the_vehicle(log):

@@ -51,21 +51,16 @@ class OnboardTrack(NamedTuple):
 
 def read_onboard(path: Any) -> OnboardTrack | None:
     """Read what the filter of the vehicle estimated; None of what is no single log of an autopilot, or holds none.
-
-    Args:
-        path: of a log.
-
-    Raises:
-        ValueError: if it is a log of an autopilot and cannot be read.
+    ValueError for a log of an autopilot that cannot be read.
     """
     file = Path(path) if isinstance(path, str | Path) else Path()
     if not file.is_file() or file.suffix not in (".ulg", *DATAFLASH_SUFFIXES):
         return None
     parser = "ulog" if file.suffix == ".ulg" else "dataflash"
     found = parse_apart(parser, file, EXTRA, rows_limit=MOST_ROWS, onboard=True)
-    track = None
-    if found:
-        track = _px4_track(**found) if parser == "ulog" else _ardupilot_track(**found)
+    if not found:
+        return None
+    track = _px4_track(**found) if parser == "ulog" else _ardupilot_track(**found)
     return track if track is not None and len(track.time) > 1 else None
 
 
@@ -92,12 +87,8 @@ def _px4_track(topic: str, fields: dict[str, numpy.ndarray]) -> OnboardTrack:
 
 
 def _ardupilot_track(topic: str, estimates: numpy.ndarray, origins: numpy.ndarray) -> OnboardTrack | None:
-    """Add metres to the origin in force.
-
-    Args:
-        topic: ``XKF1`` or ``NKF1``.
-        estimates: time, us, and metres north and east, ``(3, n)``.
-        origins: time, us, type, and latitude and longitude, degrees, ``(4, m)``; type 0 is the filter's.
+    """Add metres north and east to the origin in force, of which type 0 is the filter's; times in us, ``(3, n)`` and
+    ``(4, m)``.
     """
     origins = origins[:, origins[1] == 0.0]
     if not origins.size:

@@ -365,14 +365,7 @@ def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
     """Read positions of the first receiver from a log of ArduPilot.
 
     Reading: ``HAcc`` of ``GPA`` is a deviation as ``eph`` is, of :func:`read_ulog`. Altitudes are above the sea: some
-    tens of metres move a position in the plane by 1e-5 of its distance.
-
-    Args:
-        file: its path.
-        most_rows: that it may have.
-
-    Raises:
-        ValueError: if it holds none, or more.
+    tens of metres move a position in the plane by 1e-5 of its distance. Arguments and errors as of :func:`read_ulog`.
     """
     found = parse_apart("dataflash", file, EXTRA, rows_limit=most_rows)
     time, latitude, longitude, altitude, status = found["GPS"]

@@ -1,20 +1,19 @@
 """The command that advises which filter to take for a log."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from ..baselines.advice import Advice, Fits, FittedLog, advise, fit_all
+from ..baselines.advice import FittedLog, advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
-from ..baselines.judgement import roles_of
 from ..baselines.onboard import judge_onboard
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task
-from ..envs.logs.onboard import OnboardTrack, read_onboard
+from ..envs.logs.onboard import read_onboard
 from ..envs.logs.reading import read_recording
 from ..evaluation.storage.files import writable_file, write_text
 from ..names import find_competitor, find_competitors
@@ -103,32 +102,6 @@ def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path
     console.print(f"saved in {out}; filtergym evaluate {problem.name} --policy {out} runs it", soft_wrap=True)
 
 
-def compare_onboard(
-    problem: Problem,
-    advice: Advice,
-    keywords: Mapping[str, Any],
-    shipped: Mapping[str, Any],
-    learned: Sequence[str],
-    track: OnboardTrack,
-) -> Advice:
-    """Return the advice with the vehicle's own filter beside the filters of its table.
-
-    Args:
-        problem: of the recording.
-        advice: as it was found.
-        keywords: parameters of the task.
-        shipped: competitors that are not fitted, by name.
-        learned: names of shipped agents.
-        track: estimates of the vehicle's own filter.
-    """
-    fits = Fits(advice.fits, advice.tunables, {})
-    names = [row.name for row in advice_rows(advice, learned)]
-    makers = {name: fits.make(name) if name in advice.fits else shipped[name] for name in names}
-    judged = roles_of(advice.share, advice.recording.seconds.shape).judged
-    found = judge_onboard(problem, advice.recording, keywords, judged, makers, track)
-    return advice._replace(onboard=found)
-
-
 def advise_on_log(
     recording: Annotated[
         str,
@@ -206,7 +179,11 @@ def advise_on_log(
         prices = update_prices(problem, found)
         advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)
         if (track := read_onboard(recording)) is not None:
-            advice = compare_onboard(problem, advice, keywords, makers, learned, track)
+            names = [row.name for row in advice_rows(advice, learned)]
+            every = {**makers, **advice.make_fitted()}
+            shown = {name: every[name] for name in names}
+            onboard = judge_onboard(problem, found, keywords, advice.share, shown, track)
+            advice = advice._replace(onboard=onboard)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:
