@@ -46,6 +46,7 @@ from .fitting import (
 )
 from .judgement import AS_GOOD, FEWEST, JudgedFilter, Judgement, Share, likeliest_of, roles_of, share_out
 from .log_scores import replay_log, score_log
+from .onboard import OnboardJudgement
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -242,11 +243,17 @@ class Advice(NamedTuple):
     None where it is the advised one."""
     prices: "Prices"
     """What an update of each costs."""
+    onboard: OnboardJudgement | None = None
+    """Of a log of an autopilot, what its own filter did on withheld fixes."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
         """Of the parameters of ``fitted``."""
         return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
+
+    def make_fitted(self) -> dict[str, Any]:
+        """Return what makes each fitted filter, by name."""
+        return {name: Fits(self.fits, self.tunables, {}).make(name) for name in self.fits}
 
     @property
     def advised(self) -> JudgedFilter:

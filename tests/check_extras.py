@@ -67,7 +67,9 @@ FLOWN = f"{EVALUATE} --policy imm --scenario"
 RECORDED = f"filtergym evaluate {ID} --policy imm --speeds 0,100 --recording"
 LOGS = """
 from pathlib import Path
+from test_onboard import flight
 from test_receiver_logs import NEW, TIME, bag, nmea, places, ulog
+flight(Path('log.bin'))
 nmea(Path('log.nmea'))
 rows = [(round(1e6 * t), *place, 2.0, 3) for t, place in zip(TIME, places().T)]
 ulog(Path('log.ulg'), NEW, rows)
@@ -90,7 +92,7 @@ NEEDS = {
     "report": [Need("filtergym report results.json --out report.html", RESULTS)],
     "render": [Need(f"python -c {shlex.quote(VIDEO)}", refusal="moviepy is not installed")],
     "flights": [Need(f"{FLOWN} flight.parquet", FLIGHT), Need(f"{FLOWN} flight.nc", FLIGHT)],
-    "logs": [Need(f"{RECORDED} log{suffix}", LOGS) for suffix in (".nmea", ".ulg", ".bag")],
+    "logs": [Need(f"{RECORDED} log{suffix}", LOGS) for suffix in (".nmea", ".ulg", ".bin", ".bag")],
     "ins": [
         Need(
             f"python -c {shlex.quote(INERTIAL)}",

@@ -31,7 +31,20 @@ ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES, LONGEST = 20, 1024, 200_000
 ENVIRONMENT = "filtergym/ManeuveringTarget-v0"
 MODEL = "fuzzed/Model-v0"
-TABLES = (".csv", ".json", ".json.gz", ".nc", ".parquet", ".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap")
+TABLES = (
+    ".csv",
+    ".json",
+    ".json.gz",
+    ".nc",
+    ".parquet",
+    ".pos",
+    ".nmea",
+    ".ulg",
+    ".bin",
+    ".bag",
+    ".db3",
+    ".mcap",
+)
 WHOLE = (
     "measured.nc", "truth.csv", "imu.csv", "model.csv", "tuned.json", "filter.json", "safetensors", "submission",
     "results", "run.json", "settings.yml", "kept",
@@ -50,6 +63,7 @@ def track():
 
 def write_table_seeds(suffix: str, place: Path) -> None:
     """Write honest tables and logs of a kind into a folder."""
+    import test_onboard
     import test_receiver_logs as logs
 
     table, path = track(), place / "seed"
@@ -80,6 +94,7 @@ def write_table_seeds(suffix: str, place: Path) -> None:
         ".pos": lambda: logs.rtklib(path, logs.GEODETIC, logs.places()),
         ".nmea": lambda: logs.nmea(path),
         ".ulg": lambda: logs.ulog(path, logs.NEW, rows),
+        ".bin": lambda: test_onboard.flight(path, 10.0),
         ".bag": lambda: logs.bag(path),
         ".db3": lambda: shutil.copy(logs.bag2(place.parent / "made-db3", kinds=kinds), path),
         ".mcap": lambda: shutil.copy(logs.bag2(place.parent / "made-mcap", "MCAP", compression=True), path),

@@ -20,7 +20,7 @@ OF_PROBLEMS = (
 PARTS = {
     "logs and advice": (
         rf"envs/logs/|envs/{PROBLEM}/(logs|live|flights|inertial)\.py"
-        r"|baselines/(advice|fitt\w+|judgement|log_scores|tuning)\.py|filtergym/commands/(advise|improve)\.py"
+        r"|baselines/(advice|fitt\w+|judgement|log_scores|onboard|tuning)\.py|filtergym/commands/(advise|improve)\.py"
         r"|filtergym/reports/(tables/(advice|recording_tables)|pages/advice_report)\.py"
         r"|evaluation/(competitors/(likelihood|file_estimates)|storage/(blind|estimate_tables|estimates))\.py"
     ),

@@ -18,6 +18,7 @@ import pytest
 from models import make_model
 from test_wall import without
 
+from filtergym.baselines.problem import problem_of
 from filtergym.compiler.functions import leaves
 from filtergym.envs.contract.filter import Initial
 from filtergym.envs.contract.task import Component, named_arrays
@@ -40,7 +41,7 @@ from filtergym.evaluation.competitors.programs import (
 )
 from filtergym.evaluation.running.rollout import measure_time, rollout, start_lanes
 from filtergym.evaluation.storage.dataset import FAULTS
-from filtergym.names import competitor
+from filtergym.names import competitor, find_competitors
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
@@ -231,6 +232,17 @@ def test_what_is_no_program_is_refused_before_anything_runs():
 
 
 @pytest.mark.skipif(sys.prefix == sys.base_prefix, reason="this Python runs in no virtual environment")
+@pytest.mark.parametrize("name", ["exec:cat", "isolated:lone_module:Missing"])
+def test_what_needs_groups_of_processes_is_refused_in_one_sentence_without(name, monkeypatch, tmp_path):
+    monkeypatch.delattr("os.killpg", raising=False)  # as on Windows
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lone_module.py").write_text("class Missing: ...")
+    with pytest.raises(
+        ValueError, match=r"^exec: and --isolated .* needs Linux or macOS: on Windows take WSL$"
+    ):
+        find_competitors(problem_of("filtergym/ManeuveringTarget-v0"), [name])
+
+
 def test_python_is_the_one_of_the_environment_whether_it_is_activated_or_not(tmp_path, monkeypatch):
     """It has the package, however that was installed."""
     other = tmp_path / "python"

@@ -7,6 +7,7 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
+from test_onboard import flight
 
 from filtergym import read_recording
 from filtergym.filters import geodesy
@@ -266,7 +267,13 @@ def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "library"), [(".nmea", "pynmea2"), (".ulg", "pyulog"), (".bag", "rosbags.rosbag1")]
+    ("suffix", "library"),
+    [
+        (".nmea", "pynmea2"),
+        (".ulg", "pyulog"),
+        (".bin", "pymavlink.DFReader"),
+        (".bag", "rosbags.rosbag1"),
+    ],
 )
 def test_a_missing_library_is_named(suffix, library, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, library, None)
@@ -470,16 +477,17 @@ def test_a_bag_with_a_definition_of_its_own_is_refused(tmp_path):
         read_recording(path, TARGET)
 
 
-@pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap"])
+@pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bin", ".bag", ".db3", ".mcap"])
 def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
     """Bytes that changed and files that end early are read or refused, and nothing else happens."""
-    library = {".ulg": "pyulog", ".nmea": "pynmea2"}.get(suffix, "numpy")
+    library = {".ulg": "pyulog", ".nmea": "pynmea2", ".bin": "pymavlink"}.get(suffix, "numpy")
     pytest.importorskip(library, reason="not installed: pip install 'filtergym[logs]'")
     rows = [(round(1e6 * time), *place, 2.0, 3) for time, place in zip(TIME, places().T, strict=True)]
     make = {
         ".pos": lambda path: rtklib(path, GEODETIC, places()),
         ".nmea": nmea,
         ".ulg": lambda path: ulog(path, NEW, rows),
+        ".bin": lambda path: flight(path, 10.0),
         ".bag": bag,
         ".db3": lambda path: bag2(path),
         ".mcap": lambda path: bag2(path, "MCAP", compression=True),

@@ -109,9 +109,10 @@ def test_every_record_is_small_and_shown():
 
 
 @pytest.mark.claims
-def test_readme_shows_the_records():
-    """If not: ``python docs/make readme``."""
-    page = DOCS.parent / "README.md"
+@pytest.mark.parametrize("name", ["README.md", "papers/joss/paper.md"])
+def test_readme_and_paper_show_the_records(name):
+    """If not: ``python docs/make readme NAME``."""
+    page = DOCS.parent / name
     assert with_numbers(page) == page.read_text(encoding="utf-8")
 
 

@@ -199,6 +199,27 @@ def draw_public_problems(
     return figure
 
 
+@in_print
+def draw_update_times(rows: Sequence[Sequence[str]], *, columns: int = 2) -> Any:
+    """Bars of the time that an update takes, the quickest first; those of other libraries are grey.
+
+    Args:
+        rows: of the record: what is updated, in quotes where it is ours, and the median in microseconds.
+        columns: of a paper, as wide as which it is.
+    """
+    shown = sorted(rows, key=lambda row: float(row[1]))
+    median = [float(row[1]) for row in shown]
+    figure, axes = figure_with_axes(columns=columns, height={1: 2.6, 2: 3.0}[columns])
+    axis = axes[0]
+    bars = axis.barh(
+        range(len(shown)), median, color=[COLOURS[0] if "`" in row[0] else "0.6" for row in shown]
+    )
+    axis.bar_label(bars, fmt="{:g}", padding=3)
+    axis.margins(x=0.08)
+    _name_rows(axis, "", [row[0].replace("`", "") for row in shown], "time of an update, median, µs")
+    return figure
+
+
 def _look_of(name: str) -> dict[str, Any]:
     learned = name.startswith(LEARNED)
     colour = COLOURS[1] if learned else COLOURS[0] if name == "OKF" or "tuned" in name else "0.45"

@@ -16,7 +16,7 @@ from docutils.parsers.rst import directives
 from docutils.statemachine import StringList
 from environment_page import causes_table, environment_table
 from front import budgets_markdown, draw_fronts, panels_of
-from pictures import draw_public_problems
+from pictures import draw_public_problems, draw_update_times
 from playground import page_script, read_modules
 from records import (
     BENCHMARK,
@@ -174,6 +174,15 @@ class PublicFigure(_Rendered):
         }
         words = "Errors of filters on the problems that learned Kalman filters are published on"
         return "public_problems", words, draw_public_problems(rows, drives)
+
+
+class UpdateTimes(_Rendered):
+    """``{update-times}``: the time of an update of running filters, beside those of other libraries."""
+
+    def figure(self) -> tuple[str, str, Any]:
+        """Return the bars."""
+        rows = self.record("online_time").data["rows"]
+        return "update_times", "Bars: median time of an update of each filter", draw_update_times(rows)
 
 
 class BudgetsTable(_Rendered):
@@ -348,6 +357,7 @@ DIRECTIVES = {
     "comparison-overview": ComparisonOverview,
     "front-figure": FrontFigure,
     "public-figure": PublicFigure,
+    "update-times": UpdateTimes,
     "budgets-table": BudgetsTable,
     "seeds": SeedsTables,
     "seed-profiles": SeedProfiles,

@@ -249,19 +249,65 @@ ULOG_FIELDS = (
 )  # fmt: skip
 
 
-def parse_ulog(file: BinaryIO, path: str, rows_limit: int) -> Any:
-    """Return the topic with positions of a log of PX4, names of all its fields, and the known ones."""
+ONBOARD_TOPICS = ("vehicle_local_position", "estimator_local_position")
+"""With positions of the vehicle's own filter, the first that a log has."""
+ONBOARD_FIELDS = ("timestamp", "timestamp_sample", "x", "y", "ref_lat", "ref_lon", "xy_valid")
+
+
+def parse_ulog(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
+    """Return the topic with positions of a log of PX4, names of all its fields, and the known ones; ``onboard`` the
+    topic and the fields of the vehicle's own filter, and nothing where there is none.
+    """
     import pyulog
 
-    log = pyulog.ULog(file, list(ULOG_TOPICS))
+    topics, known = (ONBOARD_TOPICS, ONBOARD_FIELDS) if onboard else (ULOG_TOPICS, ULOG_FIELDS)
+    log = pyulog.ULog(file, list(topics))
     held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    chosen = min(held, key=lambda key: (ULOG_TOPICS.index(key[0]), key[1]), default=None)
+    chosen = min(held, key=lambda key: (topics.index(key[0]), key[1]), default=None)
     if chosen is None:
-        raise ValueError(f"it holds neither {' nor '.join(ULOG_TOPICS)}")
+        if onboard:
+            return {}
+        raise ValueError(f"it holds neither {' nor '.join(topics)}")
     data = held[chosen]
     check_rows(len(data["timestamp"]), rows_limit)
-    fields = {name: data[name] for name in ULOG_FIELDS if name in data}
+    fields = {name: data[name] for name in known if name in data}
+    if onboard:
+        whole = {"x", "y", "ref_lat", "ref_lon"} <= {*fields}
+        return {"topic": chosen[0], "fields": fields} if whole else {}
     return {"topic": chosen[0], "names": [*data][:MOST_COLUMNS], "fields": fields}
+
+
+FIXES = {"GPS": ("TimeUS", "Lat", "Lng", "Alt", "Status"), "GPA": ("TimeUS", "HAcc")}
+"""Messages of ArduPilot with positions of a receiver, and their fields."""
+ESTIMATES = dict.fromkeys(("XKF1", "NKF1"), ("TimeUS", "PN", "PE"))
+"""Messages of the vehicle's own filter, the first that a log has: EKF3, EKF2."""
+ORIGINS = {"ORGN": ("TimeUS", "Type", "Lat", "Lng")}
+
+
+def parse_dataflash(file: BinaryIO, path: str, rows_limit: int, onboard: bool = False) -> Any:
+    """Return the fixes of the first receiver in a log of ArduPilot, a column each, and the stated errors;
+    ``onboard`` the estimates of the first core of the vehicle's own filter and their origins, and nothing where there
+    are none.
+    """
+    import numpy
+    from pymavlink import DFReader
+
+    known = {**ESTIMATES, **ORIGINS} if onboard else FIXES
+    log = DFReader.DFReader_binary(path)
+    found: dict[str, list[list[float]]] = {name: [] for name in known}
+    while (message := log.recv_match(type=[*known])) is not None:
+        if getattr(message, "I", 0) or getattr(message, "C", 0):  # another receiver, another core
+            continue
+        name = message.get_type()
+        found[name].append([float(getattr(message, field)) for field in known[name]])
+        check_rows(len(found[name]), rows_limit)
+    columns = {name: numpy.array(rows).reshape(-1, len(known[name])).T for name, rows in found.items()}
+    if not onboard:
+        if not columns["GPS"].size:
+            raise ValueError("it holds no GPS")
+        return columns
+    topic = next((name for name in ESTIMATES if columns[name].size), None)
+    return {} if topic is None else {"topic": topic, "estimates": columns[topic], "origins": columns["ORGN"]}
 
 
 NAVSAT = "sensor_msgs/msg/NavSatFix"
@@ -403,6 +449,7 @@ PARSERS: Mapping[str, Callable[..., Any]] = {
     "netcdf4_names": parse_netcdf4_names,
     "parquet": parse_parquet,
     "ulog": parse_ulog,
+    "dataflash": parse_dataflash,
     "bag": parse_bag,
     "yaml": parse_yaml,
 }
@@ -411,6 +458,7 @@ LIBRARIES: Mapping[str, tuple[str, ...]] = {
     "netcdf4_names": ("h5netcdf", "h5py"),
     "parquet": ("pyarrow.parquet",),
     "ulog": ("pyulog",),
+    "dataflash": ("pymavlink.DFReader",),
     "bag": ("rosbags.rosbag1", "rosbags.rosbag2"),
     "yaml": ("yaml",),
 }

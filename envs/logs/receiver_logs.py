@@ -3,11 +3,12 @@
 * RTKLIB's ``.pos``: geodetic or Earth-fixed positions or baselines in metres, with standard deviations.
 * NMEA 0183, ``.nmea``: positions of GGA and RMC, standard deviations of GST.
 * ULog of PX4, ``.ulg``: positions of the topic ``vehicle_gps_position``, or ``sensor_gps``.
+* Logs of ArduPilot, ``.bin``: positions of ``GPS``, of the first receiver.
 * Bags of ROS 1, ``.bag``, and of ROS 2, ``.db3`` or ``.mcap``: ``NavSatFix``, with ``Odometry`` for a second sensor, or
   positions of ``Odometry`` or of poses.
 
 What each becomes is a table with ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x``, ``sigma_y``, as far
-as the log knows them, or ``x`` and ``y`` of a baseline. Libraries that read the last three are imported when such a
+as the log knows them, or ``x`` and ``y`` of a baseline. Libraries that read the last four are imported when such a
 file is read. A file is data and nothing more: no code, type or path that it holds is used, and what is too large is
 refused before it fills the memory.
 """
@@ -355,6 +356,33 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
     return ReceiverLog(columns, tuple(notes))
 
 
+# --- ArduPilot
+
+DATAFLASH_SUFFIXES = (".bin", ".BIN")
+
+
+def read_dataflash(file: Path, most_rows: int) -> ReceiverLog:
+    """Read positions of the first receiver from a log of ArduPilot.
+
+    Reading: ``HAcc`` of ``GPA`` is a deviation as ``eph`` is, of :func:`read_ulog`. Altitudes are above the sea: some
+    tens of metres move a position in the plane by 1e-5 of its distance. Arguments and errors as of :func:`read_ulog`.
+    """
+    found = parse_apart("dataflash", file, EXTRA, rows_limit=most_rows)
+    time, latitude, longitude, altitude, status = found["GPS"]
+    fixed = status >= 2.0  # from then on a fix has a position in the plane
+    columns = {"time": 1e-6 * time, "altitude": altitude}
+    columns |= {"latitude": numpy.where(fixed, latitude, math.nan)}
+    columns |= {"longitude": numpy.where(fixed, longitude, math.nan)}
+    stated, accuracy = found["GPA"]
+    if len(stated):
+        at = numpy.maximum(numpy.searchsorted(stated, time, side="right") - 1, 0)
+        columns |= dict.fromkeys(("sigma_x", "sigma_y"), accuracy[at] / math.sqrt(2.0))
+    notes = ["positions are of GPS, times seconds since the start of the autopilot"]
+    if not fixed.all():
+        notes.append(f"{count_of(int((~fixed).sum()), 'row')} without a fix")
+    return ReceiverLog(columns, tuple(notes))
+
+
 # --- ROS
 
 UNKNOWN_COVARIANCE, NO_FIX = 0, -1
@@ -428,6 +456,7 @@ RECEIVER_READERS: Mapping[str, Callable[[Path, int], ReceiverLog]] = {
     ".pos": read_rtklib,
     ".nmea": read_nmea,
     ".ulg": read_ulog,
+    **dict.fromkeys(DATAFLASH_SUFFIXES, read_dataflash),
     ".bag": read_rosbag,
     ".db3": read_rosbag,
     ".mcap": read_rosbag,

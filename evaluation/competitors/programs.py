@@ -104,8 +104,10 @@ class Program:
     is_program: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if os.name != "posix":
-            raise ValueError("programs compete on Linux and macOS: here pipes cannot be waited for")
+        if not hasattr(os, "killpg"):
+            raise ValueError(
+                "exec: and --isolated run a program of its own, which needs Linux or macOS: on Windows take WSL"
+            )
         if self.words is not None:
             return
         try:

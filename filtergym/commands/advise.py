@@ -8,15 +8,18 @@ import typer
 
 from ..baselines.advice import FittedLog, advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, setup_of, write_advised
+from ..baselines.onboard import judge_onboard
 from ..baselines.problem import Problem, problem_of
 from ..envs.data.recording import Recording
 from ..envs.engine.catalogue import check_names, nearest, short_name
 from ..envs.engine.scenario_choice import make_task
+from ..envs.logs.onboard import read_onboard
 from ..envs.logs.reading import read_recording
 from ..evaluation.storage.files import writable_file, write_text
 from ..names import find_competitor, find_competitors
 from ..reports.tables.advice import (
     advice_lines,
+    advice_rows,
     advice_table,
     further_sentences,
     held_out_numbers,
@@ -178,6 +181,12 @@ def advise_on_log(
 
         prices = update_prices(problem, found)
         advice = advise(FittedLog(problem, found, noise, seed, keywords), makers, own, progress, prices)
+        if (track := read_onboard(recording)) is not None:
+            names = [row.name for row in advice_rows(advice, learned)]
+            every = {**makers, **advice.make_fitted()}
+            shown = {name: every[name] for name in names}
+            onboard = judge_onboard(problem, found, keywords, advice.share, shown, track)
+            advice = advice._replace(onboard=onboard)
         costs = price_table(advice, learned)
     console.print(advice_table(advice, learned))
     if costs is not None:

@@ -19,9 +19,9 @@ from ...evaluation.competitors.likelihood import Span
 from ...evaluation.running.metrics import chi_square_band
 from ...evaluation.statistics.innovations import received
 from ..tables.advice import (
-    COLUMNS,
     PRICES,
     ParameterText,
+    advice_columns,
     advice_rows,
     parameter_name,
     parameter_size,
@@ -67,7 +67,7 @@ def advice_html(
         advised=advice.advised.name,
         parameters=list(_parameters(advice, advice.fitted.name)),
         rows=list(advice_rows(advice, learned)),
-        columns=[title.replace("-\n", "") for title in COLUMNS],
+        columns=[title.replace("-\n", "") for title in advice_columns(advice)],
         price_columns=list(PRICES),
         prices=price_rows(advice, learned),
         families=[
@@ -90,6 +90,7 @@ def advice_html(
         has_track=received(replay.isel(policy=0), task) is not None,
         has_innovations="prediction_error" in replay,
         has_nis="nis" in replay,
+        has_onboard=advice.onboard is not None,
     )
 
 
@@ -138,6 +139,7 @@ def _episodes(advice: Advice, replay: xarray.Dataset, task: Task) -> Iterator[di
             "spans": list(_spans(advice, episode, seconds)),
             **_track(run, task, _shown(advice), step, advice.outliers[episode, :rows]),
             **_innovations(run, advice.advised.name, step),
+            **_onboard(advice, episode, rows, step),
         }
         if "nis" in run:
             found["nis"] = [_mean_nis(run, name, seconds) for name in _shown(advice)]
@@ -197,6 +199,14 @@ def _track(
         true = chosen["truth"].isel(policy=0).transpose("component", "time").values
         found["truth"] = [_numbers(values) for values in true]
     return found
+
+
+def _onboard(advice: Advice, episode: int, rows: int, step: int) -> dict[str, Any]:
+    """Where the vehicle's own filter was at the fixes."""
+    if advice.onboard is None:
+        return {}
+    places = advice.onboard.positions[episode, :rows:step]
+    return {"onboard": [_numbers(axis) for axis in places.T]}
 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:

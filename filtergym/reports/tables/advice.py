@@ -11,6 +11,7 @@ from rich.table import Table
 from ...baselines.advice import APART, Advice
 from ...baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, OUTLIER_SHARE, STARTS, WIDE, Fit, Interval
 from ...baselines.judgement import JudgedFilter
+from ...baselines.onboard import ONBOARD, ONE_IN
 from ...baselines.table import Tunable
 from ...envs.contract.log_format import deviation_words, is_assumed
 from ...envs.data.recording import Recording
@@ -29,6 +30,8 @@ NAME_WIDTH = 16
 """Columns of a name; longer ones go on below."""
 COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
 """Of the table, and how wide they are at least, so that no number is cut."""
+WITHHELD = {"with-\nheld": 6}
+"""The column of the errors at withheld fixes, where a log holds the estimate of the vehicle's own filter."""
 PRICES = {
     "operations": "operations",
     "state, bytes": "state_bytes",
@@ -58,7 +61,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
         title=f"{recording.name}: {judged:,} measurements that judge (95 % intervals)", title_justify="left"
     )
     table.add_column("filter", no_wrap=True)
-    for title, width in COLUMNS.items():
+    for title, width in advice_columns(advice).items():
         table.add_column(title, justify="right", min_width=width)
     for row in advice_rows(advice, learned):
         table.add_row("\n".join(textwrap.wrap(row.label, NAME_WIDTH)), *row.cells)
@@ -69,6 +72,8 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
         f"measurements that chose, on those that judge; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large "
         "as predicted; correlation: of successive prediction errors, 0 where they are white."
     )
+    if advice.onboard is not None:
+        table.caption += f"\nwithheld: RMSE at {advice.onboard.fixes:,} withheld fixes, m."
     table.caption_justify = "left"
     return table
 
@@ -76,14 +81,22 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
 class Row(NamedTuple):
     """A row of the table of an advice."""
 
-    competitor: JudgedFilter
+    name: str
     label: str
     cells: tuple[str, ...]
-    """In the order of ``COLUMNS``."""
+    """In the order of :func:`advice_columns`."""
+
+
+def advice_columns(advice: Advice) -> dict[str, int]:
+    """Return the columns of the table of an advice, and how wide they are at least."""
+    return {**COLUMNS, **({} if advice.onboard is None else WITHHELD)}
 
 
 def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
-    """Return what stands in the table: the advised filter first; arguments as of :func:`advice_table`."""
+    """Return what stands in the table: the advised filter first, the vehicle's own last; arguments as of
+    :func:`advice_table`.
+    """
+    errors = None if advice.onboard is None else advice.onboard.errors
     has_truth = advice.recording.truth is not None
     known = advice.rival, advice.best_shipped
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
@@ -103,14 +116,20 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
             _number(one.nis, ".2f"),
             _interval(one.correlation, "+.2f"),
         )
-        yield Row(one, _label(advice, one), cells)
+        withheld = (
+            () if errors is None else (_number(errors.get(one.name, math.nan)),)
+        )
+        yield Row(one.name, _label(advice, one), (*cells, *withheld))
+    if errors is not None:
+        yield Row(ONBOARD, ONBOARD, (*["-"] * len(COLUMNS), _number(errors[ONBOARD])))
 
 
 def price_rows(advice: Advice, learned: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
     """What an update of each filter of :func:`advice_table` costs, in the order of ``PRICES``; empty where it is known
     of none.
     """
-    prices = {row.competitor.name: advice.prices[row.competitor.name] for row in advice_rows(advice, learned)}
+    names = [row.name for row in advice_rows(advice, learned) if row.name != ONBOARD]
+    prices = {name: advice.prices[name] for name in names}
     cells = {
         name: tuple("-" if price is None else f"{price[key]:,}" for key in PRICES.values())
         for name, price in prices.items()
@@ -243,6 +262,7 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
 
 def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
+    yield from _onboard(advice)
     yield from _hindsight(advice)
     yield from _fits(advice)
     yield from _dearer(advice)
@@ -339,6 +359,21 @@ def _hindsight(advice: Advice) -> Iterator[str]:
     yield (
         f"In hindsight {best} is the best of the {count} shipped ones there: {advice.advised.name} has "
         f"{_amount(advice, relative)}. The best of many is so partly by luck."
+    )
+
+
+def _onboard(advice: Advice) -> Iterator[str]:
+    """How the vehicle's own filter compares, and what flatters it."""
+    found = advice.onboard
+    if found is None:
+        return
+    name, relative = advice.advised.name, _interval(_percent(found.relative), "+.1f")
+    yield (
+        f"One in {ONE_IN} of the fixes was withheld. On {found.fixes:,} that judge, the estimates of {name} lie "
+        f"{found.errors[name]:.3g} m from them, and those of the vehicle's own filter ({found.source}), "
+        f"{found.delay:.2f} s before, {found.errors[ONBOARD]:.3g} m: {relative} %. That filter has seen the earlier "
+        "withheld fixes, which the others have not, and an inertial sensor: its row is an optimistic bound. Where "
+        "errors of fixes last, filters that follow them come closer to the fixes, and no closer to the truth."
     )
 
 

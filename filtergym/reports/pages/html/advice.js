@@ -26,7 +26,7 @@
 
   const FIGURES = {
     track({ names }, episode) {
-      const { components, measured, estimates, outliers, outlier_numbers, outlier_seconds, seconds, truth } = episode, isPlane = components.length === 2;
+      const { components, measured, estimates, outliers, outlier_numbers, outlier_seconds, seconds, truth, onboard } = episode, isPlane = components.length === 2;
       const isMissed = measured[0].map((x) => x === null);
       const at = (values) => (isPlane ? { x: values[0], y: values[1] } : { x: seconds, y: values[0] });
       const drawn = [];
@@ -41,6 +41,7 @@
         const shown = { name: plain(name), legendgroup: plain(name), text: seconds, visible: i ? "legendonly" : true, hovertemplate: "%{text} s<extra>" + plain(name) + "</extra>" };
         drawn.push({ ...solid, mode: "lines", line: lineOf(i), ...shown }, { ...dotted, mode: "lines", line: { ...lineOf(i), dash: "dot" }, ...shown, showlegend: false });
       });
+      if (onboard) drawn.push({ ...at(onboard), mode: "lines", name: "on-board", line: { color: "#009E73", width: 1.2 }, connectgaps: true, text: seconds, hovertemplate: "%{text} s<extra>on-board</extra>" });
       const axes = isPlane ? { xaxis: { title: { text: plain(components[0]) } }, yaxis: { title: { text: plain(components[1]) }, scaleanchor: "x" } } : { xaxis: time, yaxis: { title: { text: plain(components[0]) } } };
       return [drawn, { ...axes, height: window.innerWidth < 640 ? 460 : 600 }];
     },
