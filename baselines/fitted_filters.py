@@ -35,9 +35,7 @@ def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
     known = problem.baselines
     if known.log_families is not None:
         return dict(known.log_families(recording))
-    # Whether their parameters may be arrays, nobody says.
-    found = {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
-    return {name: replace(tunable, in_lanes=False) for name, tunable in found.items()}
+    return {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
 
 
 def own_family(name: str, cls: Any) -> Tunable:

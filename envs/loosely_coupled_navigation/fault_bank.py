@@ -37,7 +37,7 @@ import numpy
 
 from ...filters import imm
 from ...filters import receiver_faults as faults
-from ...filters.array_namespace import namespace
+from ...filters.array_namespace import exponential, namespace
 from ...filters.loosely_coupled import AugmentedCovariance, Sampling
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import SteerableFilter
@@ -126,7 +126,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         self.prior, p = prior._replace(**changed), task.parameters
         prior, self.interval = self.prior, p.sampling_interval
         self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
-        self.spacing = max(round(prior.longest / (prior.onsets * self.interval)), 1)
+        spacing = numpy.maximum(numpy.round(prior.longest / (prior.onsets * self.interval)), 1.0)
+        self.spacing = spacing if numpy.ndim(spacing) else int(spacing)
         self.noises = Noises(*(task.constant(each)[:, None, None] for each in draw_noises(prior, p)))
         self.others = Noises(*(each[1:] for each in self.noises))
         self.noise_weights = task.constant(
@@ -143,7 +144,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         """Whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
         highest = math.log(prior.levels[-1]) or 1.0
         self.heights = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
-        self.onsets = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
+        self.onsets = task.constant(numpy.arange(float(prior.onsets)))[:, None] * self.spacing
 
     def start(self, initial: Initial) -> FaultState:
         """Start where INS and reference agree, without a pull."""
@@ -179,7 +180,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
     def since_onset(self, number: Array) -> Array:
         """Measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a measurement."""
-        cycle = float(self.spacing * self.prior.onsets)
+        cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
@@ -241,7 +242,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
-        changing = 1.0 - math.exp(-self.prior.level_rate * self.interval)
+        changing = 1.0 - exponential(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
         changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
         chain = self.xp.where(changed, self.fresh, chain)
