@@ -193,6 +193,9 @@ class LogFormat:
     """How the rows are measurements as they stand; None where more is done to them."""
     plot_rows: PlotRows | None = None
     """How the rows are plots of a track; None where they are not."""
+    regular_rows: Callable[[Any], Mapping[str, float]] | None = None
+    """How the rows come at one rate, the first of which starts the track and each further one is a measurement: by the
+    parameters the numbers that the reading needs, by name; None where they do not."""
     noise_hint: str = ""
     """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     decision_interval: int | None = None
