@@ -23,6 +23,8 @@ from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_va
 
 SUFFIX = ".filter.json"
 """Of the names of such files."""
+MOST_MEASUREMENTS = 100_000
+"""Of a track, of which a file tells how many there were; an export simulates as many."""
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
@@ -92,6 +94,7 @@ def setup_of(problem: Problem, recording: Any) -> LogSetup:
         {name: round_value(value) for name, value in deviations.items()},
         source,
         dict(recording.origin),
+        min(int(recording.rows.max()), MOST_MEASUREMENTS),
     )
 
 
@@ -191,9 +194,10 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         "deviations": dict[str, float],
         "deviations_from": str,
         "origin": dict[str, float],
+        "horizon": int,
     }
     if isinstance(log, dict):
-        log = {"origin": {}, **log}  # files of older versions say nothing of it
+        log = {"origin": {}, "horizon": 0, **log}  # files of older versions say nothing of them
     log_format = find_companion(problem.task, LogFormat)
     names = {
         "time",
@@ -209,6 +213,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not 0.0 < log["interval"] < math.inf
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
+        or not 0 <= log["horizon"] <= MOST_MEASUREMENTS
         or not (not log["origin"] or _is_place(log["origin"]))
     ):
         raise ValueError(f"{path}: what it says of its log is none: filtergym advise writes it anew")

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy
 
 from ...filters.geodesy import PlaneOrigin
+from .task import Scenario
 
 TIME = ("time", "timestamp", "seconds")
 """Names of the column of times."""
@@ -221,6 +222,14 @@ class LogSetup(NamedTuple):
     origin: dict[str, float]
     """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
     were metres."""
+    horizon: int = 0
+    """Measurements of the longest track; zero where that is not known."""
+
+    def scenario(self, log_format: LogFormat) -> Scenario:
+        """Parameters of a task on logs that are read in the same way, in place of those of a simulated scenario."""
+        known = {"horizon": self.horizon, "decision_interval": log_format.decision_interval}
+        known = {name: value for name, value in known.items() if value}
+        return Scenario("log", "Parameters of a log.", {**known, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:

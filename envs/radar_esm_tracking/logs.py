@@ -92,7 +92,7 @@ def _start_variances(p: Any) -> list[float]:
 def _numbers(p: Any) -> dict[str, float]:
     """Numbers that the reading of a row needs."""
     variances = {f"variance_{i}": variance for i, variance in enumerate(_start_variances(p))}
-    return {"types": len(p.recognition), "esm_period": p.esm_period, **variances}
+    return {"types": len(p.recognition), "esm_period": p.esm_period, "horizon": p.horizon, **variances}
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:

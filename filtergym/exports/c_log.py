@@ -89,8 +89,7 @@ class LogText(FilterText):
     ) -> None:
         super().__init__(name, traced, scalar, components)
         self.plain_rows = log_format.plain_rows if log_format else None
-        self.plot_rows = log_format.plot_rows if log_format else None
-        self.regular_rows = log_format.regular_rows if log_format else None
+        self.log_format = log_format
         self.log_columns = columns or {}
 
     def columns(self, part: str) -> list[str]:
@@ -141,14 +140,15 @@ class LogText(FilterText):
         """
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
-        if request.log is None:
+        log, log_format = request.log, self.log_format
+        if log is None or log_format is None:
             return ""
-        if self.plot_rows is not None:
-            return self._plot_log(self.plot_rows, request.log)
-        if self.regular_rows is None:
+        if log_format.plot_rows is not None:
+            return self._plot_log(log_format.plot_rows, log)
+        if log_format.regular_rows is None:
             return ""
-        parameters = request.problem.task.Parameters(**{**request.log.parameters, **request.keywords})
-        return self._regular_log(self.regular_rows(parameters), request.log)
+        parameters = {**log.scenario(log_format).parameters, **request.keywords}
+        return self._regular_log(log_format.regular_rows(request.problem.task.Parameters(**parameters)), log)
 
     def _log(
         self,
@@ -350,7 +350,7 @@ def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -
     start = {"mean_0": "cell[0]", "mean_1": "cell[1]"}
     start |= {f"covariance_{i}_{i}": literal(numbers[f"variance_{i}"]) for i in range(3)}
     start |= {f"first_{name}": value for name, value in LOOK_VALUES.items()}
-    limits = {name.upper(): numbers[name] for name in ("types", "esm_period")}
+    limits = {name.upper(): numbers[name] for name in ("types", "esm_period", "horizon")}
     return RegularReading(
         names, len(first), READ_LOOKS.format(**cells), LOOK_VALUES, start, {"WHOLE": len(first), **limits}
     )

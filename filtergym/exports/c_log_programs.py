@@ -391,6 +391,7 @@ static int read_values(const Row *row, long i, double *found) {{
     const double decision = {decision}, looked = {looked}, stated = {bearing_difference};
     const double apart = stated == stated ? stated : {radar_bearing} - {esm_bearing};
     const int decided = decision == decision;
+    if (i > HORIZON) return fail("the filter is made for shorter tracks: export it for this log, which", "goes on", row);
     if (decided && !(decision == floor(decision) && decision >= 0.0 && decision < TYPES))
         return fail("the number of an emitter type is not", "the decision", row);
     if (decided && apart != apart) return fail("no bearings are beside", "the decision", row);
