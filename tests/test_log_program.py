@@ -73,7 +73,10 @@ def log_of(id):
         )
         names = "East", "north"
     elif id == ESM:
-        east, north = np.where(time % 4.0 == 0.0, g.integers(0, 3, COUNT), np.nan), g.normal(0.0, 200.0, COUNT)
+        east, north = (
+            np.where(time % 4.0 == 0.0, g.integers(0, 3, COUNT), np.nan),
+            g.normal(0.0, 200.0, COUNT),
+        )
         north[np.isnan(east)] = np.nan
         names = "type", "apart"
     else:
@@ -88,7 +91,9 @@ def log_of(id):
     table = pandas.DataFrame(columns).assign(drive="a", note="x")
     if id == LOOSE:
         drift = np.cumsum(g.normal(0.0, 0.1, (2, COUNT)), axis=1)
-        return table.assign(**{"ins east": 900.0 + 12.0 * time + drift[0], "ins north": 300.0 - 7.0 * time + drift[1]})
+        return table.assign(
+            **{"ins east": 900.0 + 12.0 * time + drift[0], "ins north": 300.0 - 7.0 * time + drift[1]}
+        )
     if id == ESM:
         return table.assign(distance=(9000.0 - 4.0 * time + g.normal(0.0, 40.0, COUNT)).round(1))
     return table.drop(index=range(20, 24)).reset_index(drop=True)
@@ -440,7 +445,9 @@ def test_a_track_that_is_longer_than_the_tables_of_a_filter_is_refused(programs)
 def test_an_advised_filter_has_the_parameters_of_its_log_and_none_of_a_scenario(programs):
     problem = problem_of(ESM)
     request = request_export(problem, programs[ESM][1])
-    expected = read_recording(programs[ESM][0] / "first.csv", ESM, rename=RENAMES[ESM]).scenario(problem.task, {})
+    expected = read_recording(programs[ESM][0] / "first.csv", ESM, rename=RENAMES[ESM]).scenario(
+        problem.task, {}
+    )
     assert request.scenario.parameters == expected.parameters
     assert request_export(problem, programs[ESM][1], "paper").scenario == "paper"
     running = filtergym.online(ESM, programs[ESM][1])
