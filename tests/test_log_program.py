@@ -61,8 +61,8 @@ RENAMES = {
 
 
 def log_of(id):
-    """Cells of a log as numbers and words: times, two measured numbers, an accuracy, what is ignored, and perhaps more; a
-    gap where there may be one.
+    """Cells of a log as numbers and words: times, two measured numbers, an accuracy, what is ignored, and perhaps more;
+    a gap where there may be one.
     """
     g = np.random.default_rng(5)
     time = np.arange(COUNT, dtype=float).round(3)
@@ -273,7 +273,7 @@ def test_c_reads_every_form_of_a_log_as_an_evaluation_does(form, id, programs, t
     done = subprocess.run([place / "c" / "log", path], capture_output=True, check=False)
     assert done.stderr == b""
     found = check_rows(id, name, recording, done, COPIES.get(form, 0))
-    missed = {form: 2 * (id != ESM) for form in ("empty cells", "words for no number")}
+    missed = dict.fromkeys(("empty cells", "words for no number"), 2 * (id != ESM))
     missed["positions that repeat"] = 3 * (id == TARGET)
     assert (found["status"] == "missed").sum() == missed.get(form, 0)
 
@@ -413,7 +413,7 @@ BAD_ROWS = {
     "no deviation": (LOOSE, lambda: put_in(LOOSE, 0, accuracy=""), "accuracy has no value in row 0"),
     "a deviation of zero": (LOOSE, lambda: put_in(LOOSE, 7, accuracy=0), "standard deviation accuracy in row 7"),
     "no fix": (LOOSE, lambda: lines(log_of(LOOSE).assign(north="")), "no row has on every axis a north"),
-    "a missing row": (LOOSE, lambda: lines(log_of(LOOSE).drop(index=9)), "one interval apart, by their time: it is not"),
+    "a missing row": (LOOSE, lambda: lines(log_of(LOOSE).drop(index=9)), "one interval apart, by their time"),
     "no range": (ESM, lambda: put_in(ESM, 5, distance=""), "distance has no value in row 5"),
     "a missing scan": (ESM, lambda: lines(log_of(ESM).drop(index=9)), "one interval apart, by their time: it is not"),
     "no whole number": (ESM, lambda: put_in(ESM, 8, type=1.5), "number of an emitter type"),
@@ -439,7 +439,7 @@ def test_a_track_that_is_longer_than_the_tables_of_a_filter_is_refused(programs)
     longer = pandas.concat([table, table.iloc[-1:].assign(t=float(COUNT))])
     done = run(programs[ESM][0] / "c" / "log", lines(longer))
     assert done.returncode == 2
-    assert b"export it for this log" in done.stderr
+    assert b"advise on this log" in done.stderr
 
 
 def test_an_advised_filter_has_the_parameters_of_its_log_and_none_of_a_scenario(programs):

@@ -1,7 +1,7 @@
 """Programs of C that read a log as filtergym reads it, with fields for what differs from filter to filter.
 
-A program is :data:`LOG`, :data:`READER` and a function ``follow``. The reader takes the whole file into rows, sorts them
-into tracks, leaves out what comes twice, and calls ``follow`` for each track, which is :data:`PLOTS`,
+A program is :data:`LOG`, :data:`READER` and a function ``follow``. The reader takes the whole file into rows, sorts
+them into tracks, leaves out what comes twice, and calls ``follow`` for each track, which is :data:`PLOTS`,
 :data:`PLAIN_ROWS` or :data:`REGULAR_ROWS`. Their numbers and names are from :mod:`.c_log`.
 """
 
@@ -391,7 +391,7 @@ static int read_values(const Row *row, long i, double *found) {{
     const double decision = {decision}, looked = {looked}, stated = {bearing_difference};
     const double apart = stated == stated ? stated : {radar_bearing} - {esm_bearing};
     const int decided = decision == decision;
-    if (i > HORIZON) return fail("the filter is made for shorter tracks: export it for this log, which", "goes on", row);
+    if (i > HORIZON) return fail("the filter is made for shorter tracks: advise on this log, which", "goes on", row);
     if (decided && !(decision == floor(decision) && decision >= 0.0 && decision < TYPES))
         return fail("the number of an emitter type is not", "the decision", row);
     if (decided && apart != apart) return fail("no bearings are beside", "the decision", row);
