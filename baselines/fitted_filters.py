@@ -140,7 +140,9 @@ def write_advised(
             "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
             if found is not None and OUTLIER_SHARE in found.values
             else None,
-            "start": "from the first two measurements: the second, and their difference over the time between them",
+            "start": "from the first row"
+            if log_format and log_format.regular_rows
+            else "from the first two measurements: the second, and their difference over the time between them",
             "ranges": {
                 "measurements": int(recording.rows.sum()),
                 "seconds": round_value(float(numpy.nanmax(seconds))),
