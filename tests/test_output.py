@@ -47,7 +47,7 @@ def dataset():
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.evaluation.running.summary.run_experiment", lambda *_, **__: dataset)
+    monkeypatch.setattr("filtergym.evaluation.running.summary.run_competitors", lambda *_, **__: dataset)
     monkeypatch.setattr(
         "filtergym.commands.evaluation.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
     )

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import tracemalloc
 import urllib.error
 import urllib.request
 import weakref
@@ -107,6 +108,49 @@ def test_summaries_tell_what_the_evaluation_does(env_id, short):
         np.testing.assert_array_equal(result.track[name].values, whole.track[name].values, err_msg=name)
 
 
+@pytest.mark.parametrize("kind", ["one episode", "one track", "several tracks", "without truth"])
+def test_competitors_in_turn_tell_what_all_at_once_do(kind, two):
+    """Of flights, recordings and one episode there is no piece of some episodes: a competitor runs over all."""
+    names, scenario = ["imm", "adaptive", "kalman-smoother"], None
+    if kind != "one episode":
+        scenario = filtergym.record(ENV, episodes=3 if kind == "several tracks" else 1, horizon=60)
+    if kind == "without truth":
+        scenario = replace(scenario, truth=None)
+    asked = requests(ENV, names, scenario=scenario, episodes=1, drawn_episodes=1, keywords={"horizon": 60})
+    whole = run_requests(asked, Workers(), whole=True)
+    assert len({r.scenario for r in whole.flights}) == {"one track": 1, "several tracks": 3}.get(kind, 0)
+    assert set(whole.differences) == (set() if kind == "one episode" else {"imm", "adaptive"})
+    for workers in (Workers(), two) if kind == "several tracks" else (Workers(),):
+        found = run_requests(asked, workers)
+        assert [name for name in found.dataset if not name.startswith("drawn_")] == []
+        assert found.records == whole.records == tidy_records(whole.dataset)
+        assert found.flights == whole.flights
+        assert found.differences == whole.differences
+        assert found.dataset.attrs == whole.dataset.attrs
+        assert found.costs.keys() == whole.costs.keys()
+        assert set(found.curves.variables) == set(whole.curves.variables)
+        for name, expected in whole.curves.variables.items():
+            np.testing.assert_array_equal(found.curves[name].values, expected.values, err_msg=name)
+
+
+def test_memory_does_not_grow_with_measurements_times_competitors(monkeypatch):
+    monkeypatch.setattr("filtergym.evaluation.statistics.time_blocks.UNITS", 64)
+    monkeypatch.setattr(summary, "DRAWN_TIMES", 64)
+    recording, names = (
+        filtergym.record(ENV, episodes=1, horizon=10_000),
+        ["imm", "fixed-low", "adaptive", "fixed-best"],
+    )
+    asked = [one._replace(curves=False) for one in requests(ENV, names, scenario=recording, episodes=1)]
+    run_requests(asked, Workers())  # compiles
+    peaks = []
+    for number in (1, 4):
+        tracemalloc.start()
+        run_requests(asked[:number], Workers())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+
+
 def numbers_in(part):
     """How many numbers are kept of some episodes."""
     sums, samples = part.reduction.sums.values(), part.reduction.samples.values()
@@ -167,7 +211,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
     in_any = dict(summaries(asked, Workers()))
     first, other = ([found[i] for i in range(3)] for found in (in_turn, in_any))
-    (_, records, curves, _), again = combine_summaries(first), combine_summaries(other)
+    (_, records, curves, *_), again = combine_summaries(first), combine_summaries(other)
     assert records == again.records
     assert curves.identical(again.curves)
     # Sums of blocks are rounded otherwise than those of all episodes at once.

@@ -1,7 +1,6 @@
 """Intervals of one episode over time: against naive code, and for what they promise."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +8,8 @@ from scipy.signal import lfilter
 
 from filtergym import evaluate, tidy_records
 from filtergym.evaluation.running.metrics import bootstrap_of
-from filtergym.evaluation.statistics.time_blocks import BlockBootstrap, block_length
+from filtergym.evaluation.statistics import time_blocks
+from filtergym.evaluation.statistics.time_blocks import FEWEST_BLOCKS, BlockBootstrap, TimeUnits, block_length
 from filtergym.evaluation.storage.dataset import groups_of
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -18,6 +18,13 @@ ENV = "filtergym/ManeuveringTarget-v0"
 def autoregressive(generator, correlation, number):
     """Errors of a filter whose errors are correlated in time."""
     return lfilter([1.0], [1.0, -correlation], generator.normal(size=number + 300))[300:]
+
+
+def over_time(series, *settings):
+    """The resampling of one series, and what its units contribute to the mean."""
+    units = TimeUnits(len(series))
+    sums = units.sums_of_present(series[None])
+    return BlockBootstrap(units, [sums], *settings), sums
 
 
 def naive_length(series):
@@ -45,41 +52,49 @@ def test_blocks_are_as_long_as_the_rule_says(correlation):
 
 def test_resamples_are_blocks_that_go_on_at_the_start():
     generator = np.random.default_rng(0)
-    series = autoregressive(generator, 0.8, 400)
-    series[generator.random(400) < 0.1] = np.nan
-    bootstrap = BlockBootstrap(series[None], 30, seed=7)
-    assert bootstrap.unit == 1
+    series = autoregressive(generator, 0.5, 800)
+    series[generator.random(800) < 0.1] = np.nan
+    bootstrap, sums = over_time(series, 30, 7)
     assert bootstrap.block > 3
-    begins = np.random.default_rng(7).integers(400, size=(30, math.ceil(400 / bootstrap.block)))
+    begins = np.random.default_rng(7).integers(800, size=(30, math.ceil(800 / bootstrap.block)))
     wrapped = np.concatenate([series, series])
     expected = [np.nanmean(np.concatenate([wrapped[i : i + bootstrap.block] for i in own])) for own in begins]
-    found = bootstrap.resample(np.array([np.nanmean(series)]), lambda b: b.sums_of_present(series[None]))
+    found = bootstrap.resample(np.array([np.nanmean(series)]), sums)
     # Sums in another order.
     np.testing.assert_allclose(found, [np.nanmean(series), *expected], rtol=1e-12, atol=1e-14)
 
 
-def test_interval_of_a_correlated_error_covers_as_often_as_it_says():
-    """The mean square of an error with AR(1): where measurements are taken for independent, a third is not covered."""
-    generator, number, correlation = np.random.default_rng(1), 1000, 0.7
-    truth, hits, independent = 1.0 / (1.0 - correlation**2), 0, 0
-    for _ in range(150):
-        squares = autoregressive(generator, correlation, number) ** 2
-        bootstrap = BlockBootstrap(squares[None], 200)
-        sums = partial(BlockBootstrap.sums_of_present, values=squares[None])
-        means = bootstrap.resample(squares.mean(keepdims=True), sums)
-        found = bootstrap.interval(means)
-        hits += found.low <= truth <= found.high
-        independent += abs(squares.mean() - truth) <= 1.96 * squares.std() / math.sqrt(number)
-    # Four standard errors of 150 trials are 7 %, and blocks of a rule cover a little less than 95 %.
-    assert 0.86 < hits / 150 <= 0.99
-    assert independent / 150 < 0.8
+CORRELATED = {
+    0.0: (1.0, 1.0, 1.0), 0.5: (0.9, 1.0, 1.0), 0.95: (0.0, 0.0, 1.0), 0.99: (0.0, 0.0, 0.0),
+}  # fmt: skip
+"""Of a process with this correlation, shares of 200, 1,000 and 10,000 measurements of which there is an interval."""
+
+
+@pytest.mark.parametrize(("correlation", "known"), CORRELATED.items())
+def test_interval_of_a_correlated_error_covers_as_often_as_it_says_or_there_is_none(correlation, known):
+    """The mean square of an error with AR(1); with intervals for all, those of 200 at 0.99 would cover a third."""
+    generator, truth, trials = np.random.default_rng(1), 1.0 / (1.0 - correlation**2), 120
+    for number, share in zip((200, 1000, 10_000), known, strict=True):
+        found = []
+        for _ in range(trials if number < 10_000 else 40):
+            squares = autoregressive(generator, correlation, number) ** 2
+            bootstrap, sums = over_time(squares, 100)
+            assert (bootstrap.blocks >= FEWEST_BLOCKS) == ("are over time" in bootstrap.sentence)
+            found.append(bootstrap.interval(bootstrap.resample(squares.mean(keepdims=True), sums)))
+        given = [one for one in found if not math.isnan(one.low)]
+        assert len(given) / len(found) == pytest.approx(share, abs=0.1)
+        # Three standard errors of 120 trials are 6 %, and blocks of a rule cover a little less than 95 %.
+        assert sum(not one.low <= truth <= one.high for one in given) / len(found) <= 0.15
 
 
 def test_a_long_episode_is_resampled_in_units():
     series = autoregressive(np.random.default_rng(2), 0.95, 9000)
-    long, short = BlockBootstrap(series[None]), BlockBootstrap(series[None, :2000])
+    long, short = TimeUnits(9000), TimeUnits(2000)
     assert (short.unit, long.unit, long.units) == (1, 5, 1800)
-    assert long.block % 5 == 0
+    bootstrap, sums = over_time(series)
+    assert bootstrap.block % 5 == 0
+    assert bootstrap.blocks == pytest.approx(9000 / bootstrap.block)
+    assert sums.shape == (1800, 2)
     values = series[None] + 3.0
     np.testing.assert_allclose(long.sums_of_present(values).sum(axis=0), [values.sum(), 9000.0], rtol=1e-12)
     within = long.sums_of_present(values, slice(12, 8000))
@@ -87,7 +102,12 @@ def test_a_long_episode_is_resampled_in_units():
     assert within[:2, 1].tolist() == [0.0, 0.0]
 
 
-def test_one_episode_has_intervals_of_what_is_a_mean_over_time_and_says_whose():
+def test_one_episode_has_intervals_of_what_is_a_mean_over_time_and_says_whose(monkeypatch):
+    few = evaluate(ENV, ["imm", "fixed-low"], episodes=1, horizon=400)
+    assert "has no intervals: it holds 12 blocks of 34 measurements" in few.attrs["notes"]
+    assert {r.low for r in tidy_records(few) if r.metric in ("rmse", "cost", "anees")} == {None}
+    assert {r.value for r in tidy_records(few) if r.metric == "best_share"} == {None}
+    monkeypatch.setattr(time_blocks, "FEWEST_BLOCKS", 10)
     dataset = evaluate(ENV, ["imm", "fixed-low"], episodes=1, horizon=400)
     several = evaluate(ENV, ["imm", "fixed-low"], episodes=2, horizon=400)
     bootstrap = bootstrap_of(dataset)

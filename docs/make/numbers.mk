@@ -60,7 +60,7 @@ tuned: $(ENVIRONMENTS:%=$(DONE)/tune-%)
 trained: $(foreach environment,$(ENVIRONMENTS),$(call trained,$(environment)))
 shipped: $(shipped)
 evaluated: $(ENVIRONMENTS:%=$(DONE)/seeds-%) $(DONE)/benchmark $(DONE)/coverage \
-  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
+  $(DONE)/flights $(DONE)/plain $(ENVIRONMENTS:%=$(DONE)/harm-%) $(ENVIRONMENTS:%=$(DONE)/stress-%) $(DONE)/exported $(DONE)/budgets $(DONE)/pairs $(DONE)/students $(DONE)/drive $(DONE)/online $(DONE)/own_logs $(DONE)/sensing $(DONE)/loop $(DONE)/cold $(PAPERS:%=$(DONE)/paper-%)
 
 # --- values: what is shipped tells the commands that made it
 
@@ -180,6 +180,11 @@ $(DONE)/online: $(DONE)/ship-ManeuveringTarget
 $(DONE)/own_logs:
 	$(BIN)/python benchmarks/own_logs.py > build/own_logs.txt
 	$(table) build/own_logs.txt --name own_logs --command "python benchmarks/own_logs.py"
+	$(finish)
+
+$(DONE)/loop:
+	$(BIN)/python benchmarks/estimation_in_the_loop.py fixed trained > build/loop.txt
+	$(table) build/loop.txt --name loop_fixed --name loop_trained --command "python benchmarks/estimation_in_the_loop.py fixed trained"
 	$(finish)
 
 $(DONE)/sensing:

@@ -90,6 +90,11 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
     return stack_curves(found, dataset, bootstrap.episodes)
 
 
+def spread(count: int, most: int) -> numpy.ndarray:
+    """Return at most ``most`` indices of ``count``, spread evenly, with the first and the last."""
+    return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
 class CompetitorCurves(NamedTuple):
     """The curves of one competitor, and the names of its actions and gains."""
 
@@ -99,6 +104,12 @@ class CompetitorCurves(NamedTuple):
     costs: numpy.ndarray | None = None
     """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
     None of bounds, and without truth."""
+
+    def at_measurements(self, chosen: numpy.ndarray, times: int) -> "CompetitorCurves":
+        """Return them at the measurements of these indices, of so many."""
+        over_time = {key for key, own in self.curves.items() if own.shape[-1:] == (times,)}
+        fewer = {key: own[..., chosen] if key in over_time else own for key, own in self.curves.items()}
+        return self._replace(curves=fewer)
 
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:

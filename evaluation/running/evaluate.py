@@ -29,7 +29,7 @@ from ..statistics.innovations import with_innovations
 from ..statistics.time_blocks import BlockBootstrap
 from ..storage.dataset import FAULTS, keywords_as_text, whole_number
 from .kept import Kept, limits
-from .metrics import bootstrap_of
+from .metrics import bootstrap_of, units_of
 from .named_axes import StackedArrays, recording_coords, with_named_axes
 from .parallel import Workers, check_workers
 from .rollout import ProcessorTime, Progress, measure_time, run_episodes
@@ -198,6 +198,19 @@ def run_experiment(
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
             the control.
     """
+    dataset = run_competitors(experiment, competitors, progress, workers)
+    if units_of(dataset) is not None and isinstance(bootstrap := bootstrap_of(dataset, 0), BlockBootstrap):
+        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
+    return dataset
+
+
+def run_competitors(
+    experiment: Experiment,
+    competitors: Mapping[str, Any],
+    progress: Progress | None = None,
+    workers: Workers | None = None,
+) -> "xarray.Dataset":
+    """Return the evaluation of :func:`run_experiment`, without its note on intervals."""
     if progress is not None and not callable(progress):
         raise ValueError(f"progress is a function of the measurements done, got {quote_shortened(progress)}")
     plan = plan_of(experiment, competitors)
@@ -215,8 +228,6 @@ def run_experiment(
     for i, found in workers.run(run_piece, pieces, sizes, progress):
         kept.write(pieces[i].name, pieces[i].part, found)
     dataset = plan.dataset(kept, plan.seeds)
-    if isinstance(bootstrap := bootstrap_of(dataset), BlockBootstrap):
-        dataset.attrs["notes"] = "\n".join(filter(None, [dataset.attrs["notes"], bootstrap.sentence]))
     if experiment.timed:
         return with_times(dataset, [plan.time(name) for name in competitors])
     return dataset

@@ -16,8 +16,8 @@ from ..statistics.bootstrap import RESAMPLES, Bootstrap, IntervalEstimate, ratio
 from ..statistics.cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
 from ..statistics.cause_split import VARIABLE as CAUSES
 from ..statistics.predictions import correlation, stretch_interval
-from ..statistics.statistic import ALL, Function, Key, Statistic, identity, reduce_run
-from ..statistics.time_blocks import FEWEST, BlockBootstrap
+from ..statistics.statistic import ALL, Function, Key, Reduction, Statistic, identity, reduce_run
+from ..statistics.time_blocks import FEWEST, BlockBootstrap, TimeUnits
 from ..storage.dataset import (
     Losses,
     count_losses,
@@ -97,18 +97,103 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
 
 def bootstrap_of_episodes(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
-    clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
-    return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
+    clusters = tuple(dataset["flight"].values.tolist()) if "flight" in dataset.coords else None
+    return resampling(dataset.sizes["episode"], resamples, clusters)
 
 
-def bootstrap_of(dataset: "xarray.Dataset") -> Bootstrap:
-    """Resampling of the episodes of an evaluation; of one episode of blocks of time, whose length follows from the
-    costs of all competitors, without truth from their log-likelihoods.
+@functools.lru_cache(maxsize=2)
+def resampling(
+    episodes: int, resamples: int = RESAMPLES, clusters: tuple[str, ...] | None = None
+) -> Bootstrap:
+    """Return the resampling of so many episodes, which takes a while where they are many."""
+    return Bootstrap(episodes, resamples, clusters=clusters)
+
+
+def units_of(dataset: "xarray.Dataset") -> TimeUnits | None:
+    """Units of time that are resampled of one long episode; None of several, or of a short one."""
+    if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST:
+        return TimeUnits(dataset.sizes["time"])
+    return None
+
+
+def sums_over_time(run: "xarray.Dataset", units: TimeUnits) -> numpy.ndarray | None:
+    """Sums in units of time of what the length of blocks follows from, ``(units, 2)``: of the cost, without truth of
+    the log-likelihood; None where neither is known.
     """
-    known = [name for name in ("cost", "log_likelihood") if name in dataset]
-    if dataset.sizes["episode"] == 1 and dataset.sizes["time"] >= FEWEST and known:
-        return BlockBootstrap(dataset[known[0]].values[:, 0])
-    return bootstrap_of_episodes(dataset)
+    known = [name for name in ("cost", "log_likelihood") if name in run]
+    return units.sums_of_present(run[known[0]].values) if known else None
+
+
+def bootstrap_over_time(
+    units: TimeUnits, series: Sequence[numpy.ndarray | None], resamples: int = RESAMPLES
+) -> Bootstrap:
+    """Resampling of one episode, whose blocks are as long as the ``series`` of all competitors need."""
+    known = [one for one in series if one is not None]
+    return BlockBootstrap(units, known, resamples) if known else Bootstrap(1, resamples)
+
+
+def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
+    """Resampling of the episodes of an evaluation; of one episode of blocks of time."""
+    if (units := units_of(dataset)) is None:
+        return bootstrap_of_episodes(dataset, resamples)
+    runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
+    return bootstrap_over_time(units, [sums_over_time(run, units) for run in runs], resamples)
+
+
+class Reduced(NamedTuple):
+    """What records need of one competitor; of one episode no more than units of time."""
+
+    reduction: Reduction
+    units: TimeUnits | None
+    """Of one long episode."""
+    series: numpy.ndarray | None
+    """As of :func:`sums_over_time`."""
+    predictions: list[Measure]
+    run: "xarray.Dataset"
+    """Its part of an evaluation, of whose variables none is needed."""
+
+    def without_variables(self) -> "Reduced":
+        """Return it without the variables of the evaluation, and at its first measurement."""
+        run = self.run.drop_vars(list(self.run.data_vars))
+        return self._replace(run=run.isel(time=slice(0, 1)).copy(deep=True))
+
+
+def reduce_competitor(run: "xarray.Dataset", metrics: OwnMetrics | None = None) -> Reduced:
+    """Reduce one competitor's part of an evaluation to what its records need; ``metrics`` not of recordings."""
+    # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
+    own = None if run.attrs.get("recorded") else metrics
+    declare = functools.partial(record_statistics, episodes=run.sizes["episode"], metrics=own)
+    units = units_of(run)
+    series = None if units is None else sums_over_time(run, units)
+    reduction = reduce_run(run, declare, units or bootstrap_of_episodes(run))
+    return Reduced(reduction, units, series, list(prediction_measures(run)), run)
+
+
+def bootstrap_of_reduced(reduced: Sequence[Reduced], evaluation: "xarray.Dataset") -> Bootstrap:
+    """Resampling of an evaluation that was reduced, as of :func:`bootstrap_of`."""
+    if (units := reduced[0].units) is None:
+        return bootstrap_of_episodes(evaluation)
+    return bootstrap_over_time(units, [one.series for one in reduced])
+
+
+def records_of_reduced(
+    reduced: Sequence[Reduced], evaluation: "xarray.Dataset", metrics: OwnMetrics | None = None
+) -> list[Record]:
+    """Return every record of an evaluation.
+
+    Args:
+        reduced: all competitors, from :func:`reduce_competitor`.
+        evaluation: whose coordinates and attributes say of what.
+        metrics: as of :func:`reduce_competitor`.
+    """
+    own = None if evaluation.attrs.get("recorded") else metrics
+    bootstrap = bootstrap_of_reduced(reduced, evaluation)
+    blocks = bootstrap if isinstance(bootstrap, BlockBootstrap) else None
+    contenders = []
+    for one in reduced:
+        contender = contender_of(one.reduction.results(blocks), one.run, bootstrap, own)
+        contenders.append(contender._replace(measures=[*contender.measures, *one.predictions]))
+    return records_of(contenders, evaluation, bootstrap)
 
 
 def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
@@ -200,9 +285,9 @@ def _mean_of_present(
     return Statistic(key, sums, ratio, optional=True, of_units=_units(values, times))
 
 
-def _units(values: numpy.ndarray, times: slice) -> Callable[[BlockBootstrap], numpy.ndarray]:
+def _units(values: numpy.ndarray, times: slice) -> Callable[[TimeUnits], numpy.ndarray]:
     """Return what sums up values of one episode, ``(1, time)``, in units of time."""
-    return functools.partial(BlockBootstrap.sums_of_present, values=values, times=times)
+    return functools.partial(TimeUnits.sums_of_present, values=values, times=times)
 
 
 def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
@@ -350,7 +435,10 @@ class _Against:
         own_logs = numpy.array([self.logs[name] for name in self.ranked])
         places = numpy.argmax(own_logs <= own_logs.min(axis=0) + NEGLIGIBLE, axis=0) if self.ranked else []
         self.best = self.ranked[places[0]] if self.ranked else ""
-        self.chosen = {name: numpy.mean(places[1:] == i) for i, name in enumerate(self.ranked)}
+        others = places[1:]
+        self.chosen = {
+            name: numpy.mean(others == i) if len(others) else math.nan for i, name in enumerate(self.ranked)
+        }
 
     def _columns(self, part: slice) -> numpy.ndarray:
         """Numbers of some episodes of which means are needed, ``(some, columns)``: of every competitor its cost, its
@@ -452,15 +540,18 @@ def flight_records(dataset: "xarray.Dataset") -> list[Record]:
     Args:
         dataset: from an evaluation of a set of flights.
     """
-    records = []
+    parts = parts_by_flight(dataset)
+    return [r for part in parts for r in tidy_records(part) if r.metric in PER_FLIGHT]
+
+
+def parts_by_flight(dataset: "xarray.Dataset") -> "Iterator[xarray.Dataset]":
+    """Yield the evaluation of each flight, whose scenario has its name, in the order of the names."""
     for flight in sorted(set(dataset["flight"].values.tolist())):
         own = dataset["flight"].values == flight
         part = dataset if own.all() else dataset.isel(episode=numpy.flatnonzero(own))  # which copies them
         part = part.isel(time=slice(int(part["length"].max())))
         windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
-        part = with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
-        records += [r for r in tidy_records(part) if r.metric in PER_FLIGHT]
-    return records
+        yield with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
 
 
 PER_FLIGHT = ("rmse", "cost", "geometric_cost", "geometric_cost_difference", "relative_cost_difference")
@@ -496,16 +587,8 @@ def tidy_records(dataset: "xarray.Dataset", metrics: OwnMetrics | None = None) -
         dataset: from an evaluation.
         metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
-    bootstrap = bootstrap_of(dataset)
-    # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
-    own = None if dataset.attrs.get("recorded") else metrics
-    declare = functools.partial(record_statistics, episodes=bootstrap.episodes, metrics=own)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
-    contenders = []
-    for run in runs:
-        contender = contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own)
-        contenders.append(contender._replace(measures=[*contender.measures, *prediction_measures(run)]))
-    return records_of(contenders, dataset, bootstrap)
+    return records_of_reduced([reduce_competitor(run, metrics) for run in runs], dataset, metrics)
 
 
 def contender_of(

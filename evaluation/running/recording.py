@@ -1,6 +1,6 @@
 """Recordings made from the simulation: what the sensors say in episodes of a scenario, with the truth."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy
@@ -12,10 +12,11 @@ from ...envs.data.foreign_files import MOST_NUMBERS
 from ...envs.data.recorded_world import measure_once
 from ...envs.data.recording import Recording, differing
 from ...envs.engine.backend import make_model
+from ...envs.engine.compiled import can_step
 from ...envs.engine.episode_noise import uniforms_of_seeds
 from ...envs.engine.scenario_choice import find_scenario, make_task, read_files
 from .evaluate import Experiment
-from .rollout import Progress, start_lanes
+from .rollout import AT_ONCE, Progress, start_lanes
 from .seeds import episode_seeds
 
 CHUNK = 256
@@ -112,27 +113,42 @@ def _record(
     """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
     series: dict[str, list[numpy.ndarray]] = {}
-    count = len(seeds)
-
-    def first(values: numpy.ndarray) -> numpy.ndarray:
-        return numpy.moveaxis(values[..., :count], -1, 0).copy()
+    count, interval = len(seeds), model.task.decision_interval
 
     def keep_start(episode: Episode) -> None:
-        initial.update({name: first(values) for name, values in named_arrays(episode.measurement)})
+        initial.update(
+            {name: _episodes_first(values, count) for name, values in named_arrays(episode.measurement)}
+        )
 
-    def keep(episode: Episode) -> None:
-        for name, values in named_arrays(episode.measurement):
-            series.setdefault(name, []).append(first(values))
-        series.setdefault("truth", []).append(first(model.task.world.state(episode.truth)))
+    def keep(found: Mapping[str, numpy.ndarray]) -> None:
+        for name, values in found.items():
+            series.setdefault(name, []).append(_episodes_first(values, count))
 
-    lanes, nothing = start_lanes(model, seeds, keep_start), numpy.zeros(count, dtype=numpy.int64)
-    for _ in range(lanes.decisions_per_episode):
-        for episode, _ in lanes.decide(nothing):
-            keep(episode)
-        tick(count * model.task.decision_interval)
-    keep(lanes.state)
+    is_compiled = can_step(model, _measured)
+    lanes = start_lanes(model, seeds, keep_start, _measured if is_compiled else None)
+    nothing, decisions = numpy.zeros(count, dtype=numpy.int64), lanes.decisions_per_episode
+    most = max(1, AT_ONCE // (lanes.width * interval)) if is_compiled else 1
+    for first in range(0, decisions, most):
+        some = min(most, decisions - first)
+        if is_compiled:
+            keep(lanes.run(_measured, None, some * interval)[0])
+        else:
+            for found, _ in lanes.decide(nothing, _measured):
+                keep({name: values[None] for name, values in found.items()})
+        tick(count * some * interval)
+    keep({name: values[None] for name, values in _measured(model, lanes.state).items()})
     uniforms = uniforms_of_seeds(seeds, model.task.noise)
     initial["length"] = model.task.lengths(uniforms)
     if model.task.flights:
         initial["flight"] = model.task.flight_of(uniforms)
-    return {name: numpy.stack(values, axis=1) for name, values in series.items()}, initial
+    return {name: numpy.concatenate(values, axis=1) for name, values in series.items()}, initial
+
+
+def _measured(model: Model, episode: Episode) -> dict[str, Any]:
+    """Report what was measured, and the truth."""
+    return {**dict(named_arrays(episode.measurement)), "truth": model.task.world.state(episode.truth)}
+
+
+def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
+    """Return arrays ``(..., N)`` as ``(episodes, ...)``, without the padding."""
+    return numpy.moveaxis(values[..., :count], -1, 0).copy()

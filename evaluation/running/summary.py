@@ -12,13 +12,31 @@ import numpy
 import xarray
 
 from ...envs.engine.catalogue import short_name
-from ..statistics.bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
+from ..statistics.bootstrap import BLOCK, IntervalEstimate, block_of
+from ..statistics.predictions import LikelihoodSums, likelihood_differences, likelihood_sums
 from ..statistics.statistic import Reduction, Statistic, reduce_run
+from ..statistics.time_blocks import BlockBootstrap
+from ..storage.dataset import Losses, count_losses, losses_in
 from ..storage.store import Store, Work
-from .curves import CompetitorCurves, competitor_curves, curve_statistics, curves_of, stack_curves
-from .evaluate import Experiment, check_sendable, plan_of, run_experiment, run_piece
+from .curves import CompetitorCurves, competitor_curves, curve_statistics, spread, stack_curves
+from .evaluate import Experiment, check_sendable, plan_of, run_competitors, run_piece
 from .kept import DRAWN_PREFIX
-from .metrics import Contender, Record, contender_of, mean_cost, record_statistics, records_of, tidy_records
+from .metrics import (
+    PER_FLIGHT,
+    Contender,
+    Record,
+    Reduced,
+    bootstrap_of_episodes,
+    bootstrap_of_reduced,
+    contender_of,
+    mean_over_time,
+    parts_by_flight,
+    record_statistics,
+    records_of,
+    records_of_reduced,
+    reduce_competitor,
+    resampling,
+)
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
@@ -27,6 +45,10 @@ from .times import COORDINATES, with_times
 
 TOGETHER = 4 * BLOCK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+DRAWN_TIMES = 20_000
+"""Measurements of an episode that pictures show, at most."""
+MOST_RECORDINGS = 40
+"""Episodes of a recording that are reported one by one."""
 BATCH = 600_000
 """Measurements that another process is given at once, where several pieces of work share a model: about a second. A
 longer batch would leave the others idle at the end, and lose more where the work is interrupted."""
@@ -97,6 +119,10 @@ class Evaluation(NamedTuple):
     """See :func:`.curves.curves_of`; None where they were not requested of every competitor."""
     costs: Mapping[str, numpy.ndarray]
     """Mean cost of every episode by name, ``(episodes,)``, of all whose cost is known."""
+    flights: Sequence[Record] = ()
+    """Of every flight, where they are reported one by one."""
+    differences: Mapping[str, IntervalEstimate] = {}
+    """Of a recording, by name, the log-likelihood per measurement less that of the best."""
 
     @property
     def has_truth(self) -> bool:
@@ -132,16 +158,10 @@ class Part(NamedTuple):
 
     def summary(self, asked: EvaluationRequest) -> Summary:
         """Return the summary of all episodes of what was asked for."""
-        results, bootstrap = self.reduction.results(), _resampling(asked.episodes)
+        results, bootstrap = self.reduction.results(), resampling(asked.episodes)
         contender = contender_of(results, self.head, bootstrap, asked.metrics)
         curves = competitor_curves(results) if asked.curves else None
         return Summary(contender, curves, self.head, asked.episodes)
-
-
-@functools.lru_cache(maxsize=1)
-def _resampling(episodes: int) -> Bootstrap:
-    """Return the resampling of so many episodes, which takes a while where they are many."""
-    return Bootstrap(episodes, RESAMPLES)
 
 
 def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
@@ -178,7 +198,7 @@ def reduce_episodes(
     plan = plan_of(asked.experiment, {asked.name: asked.maker}, asked.first, asked.end)
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
-    bootstrap = _resampling(asked.episodes)
+    bootstrap = resampling(asked.episodes)
     block = block_of(plan.models[asked.name].task.horizon)
 
     def part(first: int) -> Part:
@@ -283,20 +303,105 @@ def _batches(pieces: Sequence[tuple[int, EvaluationRequest]]) -> list[list[tuple
 @one_thread()
 def combine_summaries(found: Sequence[Summary]) -> Evaluation:
     """Return the evaluation of which these are the summaries of all competitors."""
-    evaluation = _heads_together(found)
+    evaluation = _heads_together(
+        [one.head for one in found], [one.contender.losses for one in found], found[0].episodes
+    )
     costs = {one.contender.name: one.contender.costs for one in found if one.contender.costs is not None}
-    records = records_of([one.contender for one in found], evaluation, _resampling(found[0].episodes))
+    records = records_of([one.contender for one in found], evaluation, resampling(found[0].episodes))
     each = [one.curves for one in found if one.curves is not None]
     if len(each) < len(found):
         return Evaluation(evaluation, records, None, costs)
-    controls = [one.contender.control for one in found]
-    if len({control for control, own in zip(controls, each, strict=True) if own.actions}) > 1:
-        each = [
-            own._replace(actions=[f"{control}: {part}" for part in own.actions])
-            for control, own in zip(controls, each, strict=True)
-        ]
+    each = _actions_by_control(each, [one.contender.control for one in found])
     curves = stack_curves(each, evaluation, found[0].episodes)
     return Evaluation(evaluation, records, curves, costs)
+
+
+def _actions_by_control(
+    curves: Sequence[CompetitorCurves], controls: Sequence[str]
+) -> list[CompetitorCurves]:
+    """Name the actions of competitors that steer by several controls by these, too."""
+    if len({control for control, own in zip(controls, curves, strict=True) if own.actions}) < 2:
+        return list(curves)
+    return [
+        own._replace(actions=[f"{control}: {part}" for part in own.actions])
+        for control, own in zip(controls, curves, strict=True)
+    ]
+
+
+class Alone(NamedTuple):
+    """What remains of one competitor over flights, a recording or one episode, which is resampled with the others."""
+
+    reduced: Reduced
+    flights: list[Reduced]
+    likelihood: LikelihoodSums | None
+    costs: numpy.ndarray | None
+    """Mean of every episode; None where none is known."""
+    losses: Losses | None
+    curves: CompetitorCurves | None
+    head: xarray.Dataset
+    """Its part of the evaluation, without what was kept of every episode, at ``DRAWN_TIMES`` measurements at most."""
+
+
+def reduce_alone(run: xarray.Dataset, asked: EvaluationRequest) -> Alone:
+    """Reduce one competitor's part of an evaluation to what remains of it."""
+    episodes, times = run.sizes["episode"], run.sizes["time"]
+    flights, recorded = parts_by_flight(run) if "flight" in run.coords else iter(()), run.attrs["recorded"]
+    if not run.attrs["truth"] or (recorded and episodes > MOST_RECORDINGS):
+        flights = iter(())
+    costs = mean_over_time(run, run["cost"].values) if "cost" in run else None
+    if costs is not None and numpy.isnan(costs).all():  # of bounds there is none
+        costs = None
+    chosen, curves = spread(times, DRAWN_TIMES), None
+    if asked.curves:
+        declare = functools.partial(curve_statistics, episodes=episodes)
+        results = reduce_run(run, declare, bootstrap_of_episodes(run)).results()
+        curves = competitor_curves(results).at_measurements(chosen, times)
+    others = [name for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
+    return Alone(
+        reduce_competitor(run, asked.metrics).without_variables(),
+        [reduce_competitor(part, asked.metrics).without_variables() for part in flights],
+        likelihood_sums(run) if recorded else None,
+        costs,
+        count_losses(losses_in(run)),
+        curves,
+        run.drop_vars(others).isel(time=chosen),
+    )
+
+
+def _run_alone(asked: EvaluationRequest, tick: Progress) -> Alone:
+    found = run_competitors(asked.experiment, {asked.name: asked.maker}, tick)
+    return reduce_alone(found.isel(policy=0), asked)
+
+
+@one_thread()
+def _combine_alone(
+    found: Mapping[str, Alone],
+    curves: Sequence[CompetitorCurves],
+    evaluation: xarray.Dataset,
+    metrics: OwnMetrics | None,
+) -> Evaluation:
+    """Return the evaluation of all competitors over flights, a recording or one episode."""
+    reduced = [one.reduced for one in found.values()]
+    bootstrap = bootstrap_of_reduced(reduced, evaluation)
+    if isinstance(bootstrap, BlockBootstrap):
+        notes = filter(None, [evaluation.attrs["notes"], bootstrap.sentence])
+        evaluation = evaluation.assign_attrs(notes="\n".join(notes))
+    flights = [
+        record
+        for own in zip(*(one.flights for one in found.values()), strict=True)
+        for record in records_of_reduced(own, own[0].run, metrics)
+        if record.metric in PER_FLIGHT
+    ]
+    shown = evaluation.drop_vars(list(evaluation.data_vars))
+    shown = shown.isel(time=spread(shown.sizes["time"], DRAWN_TIMES))
+    return Evaluation(
+        evaluation,
+        records_of_reduced(reduced, evaluation, metrics),
+        stack_curves(curves, shown, evaluation.sizes["episode"]) if curves else None,
+        {name: one.costs for name, one in found.items() if one.costs is not None},
+        flights,
+        likelihood_differences({n: one.likelihood for n, one in found.items() if one.likelihood is not None}),
+    )
 
 
 def run_requests(
@@ -313,31 +418,41 @@ def run_requests(
         workers: share the work.
         progress: called with the number of measurements done.
         store: as of :func:`summaries`.
-        whole: keep every number of every episode; flights and recordings have no summary.
+        whole: keep every number of every episode.
 
     Raises:
         ValueError: as :func:`summaries` and :func:`.evaluate.run_experiment`.
     """
-    first = asked[0]
-    if not whole and first.episodes > 1:
+    first, names = asked[0], [one.name for one in asked]
+    if whole:
+        makers = {one.name: one.maker for one in asked}
+        evaluation = run_competitors(first.experiment, makers, progress, workers)
+        remains = [reduce_alone(evaluation.sel(policy=one.name), one) for one in asked]
+        curves = [one.curves for one in remains if one.curves is not None]
+    elif first.episodes > 1 and not first.experiment.make_task().flights:
         found = dict(summaries(asked, workers, progress, store))
         return combine_summaries([found[i] for i in range(len(found))])
-    dataset = run_experiment(first.experiment, {one.name: one.maker for one in asked}, progress, workers)
-    costs = {}
-    for name in dataset["policy"].values.tolist() if "cost" in dataset else ():
-        own = mean_cost(dataset, name)
-        if not numpy.isnan(own).all():  # of bounds there is none
-            costs[name] = own
-    curves = curves_of(dataset) if first.curves else None
-    return Evaluation(dataset, tidy_records(dataset, first.metrics), curves, costs)
+    else:  # one competitor after the other, of which nothing is kept that is as long as the episodes
+        if not workers.alone:
+            check_sendable(first.experiment.task, {one.name: one.maker for one in asked})
+        done = dict(workers.run(_run_alone, asked, [one.measurements for one in asked], progress))
+        remains = [done[i] for i in range(len(asked))]
+        curves = [one.curves for one in remains if one.curves is not None]
+        if curves:
+            curves = _actions_by_control(curves, [str(one.head["control"].values) for one in remains])
+        evaluation = _heads_together(
+            [one.head for one in remains], [one.losses for one in remains], remains[0].head.sizes["episode"]
+        )
+    return _combine_alone(dict(zip(names, remains, strict=True)), curves, evaluation, first.metrics)
 
 
-def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
-    heads = [one.head for one in found]
+def _heads_together(
+    heads: Sequence[xarray.Dataset], losses: Sequence[Losses | None], episodes: int
+) -> xarray.Dataset:
     notes = [heads[0].attrs["notes"]] if heads[0].attrs["notes"] else []
-    for one in found:
-        if (losses := one.contender.losses) is not None:
-            notes.append(losses.sentence(one.contender.name, one.episodes))
+    for head, lost in zip(heads, losses, strict=True):
+        if lost is not None:
+            notes.append(lost.sentence(str(head["policy"].values), episodes))
     coords: dict[str, Any] = {}
     for head in heads:
         coords |= {str(n): c.variable for n, c in head.coords.items() if n not in coords}

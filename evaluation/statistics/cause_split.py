@@ -12,7 +12,7 @@ import numpy
 
 from ...envs.contract.causes import RESERVED
 from .bootstrap import Bootstrap, IntervalEstimate, ratio
-from .time_blocks import BlockBootstrap
+from .time_blocks import TimeUnits
 
 if TYPE_CHECKING:
     import xarray
@@ -77,14 +77,14 @@ def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
 
 
 def cause_sums(
-    run: "xarray.Dataset", nees: numpy.ndarray | None, blocks: BlockBootstrap | None = None
+    run: "xarray.Dataset", nees: numpy.ndarray | None, units: TimeUnits | None = None
 ) -> numpy.ndarray:
     """Sum what is split over the measurements in which each cause holds.
 
     Args:
         run: one policy's part of some episodes.
         nees: over its dimension, ``(episodes, time)``, NaN where there is none; None where nobody says it.
-        blocks: of one episode, whose units of time stand in the place of episodes; None: episodes.
+        units: of time of one episode, which stand in the place of episodes; None: episodes.
 
     Returns:
         ``(episodes, causes, 4)``, in the order of :func:`held_causes`.
@@ -96,8 +96,8 @@ def cause_sums(
     if nees is not None:
         values[NEES] = numpy.where(judged, nees, 0.0)
     holding = (held for _, held in held_causes(run))
-    if blocks is not None:
-        values, holding = blocks.cut(values[:, 0]), (blocks.cut(held)[0] for held in holding)
+    if units is not None:
+        values, holding = units.cut(values[:, 0]), (units.cut(held)[0] for held in holding)
     return numpy.stack([numpy.einsum("set,et->es", values, held) for held in holding], axis=1, dtype=float)
 
 

@@ -4,11 +4,16 @@ Neighbouring measurements are not independent: intervals come from resampling wh
 """
 
 import math
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
 
 from .bootstrap import Bootstrap, IntervalEstimate, ratio
+
+if TYPE_CHECKING:
+    import xarray
 
 STRETCHES = 30
 """Into which measurements are cut for intervals, at most; a stretch has at least ``SHORTEST_STRETCH``."""
@@ -73,3 +78,55 @@ def interval_of_sums(
         return IntervalEstimate(float(function(sums)[0]), math.nan, math.nan)
     bootstrap = Bootstrap(len(sums))
     return bootstrap.interval(function(bootstrap.means(sums)))
+
+
+class LikelihoodSums(NamedTuple):
+    """Log-likelihoods of one competitor, added up over stretches of all measurements."""
+
+    sums: numpy.ndarray
+    counts: numpy.ndarray
+    """How many were added up in each."""
+    known: int
+    """Checksum of which measurements have one."""
+
+    @property
+    def mean(self) -> float:
+        """Of a measurement."""
+        return float(self.sums.sum() / self.counts.sum())
+
+
+def likelihood_sums(run: "xarray.Dataset") -> LikelihoodSums | None:
+    """Add up one competitor's log-likelihoods; None where it has none.
+
+    Args:
+        run: its part of an evaluation.
+    """
+    if "log_likelihood" not in run:
+        return None
+    values = run["log_likelihood"].values
+    there = numpy.isfinite(values)
+    if not there.any():
+        return None
+    number = stretches_of(numpy.ones(values.shape, dtype=bool))
+    count = int(number.max()) + 1
+    sums = numpy.bincount(number[there], values[there], minlength=count)
+    counts = numpy.bincount(number[there], minlength=count)
+    return LikelihoodSums(sums, counts, zlib.crc32(numpy.packbits(there).tobytes()))
+
+
+def likelihood_differences(found: Mapping[str, LikelihoodSums]) -> dict[str, IntervalEstimate]:
+    """Log-likelihood per measurement less that of the best, by name.
+
+    The interval is paired; there is none where both are known of different measurements.
+    """
+    if not found:
+        return {}
+    best = max(found.values(), key=lambda one: one.mean)
+    differences = {}
+    for name, one in found.items():
+        if one.known == best.known:
+            sums = numpy.stack([one.sums - best.sums, best.counts], axis=1)
+            differences[name] = interval_of_sums(sums, best.counts, ratio)
+        else:
+            differences[name] = IntervalEstimate(one.mean - best.mean, math.nan, math.nan)
+    return differences

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from .bootstrap import Bootstrap, block_of, mean_of_sums
-from .time_blocks import BlockBootstrap
+from .time_blocks import BlockBootstrap, TimeUnits
 
 if TYPE_CHECKING:
     import xarray
@@ -48,7 +48,7 @@ class Statistic(NamedTuple):
     """Number of the first episodes whose values are kept, in place of means of all; zero: means."""
     optional: bool = False
     """A block that lacks it adds nothing to its means; otherwise it is then known of no episode."""
-    of_units: Callable[[BlockBootstrap], numpy.ndarray] | None = None
+    of_units: Callable[[TimeUnits], numpy.ndarray] | None = None
     """What each unit of time contributes where one episode is resampled over time, ``(units, ...)``: as an episode
     does, or of a mean its sum and how many numbers; None: it is one number of the whole episode."""
 
@@ -62,6 +62,10 @@ class Reduction(NamedTuple):
     samples: dict[Key, list[numpy.ndarray]]
     """``(episodes, ...)``, piece by piece."""
     optional: set[Key]
+    of_units: dict[Key, numpy.ndarray]
+    """Of one episode what its units of time contribute, where a statistic can be resampled over time."""
+    known: dict[Key, Any]
+    """Of one episode statistics that cannot."""
 
     def merge(self, later: "Reduction") -> "Reduction":
         """Add the episodes that come next."""
@@ -69,17 +73,25 @@ class Reduction(NamedTuple):
         sums = {key: own for key, own in (self.sums | later.sums).items() if key in optional}
         sums |= {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
         samples = {k: own + later.samples[k] for k, own in self.samples.items() if k in later.samples}
-        return Reduction(self.functions | later.functions, sums, samples, optional)
+        return Reduction(self.functions | later.functions, sums, samples, optional, {}, {})
 
-    def results(self) -> dict[Key, Any]:
-        """Return every statistic of all episodes; once, since samples are given away."""
+    def results(self, blocks: BlockBootstrap | None = None) -> dict[Key, Any]:
+        """Return every statistic of all episodes; once, since samples are given away.
+
+        Args:
+            blocks: of one episode, over whose units it was reduced.
+        """
         found = {}
         for key, function in self.functions.items():
-            if key in self.sums:
+            if key in self.known:
+                found[key] = self.known[key]
+            elif key in self.sums:
                 found[key] = function(mean_of_sums(self.sums[key]))
             elif key in self.samples:
                 values = numpy.concatenate(self.samples[key])
                 self.samples[key].clear()  # so that little is held twice
+                if blocks is not None and key in self.of_units:
+                    values = blocks.resample(values, self.of_units[key])
                 found[key] = function(values)
         return found
 
@@ -87,7 +99,7 @@ class Reduction(NamedTuple):
 def reduce_run(
     run: "xarray.Dataset",
     declare: "Callable[[xarray.Dataset], Iterable[Statistic]]",
-    bootstrap: Bootstrap,
+    bootstrap: Bootstrap | TimeUnits,
     first: int = 0,
 ) -> Reduction:
     """Reduce some episodes of one competitor.
@@ -95,7 +107,7 @@ def reduce_run(
     Args:
         run: one policy's part of an evaluation.
         declare: from a block of its episodes to their statistics.
-        bootstrap: over the episodes of the whole evaluation.
+        bootstrap: over the episodes of the whole evaluation; of one episode its units of time.
         first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
     block = block_of(run.sizes["time"])
@@ -106,20 +118,22 @@ def reduce_run(
     return functools.reduce(Reduction.merge, parts)
 
 
-def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap, first: int) -> Reduction:
-    found = Reduction({}, {}, {}, set())
+def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap | TimeUnits, first: int) -> Reduction:
+    found = Reduction({}, {}, {}, set(), {}, {})
     columns = 0
 
     def means() -> Iterator[Statistic]:
         for s in statistics:
             found.functions[s.key] = s.function
             found.optional.update([s.key] * s.optional)
-            if isinstance(bootstrap, BlockBootstrap) and not s.sample:
-                found.samples[s.key] = [bootstrap.resample(s.values, s.of_units)]
-            elif s.sample:
+            if s.sample:
                 found.samples[s.key] = [s.values[: max(0, s.sample - first)].copy()]
-            else:
+            elif isinstance(bootstrap, Bootstrap):
                 yield s
+            elif s.of_units is not None:
+                found.samples[s.key], found.of_units[s.key] = [s.values], s.of_units(bootstrap)
+            else:  # at once, since it may hold every measurement
+                found.known[s.key] = s.function(s.values)
 
     def product(s: Statistic) -> tuple[int | None, int]:
         """Tell the matrix products apart."""
@@ -128,6 +142,7 @@ def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap, first: 
         return s.resamples, columns // COLUMNS
 
     for (resamples, _), group in itertools.groupby(means(), product):
+        assert isinstance(bootstrap, Bootstrap)
         together = list(group)
         sums = bootstrap.sums([s.values for s in together], first, resamples)
         found.sums.update(zip((s.key for s in together), sums, strict=True))

@@ -7,8 +7,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy
-import xarray
 from rich.table import Table
 
 from ..baselines.fitted_filters import SUFFIX
@@ -25,12 +23,9 @@ from ..envs.logs.recording_files import is_recording
 from ..evaluation.competitors.kinds import Competitor, RandomPolicy, is_program
 from ..evaluation.figures.curve_figures import evaluation_figures
 from ..evaluation.figures.print_layout import check_columns, check_formats, save
-from ..evaluation.running.metrics import Record, flight_records
 from ..evaluation.running.parallel import Workers
 from ..evaluation.running.summary import Evaluation, EvaluationRequest, run_requests
-from ..evaluation.statistics.bootstrap import IntervalEstimate, ratio
 from ..evaluation.statistics.cause_split import phrases_of
-from ..evaluation.statistics.predictions import stretch_interval
 from ..evaluation.storage.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.storage.estimates import check_estimates, write_estimates
 from ..evaluation.storage.files import whole_files, writable_file, writable_folder, write_text
@@ -65,8 +60,6 @@ MOST_PREDICTIONS = 2_000_000
 """Measurements of all competitors whose estimates are kept, some 200 bytes each."""
 TRACKS = ("truth", "estimate", "covariance")
 """What is kept of measurements for predictions, and not written unless estimates are asked for."""
-MOST_RECORDINGS = 40
-"""Of which a table tells one by one."""
 
 
 class FileOptions(NamedTuple):
@@ -244,42 +237,13 @@ def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool
     return data.seconds.size * len(set(names)) <= MOST_PREDICTIONS
 
 
-def flights_of(found: Evaluation) -> list[Record]:
-    """Return the records of every flight, where there are few enough to tell one by one."""
-    each = "flight" in found.dataset.coords and found.has_truth
-    if each and found.recorded:
-        each = found.dataset.sizes["episode"] <= MOST_RECORDINGS
-    return flight_records(found.dataset) if each else []
-
-
-def likelihood_differences(dataset: xarray.Dataset) -> dict[str, IntervalEstimate]:
-    """Return the log-likelihood per measurement less that of the best, by name."""
-    if "log_likelihood" not in dataset:
-        return {}
-    likely = {
-        str(name): dataset["log_likelihood"].sel(policy=name).values for name in dataset["policy"].values
-    }
-    known = {name: values for name, values in likely.items() if numpy.isfinite(values).any()}
-    best = max(known, key=lambda name: known[name][numpy.isfinite(known[name])].mean(), default=None)
-    if best is None:
-        return {}
-    everywhere = numpy.ones(known[best].shape, dtype=bool)
-    pairs = {name: values - known[best] for name, values in known.items()}
-    return {
-        name: stretch_interval(everywhere, numpy.stack([less, numpy.ones_like(less)], axis=-1), ratio)
-        for name, less in pairs.items()
-    }
-
-
 def tables_of(
     problem: Problem,
     found: Evaluation,
-    flights: list[Record],
-    differences: Mapping[str, IntervalEstimate],
     width: int,
 ) -> list[Table]:
     """Return what is printed in so many columns, widest first."""
-    tables = [flights_table(found.dataset, flights, found.records, width)] if flights else []
+    tables = [flights_table(found.dataset, found.flights, found.records, width)] if found.flights else []
     if found.has_truth:
         compared = results_tables(found.records, problem.knows, width, found.dataset.attrs["paper"])
         paper = found.dataset.attrs["paper"]
@@ -287,7 +251,7 @@ def tables_of(
             compared[-1].caption = f"{_without_comparison(problem)}\n{compared[-1].caption}"
         tables += compared
     if found.recorded:
-        tables += recording_tables(found.records, differences, found.has_truth, width)
+        tables += recording_tables(found.records, found.differences, found.has_truth, width)
     return tables
 
 
@@ -310,7 +274,7 @@ def run(
 ) -> tuple[Evaluation, str, dict[str, str]]:
     """Run the competitors of an evaluation; one that fails costs its own row.
 
-    Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
+    Every number of every episode is kept only where it is asked for.
 
     Args:
         requests: one for each competitor.
@@ -326,10 +290,11 @@ def run(
     """
     task = requests[0].experiment.make_task()
     measurements = sum(one.measurements for one in requests)
-    size = measurements * len(task.components) * 8
-    refusal = _size_warning(size, size, outputs.netcdf)
+    error = measurements * len(task.components) * 8
+    # And two costs, the causes and the NEES.
+    refusal = _size_warning(error + 4 * 8 * measurements, error, outputs.netcdf)
     written = outputs.folder is not None and not refusal
-    whole = written or bool(task.flights) or outputs.estimates is not None
+    whole = written or outputs.estimates is not None
     failures: dict[str, str] = {}
     found = None
     with progress_bar() as bar:
@@ -381,11 +346,7 @@ def write(
         worst: by the names of those whose cost is explained their worst episodes.
         own: names of the user's own.
     """
-    flights = flights_of(found)
-    differences = likelihood_differences(found.dataset) if found.recorded else {}
-    printed, in_file = (
-        tables_of(problem, found, flights, differences, width) for width in (console.width, LATEX_WIDTH)
-    )
+    printed, in_file = (tables_of(problem, found, width) for width in (console.width, LATEX_WIDTH))
     sentences = own_sentences(found.records, own, found.dataset.attrs["paper"]) if found.has_truth else []
     for sentence in sentences:  # before anything is written, which can fail
         print_sentence(sentence.replace("`", ""), bold=sentence.rindex(": ") - 2)
@@ -393,7 +354,7 @@ def write(
         console.print()
     for table in printed:
         print_table(table)
-    records = [*found.records, *flights]
+    records = [*found.records, *found.flights]
     if outputs.records is not None:
         write_records(outputs.records, records)
     if outputs.estimates is not None:

@@ -15,6 +15,7 @@ import xarray
 
 from ...envs.engine.catalogue import bare_name
 from ...evaluation.competitors.kinds import RANKED
+from ...evaluation.running.curves import spread
 from ...evaluation.running.metrics import Record
 from ...evaluation.storage.code import library_versions
 from ...evaluation.storage.files import write_text
@@ -135,11 +136,6 @@ def select_competitors(
     bounds = [name for name in kinds if kinds[name] == "bound"]
     wanted = [paper, reference, *own, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
     return list(dict.fromkeys(name for name in wanted if name in kinds))[:MOST_SHOWN]
-
-
-def spread(count: int, most: int) -> numpy.ndarray:
-    """Return at most ``most`` indices of ``count``, spread evenly, with the first and the last."""
-    return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
