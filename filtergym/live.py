@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from .baselines.problem import import_problem
-from .envs.contract.companions import find_companion
-from .envs.contract.log_format import LogFormat
 from .envs.contract.parameters import ParameterLimits, check
 from .envs.data.recorded_world import Feed
 from .envs.engine.backend import make_model
@@ -67,9 +65,8 @@ def online(
     found = find_competitor(problem, policy, trust) if named else Competitor(name, adopt(policy))
     maker, log = found.maker, found.log
     kind = kind_of(maker)
-    log_format = find_companion(problem.task, LogFormat)
-    if log is not None and log_format is not None and scenario is None:
-        scenario = log.scenario(log_format)
+    if log is not None and scenario is None:
+        scenario = log.scenario(problem.task)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(
         find_scenario(problem.task, scenario, keywords),

@@ -1,7 +1,6 @@
 """The array library that an array belongs to, NumPy or torch through the array API standard, and ways between them."""
 
 import functools
-import math
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -27,11 +26,6 @@ def namespace(array: Array) -> ModuleType:
     if kind not in _BY_TYPE:
         _BY_TYPE[kind] = numpy if issubclass(kind, numpy.generic) else array_api_compat.array_namespace(array)
     return _BY_TYPE[kind]
-
-
-def exponential(power: Any) -> Any:
-    """Exponential of a number, or of each of an array."""
-    return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def lane_arrays(values: Any) -> list[Array]:

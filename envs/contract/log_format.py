@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy
 
 from ...filters.geodesy import PlaneOrigin
+from .companions import find_companion
 from .task import Scenario
 
 TIME = ("time", "timestamp", "seconds")
@@ -195,8 +196,7 @@ class LogFormat:
     plot_rows: PlotRows | None = None
     """How the rows are plots of a track; None where they are not."""
     regular_rows: Callable[[Any], Mapping[str, float]] | None = None
-    """How the rows come at one rate, the first of which starts the track and each further one is a measurement: by the
-    parameters the numbers that the reading needs, by name; None where they do not."""
+    """Numbers that the reading of rows at one rate needs, by the parameters; None where rows come otherwise."""
     noise_hint: str = ""
     """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     decision_interval: int | None = None
@@ -223,13 +223,13 @@ class LogSetup(NamedTuple):
     """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
     were metres."""
     horizon: int = 0
-    """Measurements of the longest track; zero where that is not known."""
+    """Measurements of the longest track; zero: not known."""
 
-    def scenario(self, log_format: LogFormat) -> Scenario:
+    def scenario(self, task: Any) -> Scenario:
         """Parameters of a task on logs that are read in the same way, in place of those of a simulated scenario."""
-        known = {"horizon": self.horizon, "decision_interval": log_format.decision_interval}
-        known = {name: value for name, value in known.items() if value}
-        return Scenario("log", "Parameters of a log.", {**known, **self.parameters})
+        log_format: Any = find_companion(task, LogFormat)
+        known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
+        return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:

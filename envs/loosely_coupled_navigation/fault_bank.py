@@ -37,7 +37,7 @@ import numpy
 
 from ...filters import imm
 from ...filters import receiver_faults as faults
-from ...filters.array_namespace import exponential, namespace
+from ...filters.array_namespace import namespace
 from ...filters.loosely_coupled import AugmentedCovariance, Sampling
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..contract.controls import SteerableFilter
@@ -242,7 +242,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
-        changing = 1.0 - exponential(-self.prior.level_rate * self.interval)
+        changing = 1.0 - _exponential(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
         changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
         chain = self.xp.where(changed, self.fresh, chain)
@@ -446,6 +446,11 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
             axis=before,
         )
+
+
+def _exponential(power: Any) -> Any:
+    """Exponential of a number, or of each of an array."""
+    return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def _flat(h: Hypotheses) -> list[Array]:

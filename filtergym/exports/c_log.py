@@ -147,7 +147,7 @@ class LogText(FilterText):
             return self._plot_log(log_format.plot_rows, log)
         if log_format.regular_rows is None:
             return ""
-        parameters = {**log.scenario(log_format).parameters, **request.keywords}
+        parameters = {**log.scenario(request.problem.task).parameters, **request.keywords}
         return self._regular_log(log_format.regular_rows(request.problem.task.Parameters(**parameters)), log)
 
     def _log(

@@ -6,8 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..baselines.problem import Problem
-from ..envs.contract.companions import find_companion
-from ..envs.contract.log_format import LogFormat, LogSetup
+from ..envs.contract.log_format import LogSetup
 from ..names import file_endings, find_competitor
 
 
@@ -45,9 +44,8 @@ def request_export(
     found = find_competitor(problem, name, trust)
     log = found.log
     read: dict[str, Any] = {}
-    log_format = find_companion(problem.task, LogFormat)
-    if log is not None and log_format is not None and scenario is None:
-        read, scenario = log.parameters, log.scenario(log_format)
+    if log is not None and scenario is None:
+        read, scenario = log.parameters, log.scenario(problem.task)
     return ExportRequest(
         problem,
         _own_name(problem, name),
