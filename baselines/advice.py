@@ -81,8 +81,9 @@ class FittedLog:
     @cached_property
     def task(self) -> Task:
         """With the parameters of the recording, without it."""
-        parameters = self.recording.scenario(self.problem.task, self.keywords).parameters
-        return make_task(self.problem.task, None, **{**parameters, **self.keywords, "horizon": 1})
+        scenario = self.recording.scenario(self.problem.task, self.keywords)
+        scenario = dataclasses.replace(scenario, recording=None)
+        return make_task(self.problem.task, scenario, **{**self.keywords, "horizon": 1})
 
     @cached_property
     def share(self) -> Share:

@@ -23,6 +23,8 @@ from .tuned_values import TunedPolicy, check_values, make_tuned_policy, round_va
 
 SUFFIX = ".filter.json"
 """Of the names of such files."""
+MOST_MEASUREMENTS = 100_000
+"""Of a track, of which a file tells how many there were; an export simulates as many."""
 
 
 def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
@@ -35,9 +37,7 @@ def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
     known = problem.baselines
     if known.log_families is not None:
         return dict(known.log_families(recording))
-    # Whether their parameters may be arrays, nobody says.
-    found = {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
-    return {name: replace(tunable, in_lanes=False) for name, tunable in found.items()}
+    return {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
 
 
 def own_family(name: str, cls: Any) -> Tunable:
@@ -94,6 +94,7 @@ def setup_of(problem: Problem, recording: Any) -> LogSetup:
         {name: round_value(value) for name, value in deviations.items()},
         source,
         dict(recording.origin),
+        min(int(recording.rows.max()), MOST_MEASUREMENTS),
     )
 
 
@@ -139,7 +140,9 @@ def write_advised(
             "outlier_share": round_value(10.0 ** found.values[OUTLIER_SHARE])
             if found is not None and OUTLIER_SHARE in found.values
             else None,
-            "start": "from the first two measurements: the second, and their difference over the time between them",
+            "start": "from the first row"
+            if log_format and log_format.regular_rows
+            else "from the first two measurements: the second, and their difference over the time between them",
             "ranges": {
                 "measurements": int(recording.rows.sum()),
                 "seconds": round_value(float(numpy.nanmax(seconds))),
@@ -193,9 +196,10 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         "deviations": dict[str, float],
         "deviations_from": str,
         "origin": dict[str, float],
+        "horizon": int,
     }
     if isinstance(log, dict):
-        log = {"origin": {}, **log}  # files of older versions say nothing of it
+        log = {"origin": {}, "horizon": 0, **log}  # files of older versions say nothing of them
     log_format = find_companion(problem.task, LogFormat)
     names = {
         "time",
@@ -211,6 +215,7 @@ def _read_setup(path: Path, problem: Problem, log: Any) -> LogSetup | None:
         or not 0.0 < log["interval"] < math.inf
         or not {*log["columns"], *log["deviations"]} <= names
         or not all(0.0 < value < math.inf for value in log["deviations"].values())
+        or not 0 <= log["horizon"] <= MOST_MEASUREMENTS
         or not (not log["origin"] or _is_place(log["origin"]))
     ):
         raise ValueError(f"{path}: what it says of its log is none: filtergym advise writes it anew")

@@ -65,8 +65,9 @@ def online(
     found = find_competitor(problem, policy, trust) if named else Competitor(name, adopt(policy))
     maker, log = found.maker, found.log
     kind = kind_of(maker)
-    read = {} if log is None else log.parameters
-    keywords = {**read, **getattr(maker, "task_keywords", {}), **keywords}
+    if log is not None and scenario is None:
+        scenario = log.scenario(problem.task)
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(
         find_scenario(problem.task, scenario, keywords),
         flights=(),

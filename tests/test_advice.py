@@ -1,5 +1,6 @@
 """Filters fitted to recordings: likelihood, maximum, intervals, choice, and what is said of it."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -13,7 +14,7 @@ from filtergym import evaluate
 from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
 from filtergym.baselines.advice import FittedLog, advise, share_out
-from filtergym.baselines.fitted_filters import own_family, read_artefact
+from filtergym.baselines.fitted_filters import families_of, own_family, read_artefact
 from filtergym.baselines.fitting import fit, fit_profiles, with_noise_scale
 from filtergym.baselines.judgement import AS_GOOD, Judgement
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
@@ -70,6 +71,26 @@ def likelihood_of(recording, name, spans=None, warm_up=10, noise=False):
     spans = spans or [Span(0, 10, int(recording.rows[0]))]
     windows = cut_windows(recording, task, spans, warm_up)
     return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes), tunable
+
+
+@pytest.mark.parametrize(
+    ("environment", "columns"),
+    [("LooselyCoupledNavigation", "ins,fix"), ("RadarEsmTracking", "range,range_rate")],
+)
+def test_candidates_of_every_family_side_by_side_are_those_that_run_alone(environment, columns, tmp_path):
+    g, time = np.random.default_rng(0), np.arange(40.0)
+    table = np.column_stack([time, *(500.0 - 5.0 * time + g.normal(0.0, 5.0, (2, 40)))])
+    np.savetxt(tmp_path / "log.csv", table, "%.3f", ",", header=f"time,{columns}", comments="")
+    problem = problem_of(f"filtergym/{environment}-v0")
+    log = FittedLog(problem, read_recording(tmp_path / "log.csv", problem.id))
+    for name, family in families_of(problem, log.recording).items():
+        low, high = np.array([*family.limits.values()]).T
+        values = np.stack([[*family.start.values()], low + 0.3 * (high - low)], axis=1)
+        found = log.likelihood([Span(0, 5, 39)], family)
+        alone = log.likelihood([Span(0, 5, 39)], dataclasses.replace(family, in_lanes=False))
+        np.testing.assert_allclose(found(values), alone(values), rtol=1e-9, err_msg=name)
+        if environment == "LooselyCoupledNavigation":
+            assert found.in_lanes is (name != "augmented-mehra")  # which has a whole window
 
 
 def naive_log_likelihood(recording, acceleration, scale, first):

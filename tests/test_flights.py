@@ -383,7 +383,7 @@ def test_broken_files_are_left_out_and_named_and_a_set_of_them_is_refused(tmp_pa
     used, lines = read_flights(str(tmp_path / "*.csv")).flyable(6.0, 5e5)
     assert [t.name for t in used] == ["whole"]
     assert lines == [
-        "binary.csv: left out: it is no text in UTF-8",
+        "binary.csv: left out: it is no text in UTF-8: save it as such (a spreadsheet: CSV UTF-8)",
         "minutes.csv: left out: median speed 7200 m/s: are the times minutes?",
     ]
 

@@ -30,13 +30,16 @@ from filtergym.envs.contract.log_format import LogFormat
 from filtergym.envs.logs.flight_tables import DELIMITERS
 from filtergym.exports.c_filter import file_stem
 from filtergym.exports.c_log import READING
-from filtergym.exports.c_log_programs import LOG
+from filtergym.exports.c_log_programs import READER
 from filtergym.exports.c_source import FLAGS, WORST, export_c
 from filtergym.exports.request import request_export
 from filtergym.names import find_competitor
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 TARGET, OWN = "filtergym/ManeuveringTarget-v0", "mine/Logged-v0"
+LOOSE, ESM = "filtergym/LooselyCoupledNavigation-v0", "filtergym/RadarEsmTracking-v0"
+SHIPPED = {LOOSE: "time-varying", ESM: "quasi-optimal"}
+"""Advised filters that are not fitted."""
 STRICT = ("-Wconversion", "-Wdouble-promotion", "-Wshadow", "-g")
 COUNT = 40
 START = pandas.Timestamp("2026-10-25T22:59:41Z")
@@ -50,19 +53,32 @@ RENAMES = {
         "drive": "recording",
     },
     OWN: {"t": "time", "east pos": "gps", "north": "odo", "drive": "recording"},
+    LOOSE: {"t": "time", "East": "fix_x", "north": "fix_y", "accuracy": "sigma", "drive": "recording"}
+    | {"ins east": "ins_x", "ins north": "ins_y"},
+    ESM: {"t": "time", "type": "decision", "apart": "bearing_difference", "accuracy": "range_rate"}
+    | {"drive": "recording", "distance": "range"},
 }
 
 
 def log_of(id):
-    """Cells of a log as numbers and words: times, two measured numbers with a gap, an accuracy, and what is ignored."""
+    """Cells of a log as numbers and words: times, two measured numbers, an accuracy, what is ignored, and perhaps more;
+    a gap where there may be one.
+    """
     g = np.random.default_rng(5)
     time = np.arange(COUNT, dtype=float).round(3)
-    if id == TARGET:
+    if id in (TARGET, LOOSE):
         east, north = (
             900.0 + 12.0 * time + g.normal(0.0, 4.0, COUNT),
             300.0 - 7.0 * time + g.normal(0.0, 4.0, COUNT),
         )
         names = "East", "north"
+    elif id == ESM:
+        east, north = (
+            np.where(time % 4.0 == 0.0, g.integers(0, 3, COUNT), np.nan),
+            g.normal(0.0, 200.0, COUNT),
+        )
+        north[np.isnan(east)] = np.nan
+        names = "type", "apart"
     else:
         east, north = 10.0 * time + g.normal(0.0, 2.0, COUNT), 10.0 + g.normal(0.0, 0.5, COUNT)
         names = "east pos", "north"
@@ -73,6 +89,13 @@ def log_of(id):
         "accuracy": g.uniform(2.0, 6.0, COUNT).round(1),
     }
     table = pandas.DataFrame(columns).assign(drive="a", note="x")
+    if id == LOOSE:
+        drift = np.cumsum(g.normal(0.0, 0.1, (2, COUNT)), axis=1)
+        return table.assign(
+            **{"ins east": 900.0 + 12.0 * time + drift[0], "ins north": 300.0 - 7.0 * time + drift[1]}
+        )
+    if id == ESM:
+        return table.assign(distance=(9000.0 - 4.0 * time + g.normal(0.0, 40.0, COUNT)).round(1))
     return table.drop(index=range(20, 24)).reset_index(drop=True)
 
 
@@ -160,7 +183,7 @@ FORMATS = {
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    """Both programs, under the sanitizers: folder and the name of the competitor, by the environment."""
+    """All programs, under the sanitizers: folder and the name of the competitor, by the environment."""
     filtergym.state_space(
         OWN,
         f=lambda x, dt: [x[0] + dt * x[1], x[1]],
@@ -175,7 +198,7 @@ def programs(tmp_path_factory):
     for id in RENAMES:
         place = tmp_path_factory.mktemp("program")
         (place / "first.csv").write_text(lines(log_of(id)), encoding="utf-8")
-        name = "mine.filter.json" if id == TARGET else "extended"
+        name = "extended" if id == OWN else "mine.filter.json"
         found[id] = place, advised(place, id, place / "first.csv", name, RENAMES[id], ("log", "main"))
     yield found
     forget(OWN)
@@ -190,8 +213,11 @@ def run(program, text, *words):
 
 def advised(place, id, log, name, rename, programs=("log",)):
     """Export the filter of a log, and compile its programs under the sanitizers."""
-    recording = read_recording(log, id, rename=rename)
-    if id == TARGET:
+    recording, moved = read_recording(log, id, rename=rename), False
+    if id in SHIPPED:
+        write_advised(place / name, problem_of(id), SHIPPED[id], recording, None, {}, "test")
+        name = str(place / name)
+    elif id == TARGET:
         moved = "odometry_displacement" in recording.measurements
         family = "dead-reckoning" if moved else "constant-velocity"
         scale = {} if moved else {"log10_noise_scale": 0.1}
@@ -228,7 +254,8 @@ def check_rows(id, name, recording, done, copies=0):
         # Measured 2e-12; the limit of test.c is 1e-3.
         assert np.abs((values["estimate"] - estimate) / sigma).max() < 1e-6 * WORST["double"]
         np.testing.assert_allclose(values["sigma"], sigma, rtol=1e-9)
-        available = recording.measurements["available"][episode][: len(seen)][seen].reshape(len(own), -1)
+        available = recording.measurements.get("available", np.ones((len(recording.names), len(seen), 1)))
+        available = available[episode][: len(seen)][seen].reshape(len(own), -1)
         np.testing.assert_array_equal(own["status"] == "taken", (available > 0.0).any(axis=1))
     return found
 
@@ -246,7 +273,8 @@ def test_c_reads_every_form_of_a_log_as_an_evaluation_does(form, id, programs, t
     done = subprocess.run([place / "c" / "log", path], capture_output=True, check=False)
     assert done.stderr == b""
     found = check_rows(id, name, recording, done, COPIES.get(form, 0))
-    missed = {"empty cells": 2, "words for no number": 2, "positions that repeat": 3 * (id == TARGET)}
+    missed = dict.fromkeys(("empty cells", "words for no number"), 2 * (id != ESM))
+    missed["positions that repeat"] = 3 * (id == TARGET)
     assert (found["status"] == "missed").sum() == missed.get(form, 0)
 
 
@@ -372,6 +400,60 @@ def test_c_refuses_in_a_sentence_what_the_reader_refuses(case, programs, tmp_pat
         read_recording(tmp_path / "bad.csv", TARGET, rename=RENAMES[TARGET])
 
 
+def put_in(id, row, **cells):
+    """A log with some cells of another text."""
+    table = log_of(id).astype(object)
+    for column, cell in cells.items():
+        table.loc[row, column.replace("_", " ")] = cell
+    return lines(table)
+
+
+BAD_ROWS = {
+    "no position by the INS": (LOOSE, lambda: put_in(LOOSE, 5, ins_east=""), "ins east has no value in row 5 (line 7)"),
+    "no deviation": (LOOSE, lambda: put_in(LOOSE, 0, accuracy=""), "accuracy has no value in row 0"),
+    "a deviation of zero": (LOOSE, lambda: put_in(LOOSE, 7, accuracy=0), "standard deviation accuracy in row 7"),
+    "no fix": (LOOSE, lambda: lines(log_of(LOOSE).assign(north="")), "no row has on every axis a north"),
+    "a missing row": (LOOSE, lambda: lines(log_of(LOOSE).drop(index=9)), "one interval apart, by their time"),
+    "no range": (ESM, lambda: put_in(ESM, 5, distance=""), "distance has no value in row 5"),
+    "a missing scan": (ESM, lambda: lines(log_of(ESM).drop(index=9)), "one interval apart, by their time: it is not"),
+    "no whole number": (ESM, lambda: put_in(ESM, 8, type=1.5), "number of an emitter type"),
+    "no such type": (ESM, lambda: put_in(ESM, 8, type=4), "number of an emitter type"),
+    "no bearing": (ESM, lambda: put_in(ESM, 8, apart=""), "no bearings are beside the decision in row 8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_ROWS)
+def test_c_refuses_rows_at_one_rate_that_the_reader_refuses(case, programs, tmp_path):
+    id, make, sentence = BAD_ROWS[case]
+    done = run(programs[id][0] / "c" / "log", make())
+    assert done.returncode == 2
+    assert sentence in done.stderr.decode()
+    assert done.stderr.count(b"\n") == 1
+    (tmp_path / "bad.csv").write_text(make(), encoding="utf-8")
+    with pytest.raises(ValueError, match="recording"):
+        read_recording(tmp_path / "bad.csv", id, rename=RENAMES[id])
+
+
+def test_a_track_that_is_longer_than_the_tables_of_a_filter_is_refused(programs):
+    table = log_of(ESM)
+    longer = pandas.concat([table, table.iloc[-1:].assign(t=float(COUNT))])
+    done = run(programs[ESM][0] / "c" / "log", lines(longer))
+    assert done.returncode == 2
+    assert b"advise on this log" in done.stderr
+
+
+def test_an_advised_filter_has_the_parameters_of_its_log_and_none_of_a_scenario(programs):
+    problem = problem_of(ESM)
+    request = request_export(problem, programs[ESM][1])
+    expected = read_recording(programs[ESM][0] / "first.csv", ESM, rename=RENAMES[ESM]).scenario(
+        problem.task, {}
+    )
+    assert request.scenario.parameters == expected.parameters
+    assert request_export(problem, programs[ESM][1], "paper").scenario == "paper"
+    running = filtergym.online(ESM, programs[ESM][1])
+    assert running.model.task.parameters.association_error == problem.task.Parameters().association_error
+
+
 def test_a_log_that_cannot_be_opened_or_written_is_refused(programs, tmp_path):
     program = programs[TARGET][0] / "c" / "log"
     for path in (tmp_path / "none.csv", tmp_path):
@@ -480,9 +562,9 @@ def test_every_way_of_reading_a_log_is_decided_for_c():
     }
     assert set(inspect.signature(read_recording).parameters) == decided.keys()
     kinds = {name for name in LogFormat.__dataclass_fields__ if name.endswith("_rows")}
-    assert kinds == {"plain_rows", "plot_rows"}
+    assert kinds == {"plain_rows", "plot_rows", "regular_rows"}
     assert find_companion(problem_of(TARGET).task, LogFormat).plot_rows is not None
     assert DELIMITERS == ",;\t"
     # Every number of the reader's is one of the program's.
     for name in READING:
-        assert re.search(rf"\b{name}\b", LOG), name
+        assert re.search(rf"\b{name}\b", READER), name

@@ -8,6 +8,7 @@ mean square.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
@@ -41,7 +42,8 @@ def with_rules(
         cls, words = RULES[rule]
         untuned = {value: start for value, (_, start, _) in LIMITS[rule].items()}
         variants[f"{name}-{rule}"] = Variant(host, f"{description} {words}.", rule=cls, **untuned)
-        tunables[f"{name}-{rule}"] = tunable(variants[f"{name}-{rule}"], **LIMITS[rule])
+        found = tunable(variants[f"{name}-{rule}"], **LIMITS[rule])
+        tunables[f"{name}-{rule}"] = replace(found, in_lanes=rule != "mehra")  # which has a whole window
     return variants, tunables
 
 

@@ -4,7 +4,6 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
 
 import math
-from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy
@@ -255,12 +254,11 @@ TUNABLE_BANKS = {
     "fault-bank": tunable(ESTIMATORS["fault-bank"], **_RATES, rate=(0.5, 1.732, 4.0)),
     "fault-bank-vague": tunable(ESTIMATORS["fault-bank-vague"], **_RATES, longest=(1.0, 3.0, 5.0)),
 }
-"""Each candidate runs alone: values decide how many measurements a hypothesis lasts."""
 
 TUNABLE = {
     **TUNABLE_POLICIES,
     **TUNABLE_ESTIMATORS,
-    **{name: replace(bank, in_lanes=False) for name, bank in TUNABLE_BANKS.items()},
+    **TUNABLE_BANKS,
 }
 
 BASELINES = Baselines(

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy
 
 from ...filters.geodesy import PlaneOrigin
+from .companions import find_companion
+from .task import Scenario
 
 TIME = ("time", "timestamp", "seconds")
 """Names of the column of times."""
@@ -193,6 +195,8 @@ class LogFormat:
     """How the rows are measurements as they stand; None where more is done to them."""
     plot_rows: PlotRows | None = None
     """How the rows are plots of a track; None where they are not."""
+    regular_rows: Callable[[Any], Mapping[str, float]] | None = None
+    """Numbers that the reading of rows at one rate needs, by the parameters; None where rows come otherwise."""
     noise_hint: str = ""
     """How a column that states noise is read, a clause for the note on one that is not; empty where there is no way."""
     decision_interval: int | None = None
@@ -218,6 +222,14 @@ class LogSetup(NamedTuple):
     origin: dict[str, float]
     """Latitude and longitude, degrees, and usual altitude, m, around which positions were made metres; empty where they
     were metres."""
+    horizon: int = 0
+    """Measurements of the longest track; zero: not known."""
+
+    def scenario(self, task: Any) -> Scenario:
+        """Parameters of a task on logs that are read in the same way, in place of those of a simulated scenario."""
+        log_format: Any = find_companion(task, LogFormat)
+        known = ("horizon", self.horizon), ("decision_interval", log_format.decision_interval)
+        return Scenario("log", "", {**{name: value for name, value in known if value}, **self.parameters})
 
     @property
     def plane(self) -> PlaneOrigin | None:

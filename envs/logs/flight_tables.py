@@ -349,7 +349,7 @@ def read_table(file: Path, known: Iterable[str] = _COLUMN_OF_ALIAS) -> FlightTab
                 check_cells(str(name), cells)
         return table
     except UnicodeDecodeError as error:
-        raise ValueError("it is no text in UTF-8") from error
+        raise ValueError("it is no text in UTF-8: save it as such (a spreadsheet: CSV UTF-8)") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         raise ValueError(str(error) or type(error).__name__) from error
 

@@ -472,7 +472,10 @@ def _suggest(names: Sequence[str], first: Sequence[str], columns: Iterable[str])
     """What to type where the columns of a file have names of their own."""
     wanted, pairs = [*first, *columns], []
     for name in names:
-        close = difflib.get_close_matches(name, [each for each in wanted if each not in names], 1, 0.4)
+        free = [each for each in wanted if each not in names]
+        close = difflib.get_close_matches(name, free, 1, 0.65) or [
+            w for w in free if name and w.startswith(name)
+        ]
         if close and name not in (*TIME, RECORDING, *columns):
             pairs.append(f"{name}={close[0]}")
             wanted.remove(close[0])

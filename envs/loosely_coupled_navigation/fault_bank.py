@@ -128,7 +128,8 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         prior = self.prior
         self.interval: float = p.sampling_interval
         self.eye: Array = task.constant(numpy.eye(p.axes))[:, :, None]
-        self.spacing: int = max(round(prior.longest / (prior.onsets * self.interval)), 1)
+        spacing = numpy.maximum(numpy.round(prior.longest / (prior.onsets * self.interval)), 1.0)
+        self.spacing: Any = spacing if numpy.ndim(spacing) else int(spacing)
         self.noises: Noises = Noises(*(task.constant(each)[:, None, None] for each in draw_noises(prior, p)))
         self.others: Noises = Noises(*(each[1:] for each in self.noises))
         self.noise_weights: Array = task.constant(
@@ -145,7 +146,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         """Whose weights each of the first two settings multiplies, ``(2, H, 1)``."""
         highest = math.log(prior.levels[-1]) or 1.0
         self.heights: Array = task.constant([math.log(level) / highest for level in prior.levels])[:, None]
-        self.onsets: Array = task.constant(numpy.arange(prior.onsets) * float(self.spacing))[:, None]
+        self.onsets: Array = task.constant(numpy.arange(float(prior.onsets)))[:, None] * self.spacing
 
     def start(self, initial: Initial) -> FaultState:
         """Start where INS and reference agree, without a pull."""
@@ -181,7 +182,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
 
     def since_onset(self, number: Array) -> Array:
         """Measurements since the onset of each hypothesis of a pull, ``(B, N)``, at the number of a measurement."""
-        cycle = float(self.spacing * self.prior.onsets)
+        cycle = 1.0 * self.spacing * self.prior.onsets
         since = number - self.onsets
         return since - cycle * self.xp.floor(since / cycle)
 
@@ -243,7 +244,7 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
         memory = state.memory
         free, pulled = self.change(memory.free, memory.pulled, measurement.number)
         reported = measurement.reported_deviation * measurement.reported_deviation
-        changing = 1.0 - math.exp(-self.prior.level_rate * self.interval)
+        changing = 1.0 - _exponential(-self.prior.level_rate * self.interval)
         chain = (1.0 - changing) * memory.levels + changing * self.uniform
         changed = self.xp.abs(reported - memory.reported) > SAME_REPORT * reported
         chain = self.xp.where(changed, self.fresh, chain)
@@ -447,6 +448,11 @@ class FaultBank(SteerableFilter[Task, Measurement, FaultState]):
             [self.xp.reshape(each, (*each.shape[:before], -1, each.shape[-1])) for each in values],
             axis=before,
         )
+
+
+def _exponential(power: Any) -> Any:
+    """Exponential of a number, or of each of an array."""
+    return math.exp(power) if isinstance(power, int | float) else namespace(power).exp(power)
 
 
 def _flat(h: Hypotheses) -> list[Array]:

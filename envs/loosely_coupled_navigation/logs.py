@@ -118,4 +118,5 @@ LOG_FORMAT = LogFormat(
     predicted=tuple(Predicted(axis, "m", "position") for axis in AXES),
     longest_interval=5.0,
     decision_interval=1,
+    regular_rows=lambda p: {"usual_sigma": p.receiver_variance**0.5},
 )

@@ -72,9 +72,7 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
     if measurements["radar"].shape[1] < 2:
         raise ValueError("the first measurement starts the track, and a recording needs a second one")
     first = {name: values[:, 0] for name, values in measurements.items()}
-    # What an acceleration of unknown class adds: as in equation (12) at the start.
-    acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
-    covariance = numpy.diag([p.range_sigma**2, p.range_rate_sigma**2, acceleration])
+    covariance = numpy.diag(_start_variances(p))
     initial = {
         "mean": numpy.pad(first["radar"], ((0, 0), (0, 1))),
         "covariance": numpy.tile(covariance, (len(first["radar"]), 1, 1)),
@@ -83,6 +81,18 @@ def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarra
     later = {name: values[:, 1:] for name, values in measurements.items()}
     later["scan"], initial["first_scan"] = later["scan"] - first["scan"][:, None], 0 * first["scan"]
     return TrackStart(later, initial, 1)
+
+
+def _start_variances(p: Any) -> list[float]:
+    """Of range, range rate and acceleration at the start; the last is what one of unknown class adds, as in (12)."""
+    acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
+    return [p.range_sigma**2, p.range_rate_sigma**2, acceleration]
+
+
+def _numbers(p: Any) -> dict[str, float]:
+    """Numbers that the reading of a row needs."""
+    variances = {f"variance_{i}": variance for i, variance in enumerate(_start_variances(p))}
+    return {"types": len(p.recognition), "esm_period": p.esm_period, "horizon": p.horizon, **variances}
 
 
 def read_decisions(readings: Readings, scans: numpy.ndarray, p: Any) -> dict[str, numpy.ndarray]:
@@ -142,4 +152,5 @@ LOG_FORMAT = LogFormat(
     predicted=(Predicted("range", "m", "range"), Predicted("range_rate", "m/s", "range rate")),
     longest_interval=60.0,
     decision_interval=1,
+    regular_rows=_numbers,
 )

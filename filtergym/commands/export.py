@@ -156,7 +156,14 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
         f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
         *(
-            ["no log.c: it reads tables of plots, and those of models of one's own"]
+            [f"your log: cc -std=c99 -O2 log.c {stem}.c -lm -o log && ./log LOG.csv"]
+            if figures.reads_log
+            else []
+        ),
+        *(
+            [
+                "no log.c, which reads tables: write what this log holds as CSV (docs/own_data.md) and advise on that"
+            ]
             if request.log is not None and not figures.reads_log
             else []
         ),

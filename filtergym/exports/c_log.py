@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..compiler.c_text import DOUBLE, Scalar, identifier, literal
 from ..envs.contract.live_input import LARGEST
@@ -13,7 +13,20 @@ from ..envs.logs.flight_tables import DAY, DELIMITERS
 from ..envs.logs.own_models import MOST_MISSED
 from ..envs.logs.recorded_tables import MOST_TWICE, UNEVEN
 from .c_filter import FilterText
-from .c_log_programs import LOG, MEMBERS, ODOMETRY, PLAIN_ROWS, PLOTS, POSITIONS, PROJECT, READ_ODOMETRY
+from .c_log_programs import (
+    CHECK_SIGMA,
+    LOG,
+    ODOMETRY,
+    PLAIN_ROWS,
+    PLOTS,
+    POSITIONS,
+    PROJECT,
+    READ_FIXES,
+    READ_LOOKS,
+    READ_ODOMETRY,
+    READER,
+    REGULAR_ROWS,
+)
 from .traced_filter import TracedFilter
 
 if TYPE_CHECKING:
@@ -42,6 +55,15 @@ PLOT_VALUES = {
     "odometry_available": "row->odometry ? 1.0 : 0.0",
 }
 """What the numbers of a measurement are of a plot."""
+LOOK_VALUES = {
+    "scan": "(double)i",
+    "radar_0": "cell[0]",
+    "radar_1": "cell[1]",
+    "looked": "found[1]",
+    "decision": "found[2]",
+    "bearing_difference": "found[3]",
+}
+"""What they are of a row of radar and ESM."""
 
 
 class LogText(FilterText):
@@ -67,7 +89,7 @@ class LogText(FilterText):
     ) -> None:
         super().__init__(name, traced, scalar, components)
         self.plain_rows: PlainRows | None = log_format.plain_rows if log_format else None
-        self.plot_rows: PlotRows | None = log_format.plot_rows if log_format else None
+        self.log_format: LogFormat | None = log_format
         self.log_columns: Mapping[str, str] = columns or {}
 
     def columns(self, part: str) -> list[str]:
@@ -114,13 +136,19 @@ class LogText(FilterText):
 
     def log_program(self, request: "ExportRequest") -> str:
         """Text of a program that reads a log of the user; empty where its rows are no plain rows, and no filter was
-        advised for a table of plots.
+        advised for a table.
         """
         if self.plain_rows is not None:
             return self._plain_log(self.plain_rows, request.keywords.get("sampling_interval"))
-        if self.plot_rows is None or request.log is None:
+        log, log_format = request.log, self.log_format
+        if log is None or log_format is None:
             return ""
-        return self._plot_log(self.plot_rows, request.log)
+        if log_format.plot_rows is not None:
+            return self._plot_log(log_format.plot_rows, log)
+        if log_format.regular_rows is None:
+            return ""
+        parameters = {**log.scenario(request.problem.task).parameters, **request.keywords}
+        return self._regular_log(log_format.regular_rows(request.problem.task.Parameters(**parameters)), log)
 
     def _log(
         self,
@@ -129,7 +157,6 @@ class LogText(FilterText):
         names: Sequence[str],
         needed: int,
         limits: Mapping[str, float],
-        members: str = "",
     ) -> str:
         """Text of the program.
 
@@ -139,17 +166,15 @@ class LogText(FilterText):
             names: of the columns, in lower case.
             needed: of them, the first ones.
             limits: further numbers of the reading.
-            members: further ones of a row.
         """
         shown = [identifier(name) for name, _ in self.components]
         header = ["time", "status", *(f"estimate_{n}" for n in shown), *(f"sigma_{n}" for n in shown)]
         defined = {**READING, **limits}
         time = self.log_columns.get("time")
         C = len(self.components)
-        return LOG.format(
+        text = LOG.format(
             own=self.name,
             about=about,
-            include=self.name if members else "rows",
             reading="\n".join(f"#define {name} {_number(value)}" for name, value in defined.items()),
             count=len(names),
             needed=needed,
@@ -158,14 +183,13 @@ class LogText(FilterText):
             recording=_quote(self.log_columns.get(RECORDING, RECORDING).lower()),
             delimiters=_quote(DELIMITERS),
             units=", ".join(map(literal, TIME_UNITS)),
-            members=members,
-            follow=follow,
             header=name_list(",".join(header)),
             C=C,
             digits=17 if self.scalar is DOUBLE else 9,
             mean="" if C == 1 else "[i]",
             covariance="" if C == 1 else "[i][i]",
         )
+        return f"{text}{READER}\n{follow}"
 
     def _plain_log(self, rows: PlainRows, interval: float | None) -> str:
         """Text of the program for rows that are measurements as they stand.
@@ -219,7 +243,9 @@ class LogText(FilterText):
             odometry=READ_ODOMETRY.format(displacement=ODOMETRY[second]) if moves and second else "",
             read_odometry="if (read_odometry(n) != 0) return 2;\n    " if moves else "",
             stated_polar=int(deviations[0] == "range_sigma"),
-            fill=self._plot_fill(),
+            measurement=len(self.structs["measurement"].columns),
+            initial=len(self.structs["initial"].columns),
+            fill=self._assign("measurement", PLOT_VALUES, "    "),
             start=self._plot_start(),
         )
         about = """A track starts from the first two plots, the second of which is before the first row that is
@@ -227,29 +253,107 @@ class LogText(FilterText):
         limits = {"FARTHEST": rows.farthest, "MOST_MISSED": rows.most_missed, "FINER": rows.finer}
         if moves and second:
             limits["FIRST_ODOMETRY"] = first.index(second[0])
-        return self._log(about, follow, columns, 2, limits, MEMBERS)
+        return self._log(about, follow, columns, 2, limits)
 
-    def _plot_fill(self) -> str:
-        """Statements that make a measurement ``m`` of a plot."""
-        struct, real = self.structs["measurement"], self.scalar.name
-        return "\n    ".join(
-            f"m.{place} = ({real})({PLOT_VALUES[struct.columns[row]]});"
-            for row, place in sorted(struct.places.items())
+    def _regular_log(self, numbers: Mapping[str, float], log: LogSetup) -> str:
+        """Text of the program for rows at one rate, as they were read when a filter was advised; empty for other logs.
+
+        Args:
+            numbers: that the reading needs.
+            log: how it was read.
+        """
+        if "range_rate" in log.columns:
+            rows = _rows_with_looks(log.columns, numbers)
+        elif {"ins", "ins_x"} & {*log.columns}:
+            rows = _rows_with_fixes(log.columns, numbers["usual_sigma"])
+        else:
+            return ""
+        sizes = [len(self.structs[part].columns) for part in ("measurement", "initial")]
+        follow = REGULAR_ROWS.format(
+            own=self.name,
+            interval=literal(float(log.parameters.get("sampling_interval", log.interval))),
+            reading=rows.reading,
+            most=max(sizes),
+            start=self._assign("initial", rows.start, 12 * " "),
+            fill=self._assign("measurement", rows.values, 8 * " "),
         )
+        about = "A track starts with its first row, which has no estimate; all rows are one interval apart."
+        columns = [log.columns[name].lower() for name in rows.names]
+        return self._log(about, follow, columns, rows.needed, {"UNEVEN": UNEVEN, **rows.limits})
+
+    def _assign(self, part: str, values: Mapping[str, str], indent: str) -> str:
+        """Statements that give every number of a struct its value, zero where none is named."""
+        columns = sorted(self.structs[part].columns.items())
+        return f"\n{indent}".join(f"given[{row}] = {values.get(name, '0.0')};" for row, name in columns)
 
     def _plot_start(self) -> str:
         """Statements that make the ``initial`` estimate of two plots, as the reader does."""
-        struct, real = self.structs["initial"], self.scalar.name
         values = {"mean_0": "p[0]", "mean_1": "p[1]"}
         values |= {f"mean_{i + 2}": f"(p[{i}] - p0[{i}]) / lasted" for i in range(2)}
         for i in range(2):
             values[f"covariance_{i}_{i}"] = f"v[{i}]"
             values[f"covariance_{i}_{i + 2}"] = values[f"covariance_{i + 2}_{i}"] = f"v[{i}] / lasted"
             values[f"covariance_{i + 2}_{i + 2}"] = f"(v0[{i}] + v[{i}]) / (lasted * lasted)"
-        return "\n                ".join(
-            f"initial.{place} = ({real})({values.get(struct.columns[row], '0.0')});"
-            for row, place in sorted(struct.places.items())
-        )
+        return self._assign("initial", values, 16 * " ")
+
+
+class RegularReading(NamedTuple):
+    """How rows at one rate are read."""
+
+    names: list[str]
+    """Of the columns."""
+    needed: int
+    """Of them, the first ones."""
+    reading: str
+    """Text of the function ``read_values``."""
+    values: Mapping[str, str]
+    """What the numbers of a measurement are."""
+    start: Mapping[str, str]
+    """What those of the initial estimate are in the first row; zero where none is named."""
+    limits: Mapping[str, float]
+    """Numbers of the reading; ``WHOLE`` of the first columns have no empty cell."""
+
+
+def _with_others(first: list[str], columns: Mapping[str, str]) -> list[str]:
+    """Names of columns, and of all others of a log: these say which rows supply each other."""
+    return [*first, *(name for name in columns if name not in (*first, "time", RECORDING))]
+
+
+def _rows_with_fixes(columns: Mapping[str, str], usual: float) -> RegularReading:
+    """Read positions by an INS and by a receiver, whose deviation is the ``usual`` one where no column states it, m."""
+    ends = [""] if "ins" in columns else sorted(name[3:] for name in columns if name.startswith("ins_"))
+    A, stated = len(ends), int("sigma" in columns)
+    first = [*(f"ins{end}" for end in ends), *["sigma"] * stated, *(f"fix{end}" for end in ends)]
+    deviation = f"cell[{A}]" if stated else literal(usual)
+    values, start = {"number": "(double)i", "available": "found[0]", "reported_deviation": deviation}, {}
+    for axis in range(A):
+        end = f"_{axis}" * (A > 1)
+        values[f"ins{end}"] = start[f"mean{end}"] = f"cell[{axis}]"
+        values[f"increment{end}"] = f"cell[{axis}] - before[{axis}]"
+        values[f"fix{end}"] = f"found[0] > 0.0 ? cell[{A + stated + axis}] : 0.0"
+    return RegularReading(
+        _with_others(first, columns),
+        len(first),
+        READ_FIXES.format(axes=A, check=CHECK_SIGMA.format(sigma=A) if stated else ""),
+        values,
+        start,
+        {"WHOLE": A + stated},
+    )
+
+
+def _rows_with_looks(columns: Mapping[str, str], numbers: Mapping[str, float]) -> RegularReading:
+    """Read what radar and ESM report, by the ``numbers`` that the format names."""
+    first = ["range", "range_rate", *(name for name in columns if name == "looked")]
+    names = _with_others(first, columns)
+    optional = ("looked", "decision", "bearing_difference", "radar_bearing", "esm_bearing")
+    cells = {name: f"row->cell[{names.index(name)}]" if name in names else "(double)NAN" for name in optional}
+    start = {"mean_0": "cell[0]", "mean_1": "cell[1]"}
+    start |= {f"covariance_{i}_{i}": literal(numbers[f"variance_{i}"]) for i in range(3)}
+    start |= {f"first_{name}": value for name, value in LOOK_VALUES.items()}
+    limits = {name.upper(): numbers[name] for name in ("types", "esm_period", "horizon")}
+    return RegularReading(
+        names, len(first), READ_LOOKS.format(**cells), LOOK_VALUES, start, {"WHOLE": len(first), **limits}
+    )
 
 
 def _number(value: float) -> str:

@@ -43,7 +43,9 @@ def request_export(
     """
     found = find_competitor(problem, name, trust)
     log = found.log
-    read = log.parameters if log is not None and scenario is None else {}
+    read: dict[str, Any] = {}
+    if log is not None and scenario is None:
+        read, scenario = log.parameters, log.scenario(problem.task)
     return ExportRequest(
         problem,
         _own_name(problem, name),

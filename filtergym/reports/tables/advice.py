@@ -116,9 +116,7 @@ def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
             _number(one.nis, ".2f"),
             _interval(one.correlation, "+.2f"),
         )
-        withheld = (
-            () if errors is None else (_number(errors.get(one.name, math.nan)),)
-        )
+        withheld = () if errors is None else (_number(errors.get(one.name, math.nan)),)
         yield Row(one.name, _label(advice, one), (*cells, *withheld))
     if errors is not None:
         yield Row(ONBOARD, ONBOARD, (*["-"] * len(COLUMNS), _number(errors[ONBOARD])))
