@@ -12,7 +12,7 @@ environment with the same seed bit for bit.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy
@@ -48,72 +48,11 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     return map_nested(replaced, old, new)
 
 
-class EpisodeStepper(Protocol):
-    """What steps the episodes of a model: :class:`.Stepper` or :class:`ModelStepper`.
-
-    ``others`` are steppers of the same kind, width and task. What is done with the first one is done with them beside
-    it, on the same noise.
-    """
-
-    def begin(self, identities: numpy.ndarray, noise: EpisodeNoise, others: Any) -> tuple[Array, Array]:
-        """Start episodes everywhere and let their first measurement arrive, see :meth:`.Stepper.begin`."""
-        ...
-
-    def begin_some(
-        self, lanes: numpy.ndarray, identities: numpy.ndarray, noise: EpisodeNoise, others: Any
-    ) -> tuple[Array, Array]:
-        """Start episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
-        ...
-
-    def load(self, episode: Episode, shown: Array = None) -> None:
-        """Go on from other episodes; what they show, ``(fields, width)``, is observed from them unless it is given."""
-        ...
-
-    def episode(self) -> Episode:
-        """Return the episodes, in arrays that stay as they are."""
-        ...
-
-    def take(self, action: Array) -> None:
-        """Apply an action from the next decision on, batch first, of all lanes or of the first."""
-        ...
-
-    def decide(self, noise: EpisodeNoise, others: Any) -> None:
-        """Answer all measurements of a decision by the action, and report on each."""
-        ...
-
-    def reports(self) -> list[Any]:
-        """Return these reports, each of arrays ``(..., width)`` that stay as they are."""
-        ...
-
-    @property
-    def rewards(self) -> Any:
-        """These reports where each is one number, ``(interval, width)``."""
-        ...
-
-    def observation_by_field(self) -> Array:
-        """What is shown, ``(fields, width)``, until the next decision."""
-        ...
-
-    def observation(self, count: int) -> Array:
-        """Observation of the first lanes, batch first; the caller may keep it."""
-        ...
-
-    def take_alone(self, action: Array) -> None:
-        """Apply an action of the first lane from the next decision on."""
-        ...
-
-    def first_reward(self, beside: Any) -> float:
-        """Mean of the rewards of the first lane, less those of what runs beside it, if anything does."""
-        ...
-
-    def observation_of_first(self) -> Array:
-        """Observation of the first lane; the caller may keep it."""
-        ...
-
-
 class ModelStepper:
-    """Episodes stepped by the functions of their model, in arrays that never change; calls as of
-    :class:`EpisodeStepper`.
+    """Episodes stepped by the functions of their model, in arrays that never change; calls as of :class:`.Stepper`.
+
+    ``others`` are steppers of the same kind, width and task: what is done with this one is done with them beside it, on
+    the same noise.
 
     Args:
         model: whose episodes they are.
@@ -272,8 +211,10 @@ class Lanes:
         self._on_start, self._report = on_start, report
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
-        self._moving: Sequence[EpisodeStepper] = []
-        """Steppers that hold the episodes, of the task and of what runs beside it; none before the first episode."""
+        self._moving: Sequence[Any] = []
+        """Those that hold the episodes, :class:`.Stepper` or :class:`ModelStepper`, of the task and of what runs beside
+        it; none before the first episode.
+        """
         self.noise = EpisodeNoise(task, count)
         self._some: dict[int, EpisodeNoise] = {}
         """Noise of lanes that restart while others fly on, by their number."""
@@ -363,7 +304,7 @@ class Lanes:
         reward = own.first_reward(beside[0] if beside else None)
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
-    def _take_and_decide(self, action: Array, report: Report) -> Sequence[EpisodeStepper]:
+    def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
         """Apply one decision to all its measurements; returns the steppers that have the reports."""
         steppers = self._reporting(report)
         steppers[0].take(action)
@@ -433,7 +374,7 @@ class Lanes:
             else self.task.constant(actions)
         )
 
-    def _reporting(self, report: Report) -> Sequence[EpisodeStepper]:
+    def _reporting(self, report: Report) -> Sequence[Any]:
         """Steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving
