@@ -382,7 +382,8 @@ class Stepper:
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
-        sequence = CallSequence(*turns, moving, steps, self._tiled(turns), self._together)
+        even, odd = turns
+        sequence = CallSequence(even, odd, moving, steps, self._tiled(turns), self._together)
         sequence.run_once(self.width, self._threads)
         self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
         answers = [
