@@ -228,7 +228,9 @@ class Call:
         native(self.address, first, last)
 
 
-def run_over(call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST) -> None:
+def run_over(
+    call: Callable[[int, int], None], width: int, threads: int, fewest: int = FEWEST, grain: int = LANES
+) -> None:
     """Run over all lanes, shared by some threads; the numbers do not depend on how many.
 
     Args:
@@ -236,12 +238,13 @@ def run_over(call: Callable[[int, int], None], width: int, threads: int, fewest:
         width: lanes.
         threads: how many share them, this one among them.
         fewest: lanes that are worth a thread.
+        grain: lanes that one thread has together.
     """
     threads = min(threads, width // fewest)
     if threads <= 1:
         call(0, width)
         return
-    cuts = [width * i // threads // LANES * LANES for i in range(threads)] + [width]
+    cuts = [width * i // threads // grain * grain for i in range(threads)] + [width]
     pool = _pool(threads - 1, os.getpid())
     others = [pool.submit(call, *cut) for cut in itertools.pairwise(cuts[1:])]
     call(0, cuts[1])

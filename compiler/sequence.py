@@ -47,13 +47,14 @@ entry:
   %tile = load i64, ptr %tile.place
   %lasting.place = getelementptr i64, ptr %given, i64 8
   %lasting = load ptr, ptr %lasting.place
-  %lasts.place = getelementptr i64, ptr %given, i64 9
+  %hops.place = getelementptr i64, ptr %given, i64 9
+  %hops = load ptr, ptr %hops.place
+  %lasts.place = getelementptr i64, ptr %given, i64 10
   %lasts = load i64, ptr %lasts.place
-  %hop = mul i64 %tile, 8
   br label %tile.head
 tile.head:
   %start = phi i64 [%first, %entry], [%ahead, %tile.next]
-  %hopped = phi i64 [0, %entry], [%hops, %tile.next]
+  %tiles = phi i64 [0, %entry], [%tiles.after, %tile.next]
   %ahead = add i64 %start, %tile
   %whole = icmp slt i64 %ahead, %last
   %end = select i1 %whole, i64 %ahead, i64 %last
@@ -113,7 +114,7 @@ rewind.body:
   %back.after = add i64 %back, 1
   br label %rewind.head
 hop.start:
-  %hops = add i64 %hopped, %hop
+  %tiles.after = add i64 %tiles, 1
   br label %hop.head
 hop.head:
   %same = phi i64 [0, %hop.start], [%same.after, %hop.body]
@@ -122,9 +123,11 @@ hop.head:
 hop.body:
   %same.place = getelementptr ptr, ptr %lasting, i64 %same
   %same.at = load ptr, ptr %same.place
+  %hop.place = getelementptr i64, ptr %hops, i64 %same
+  %hop = load i64, ptr %hop.place
   %there = load i64, ptr %same.at
-  %nearer = sub i64 %there, %hop
-  store i64 %nearer, ptr %same.at
+  %further = add i64 %there, %hop
+  store i64 %further, ptr %same.at
   %same.after = add i64 %same, 1
   br label %hop.head
 tile.next:
@@ -136,8 +139,11 @@ home.head:
 home.body:
   %home.place = getelementptr ptr, ptr %lasting, i64 %home
   %home.at = load ptr, ptr %home.place
+  %leap.place = getelementptr i64, ptr %hops, i64 %home
+  %leap = load i64, ptr %leap.place
+  %hopped = mul i64 %leap, %tiles
   %away = load i64, ptr %home.at
-  %begun = add i64 %away, %hopped
+  %begun = sub i64 %away, %hopped
   store i64 %begun, ptr %home.at
   %home.after = add i64 %home, 1
   br label %home.head
@@ -183,8 +189,9 @@ class CallSequence:
         odd: those of an odd step, as many; needed where there is more than one step.
         moving: what moves on with every step, in tables of these calls; after the last step it is where it was.
         steps: how many; the first is an even one.
-        passing: places of arrays ``(..., tile)`` of these calls that every tile of lanes has after the other: what lies
-            in them when a tile ends is lost.
+        passing: places of arrays ``(..., tile)`` of these calls, those of the first tile of lanes, and how many bytes
+            further on those of the next one lie. Zero: every tile has them after the other, and what lies in them
+            when a tile ends is lost.
         tile: lanes that go through all steps together.
     """
 
@@ -194,7 +201,7 @@ class CallSequence:
         odd: Sequence[Call] = (),
         moving: Sequence[Moving] = (),
         steps: int = 1,
-        passing: Sequence[tuple[Call, int]] = (),
+        passing: Sequence[tuple[Call, int, int]] = (),
         tile: int = TILE,
     ) -> None:
         self._calls, self._form = [*even, *odd], (len(even), steps, tile)
@@ -211,7 +218,9 @@ class CallSequence:
             [each.call.address + 8 * each.entry for each in moving], dtype=numpy.int64
         )
         self._passing = passing
-        self._lasting = numpy.array([call.address + 8 + 16 * i for call, i in passing], dtype=numpy.int64)
+        self._lasting = numpy.array([call.address + 8 + 16 * i for call, i, _ in passing], dtype=numpy.int64)
+        # Calls count lanes from the first of all.
+        self._hops = numpy.array([apart - 8 * tile for *_, apart in passing], dtype=numpy.int64)
         self._given = self._put_together(self._tables, self._entries, self._lasting)
         self._run = functools.partial(_driver(), address_of(self._given))
         self._shares: dict[tuple[int, int], _Share] = {}
@@ -225,7 +234,7 @@ class CallSequence:
         return numpy.array(
             [
                 *(*addresses, address_of(self._amounts), len(self._amounts), steps, tile),
-                *(address_of(lasting), len(lasting)),
+                *(address_of(lasting), address_of(self._hops), len(lasting)),
             ],
             dtype=numpy.int64,
         )
@@ -258,7 +267,9 @@ class CallSequence:
         if alone:
             self._run(0, width)
         else:
-            run_over(self._run_share if len(self._amounts) else self._run, width, threads, LANES)
+            own_tables = len(self._amounts) or self._passing
+            grain = self._form[2] if self._passing else LANES
+            run_over(self._run_share if own_tables else self._run, width, threads, grain, grain)
         if trial:
             self._seconds[not alone] = min(self._seconds[not alone], time.perf_counter() - begin)
             self._tries += 1
@@ -279,8 +290,8 @@ class CallSequence:
             share = self._shares[first, last] = self._make_share()
         for own, call in zip(share.tables, self._calls, strict=True):
             own[:] = call.table
-        for table, place, array in share.passing:
-            table[1 + 2 * place] = address_of(array) - 8 * first
+        for table, place, array, apart in share.passing:
+            table[1 + 2 * place] = address_of(array) + first // self._form[2] * apart - 8 * first
         _driver()(share.address, first, last)
 
     def _make_share(self) -> "_Share":
@@ -296,10 +307,11 @@ class CallSequence:
         (entries, _), (lasting, owners) = moved(self._entries), moved(self._lasting)
         arrays: dict[int, numpy.ndarray] = {}
         passing = []
-        for owner, (call, place) in zip(owners, self._passing, strict=True):
-            known = call.arrays[place]
-            own = arrays.setdefault(id(known), empty_lanes(known.shape[:-1], known.shape[-1]))
-            passing.append((tables[owner], place, own))
+        for owner, (call, place, apart) in zip(owners, self._passing, strict=True):
+            own = known = call.arrays[place]
+            if not apart:
+                own = arrays.setdefault(id(known), empty_lanes(known.shape[:-1], known.shape[-1]))
+            passing.append((tables[owner], place, own, apart))
         given = self._put_together(addresses, entries, lasting)
         return _Share(tables, addresses, entries, lasting, passing, given, address_of(given))
 
@@ -311,7 +323,7 @@ class _Share(NamedTuple):
     addresses: numpy.ndarray
     entries: numpy.ndarray
     lasting: numpy.ndarray
-    passing: list[tuple[numpy.ndarray, int, numpy.ndarray]]
-    """Tables, places in them, and arrays that are there."""
+    passing: list[tuple[numpy.ndarray, int, numpy.ndarray, int]]
+    """Tables, places in them, arrays that are there, and bytes to those of the next tile."""
     given: numpy.ndarray
     address: int

@@ -1,10 +1,14 @@
 """Whole episodes in one native call are the episodes that are stepped, bit for bit."""
 
+import copy
+
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from filtergym import evaluate
 from filtergym.baselines.problem import problem_of
+from filtergym.envs.engine import stepper
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.kinds import Policy, kind_of
 from filtergym.evaluation.running import rollout as rollouts
@@ -204,3 +208,25 @@ def test_a_time_is_that_of_a_decision_without_setting_up(monkeypatch):
     # A run of about twenty milliseconds, were setting it up all that a first decision takes; some of them.
     assert set(flown) == {1, 8}
     assert flown.count(8) >= rollouts.FEWEST_RUNS
+
+
+@pytest.mark.parametrize("name", ["ManeuveringTarget", "LooselyCoupledNavigation"])
+def test_numbers_of_a_tile_side_by_side_change_no_bit(name, monkeypatch):
+    """Nor do lanes that begin anew, or a copy."""
+
+    def shown(wide, lanes=576):
+        monkeypatch.setattr(stepper, "WIDE", wide)
+        keywords = {"num_envs": lanes, "threads": 3, "autoreset_mode": "Disabled"}
+        env = gym.make_vec(f"filtergym/{name}-v0", **keywords)
+        env.action_space.seed(0)
+        found = [env.reset(seed=0)[0]]
+        for k in range(6):
+            found += env.step(env.action_space.sample())[:2]
+            if k == 1:
+                found.append(env.reset(options={"reset_mask": np.arange(lanes) % 3 == 0})[0])
+            if k == 3:
+                env = copy.deepcopy(env)
+        return found
+
+    for tiled, rows in zip(shown(64), shown(1024), strict=True):
+        np.testing.assert_array_equal(tiled, rows)

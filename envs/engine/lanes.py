@@ -113,8 +113,10 @@ class EpisodeStepper(Protocol):
 
 
 class ModelStepper:
-    """Episodes stepped by the functions of their model, in arrays that never change; calls as of
-    :class:`EpisodeStepper`.
+    """Episodes stepped by the functions of their model, in arrays that never change; calls as of :class:`.Stepper`.
+
+    ``others`` are steppers of the same kind, width and task: what is done with this one is done with them beside it, on
+    the same noise.
 
     Args:
         model: whose episodes they are.
@@ -367,7 +369,7 @@ class Lanes:
         reward = own.first_reward(beside[0] if beside else None)
         return own.observation_of_first(), reward, taken >= self._lengths.item(0)
 
-    def _take_and_decide(self, action: Array, report: Report) -> Sequence[EpisodeStepper]:
+    def _take_and_decide(self, action: Array, report: Report) -> Sequence[Any]:
         """Apply one decision to all its measurements; returns the steppers that have the reports."""
         steppers = self._reporting(report)
         steppers[0].take(action)
@@ -437,7 +439,7 @@ class Lanes:
             else self.task.constant(actions)
         )
 
-    def _reporting(self, report: Report) -> Sequence[EpisodeStepper]:
+    def _reporting(self, report: Report) -> Sequence[Any]:
         """Steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...compiler.block import LANES
 from ...compiler.functions import (
     DTYPES,
     Call,
@@ -32,6 +33,9 @@ def mean_of(rewards: Sequence[Any]) -> Any:
 
 MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
+WIDE = 1024
+"""Lanes beyond which the numbers of a tile of them lie side by side: more leave the cache between two steps, and memory
+is read faster in one piece than row by row."""
 
 
 class Stepper:
@@ -64,6 +68,11 @@ class Stepper:
         self.action[...] = 0.0
         self._first_action = self.action[..., 0]
         fields = predict.outputs[-1].shape[0] if world_of is None else 0
+        # A width without a divisor of that order stays in rows.
+        tiles = range(4 * TILE, TILE - 1, -LANES) if width > WIDE else ()
+        self._tile = next((tile for tile in tiles if width % tile == 0), width)
+        self._together = self._tile if self._tile < width else TILE
+        """Lanes that go through a decision together."""
         self._shown, self._given = numpy.empty((width, fields)), False
         self._first_shown = self._shown[0]
         self._reported = memory_of(tell.outputs, width)
@@ -75,16 +84,22 @@ class Stepper:
         handed_on = [ahead_of_filter + i in update.same for i in range(states)]
         stays = [*(same is not None for same in advance.same), *(not handed for handed in handed_on)]
         stays = stays[self._shared :]
-        self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
+        stay, go = ([o for o, s in zip(outputs, stays, strict=True) if s is which] for which in (True, False))
+        self._staying, staying = _side_by_side(stay, width, self._tile)
         self._going: list[numpy.ndarray] = []
-        """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
+        """Of each copy the numbers of all arrays that are not shared, ``(numbers, tiles, tile)``."""
         self._copies: list[list[numpy.ndarray]] = []
         for world in ([], []) if world_of is None else world_of._copies:
-            numbers, going = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if not s], width)
+            numbers, going = _side_by_side(go, width, self._tile)
             self._going.append(numbers)
             kept, own = iter(staying), iter(going)
             self._copies.append([*world[: self._shared], *(next(kept if s else own) for s in stays)])
-        first, second = self._copies
+        first, second = ([array[..., 0, :] for array in copy] for copy in self._copies)
+        tiled = [*self._copies[0], *self._copies[1]] if self._tile < width else []
+        self._apart = [
+            (part, array.strides[-2]) for part, array in zip([*first, *second], tiled, strict=False)
+        ]
+        """Arrays of the first tile of lanes, and the bytes from them to those of the next one."""
         written = self._written = memory_of(update.outputs, width)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
@@ -147,14 +162,15 @@ class Stepper:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
         own = zip(self._copies[self._now], leaves(episode), strict=True)
         for memory, values in itertools.islice(own, self._shared, None):
-            memory[...] = values
+            memory[...] = values.reshape(memory.shape)
         self._policy_memory = None
         if shown is not None:
             self._shown[...] = shown.T
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
-        return copy_arrays(self._template, self._copies[self._now], self._kinds)
+        arrays = [array.reshape(*array.shape[:-2], self.width) for array in self._copies[self._now]]
+        return copy_arrays(self._template, arrays, self._kinds)
 
     def begin(
         self, identities: numpy.ndarray, noise: EpisodeNoise, others: "Sequence[Stepper]" = ()
@@ -186,7 +202,10 @@ class Stepper:
                         calls[0].replace(place, numbers)
                 turn += calls
         shown = [[turn[1 + len(self._begin[0])]] for turn in turns]
-        return _bound(draw, [CallSequence(turn) for turn in turns], shown)
+        sequences = [
+            CallSequence(turn, passing=self._tiled([turn], others), tile=self._together) for turn in turns
+        ]
+        return _bound(draw, sequences, shown)
 
     def _run_bound(self, whole: bool, noise: EpisodeNoise, others: "Sequence[Stepper]") -> None:
         """Run whole decisions, or beginnings, of the task and of what runs beside it, as one native call."""
@@ -232,8 +251,9 @@ class Stepper:
         small, *smalls = [each._small[noise.width] for each in steppers]
         start = small.begin(identities, noise, smalls)
         for each, begun in zip(steppers, (small, *smalls), strict=True):
-            each._staying[:, lanes] = begun._staying[:, : len(lanes)]
-            each._going[each._now][:, lanes] = begun._going[begun._now][:, : len(lanes)]
+            place, source = numpy.divmod(lanes, each._tile), numpy.divmod(range(len(lanes)), begun._tile)
+            each._staying[:, *place] = begun._staying[:, *source]
+            each._going[each._now][:, *place] = begun._going[begun._now][:, *source]
         if self._given:
             self._show_in(self._shown.copy())
         self._shown[lanes] = small._shown[: len(lanes)]
@@ -277,35 +297,48 @@ class Stepper:
         for each in (self, *others):
             for now, turn in enumerate(turns):
                 turn += each._bound_copies(now, noise, each.reported, moving)
-        passing = self._let_pass(turns, noise, others) if self.width > TILE else []
+        passing = self._tiled(turns, others)
+        passing += self._let_pass(turns, noise, others) if self.width > self._together else []
         shown = [turn[len(self._calls[0])] for turn in turns]
         if self._passing is not None:
             moving += [moving_array(call, len(call.arrays) - 1, self._passing) for call in shown]
             shown = []
-        sequences = [CallSequence(even, odd, moving, interval, passing) for even, odd in (turns, turns[::-1])]
+        sequences = [
+            CallSequence(even, odd, moving, interval, passing, self._together)
+            for even, odd in (turns, turns[::-1])
+        ]
         return _bound(draw, sequences, [shown, shown] if interval > 1 else [shown[:1], shown[1:]])
 
     def _let_pass(
         self, turns: Sequence[Sequence[Call]], noise: EpisodeNoise, others: "Sequence[Stepper]"
-    ) -> list[tuple[Call, int]]:
+    ) -> list[tuple[Call, int, int]]:
         """Give calls of decisions memory of a tile for what is not looked at afterwards: noise, and filters between
         update and prediction. Returns where, as :class:`.CallSequence` takes it.
         """
         row = noise.call_of_each().arrays[2]
         places = {
-            id(array): empty_lanes(array.shape[:-1], TILE)
+            id(array): empty_lanes(array.shape[:-1], self._together)
             for each in (self, *others)
             for array in each._written
         }
-        places[id(row)] = empty_lanes(row.shape[:-1], TILE)
+        places[id(row)] = empty_lanes(row.shape[:-1], self._together)
         found = []
         for call in (call for turn in turns for call in turn):
             for place, array in enumerate(call.arrays):
                 memory = places.get(id(row) if call.table[1 + 2 * place] == noise.address else id(array))
                 if memory is not None:
                     call.replace(place, memory)
-                    found.append((call, place))
+                    found.append((call, place, 0))
         return found
+
+    def _tiled(
+        self, turns: Sequence[Sequence[Call]], others: "Sequence[Stepper]" = ()
+    ) -> list[tuple[Call, int, int]]:
+        """Where calls have arrays of the first tile of lanes, as :class:`.CallSequence` takes it."""
+        apart = {id(array): hop for each in (self, *others) for array, hop in each._apart}
+        calls = [call for turn in turns for call in turn]
+        places = [(call, place, apart.get(id(a), 0)) for call in calls for place, a in enumerate(call.arrays)]
+        return [each for each in places if each[-1]]
 
     def _bound_copies(
         self, now: int, noise: EpisodeNoise, reported: Sequence[numpy.ndarray], moving: list[Moving]
@@ -350,7 +383,9 @@ class Stepper:
                 moving.append(moving_array(steer, 1 + len(memories[0]), actions))
                 moving.append(moving_array(update, self._action_place, actions))
                 memories.reverse()
-        CallSequence(turns[0], turns[1], moving, steps).run_once(self.width, self._threads)
+        even, odd = turns
+        sequence = CallSequence(even, odd, moving, steps, self._tiled(turns), self._together)
+        sequence.run_once(self.width, self._threads)
         self._now, self._policy_memory = (self._now + steps) % 2, memories[steps % 2]
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
@@ -423,9 +458,17 @@ def _bound(draw: Call, sequences: list[CallSequence], shown: list[list[Call]]) -
     return _Bound(draw, sequences, shown)
 
 
-def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
-    """Memory of all numbers of some arrays, ``(numbers, width)``, and the arrays in it, ``(..., width)``."""
-    numbers = empty_lanes((sum(leaf.rows for leaf in arrays),), width)
+def _side_by_side(arrays: Sequence[Leaf], width: int, tile: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
+    """Memory of all numbers of some arrays, ``(numbers, tiles, tile)``, and the arrays in it,
+    ``(..., tiles, tile)``: those of a tile side by side.
+    """
     starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
+    if tile == width:
+        numbers = empty_lanes((starts[-1], 1), width)
+    else:
+        tiles = empty_lanes((width // tile,), starts[-1] * tile)
+        numbers = tiles.reshape(len(tiles), starts[-1], tile).swapaxes(0, 1)
     parts = zip(arrays, starts, strict=False)
-    return numbers, [numbers[at : at + leaf.rows].reshape(*leaf.shape, width) for leaf, at in parts]
+    return numbers, [
+        numbers[at : at + leaf.rows].reshape(*leaf.shape, *numbers.shape[1:]) for leaf, at in parts
+    ]
