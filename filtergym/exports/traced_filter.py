@@ -6,13 +6,17 @@ the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept o
 
 import copy
 import functools
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count as count_from
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
+from ..baselines.table import Tunable
+from ..baselines.tuned_values import TunedPolicy
 from ..compiler import namespace
 from ..compiler.functions import leaves, map_arrays
 from ..compiler.namespace import NotTraceable, Traced
@@ -20,16 +24,29 @@ from ..compiler.program import Graph, ProgramResult, ProgramSteps, StraightLineP
 from ..envs.contract.companions import array_meanings
 from ..envs.contract.filter import Filter, FilterInput
 from ..envs.contract.model import Model
+from ..envs.contract.parameters import freeze
 from ..envs.contract.task import Task, field_words
 from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.competitors.steered_filter import Decider, steer
+from .parameters import (
+    EXACT,
+    PARAMETER,
+    Declaration,
+    Declared,
+    ParameterGraph,
+    declaration,
+    expressions,
+    traced_functions,
+    with_parameters,
+)
 
 if TYPE_CHECKING:
     from ..agents.learned_policy import LearnedPolicy
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
-"""Arguments of the programs."""
+"""Arguments of the programs, beside :data:`~.parameters.PARAMETER`."""
+CONDITION = 7
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
 """What is told beside an estimate, where the filter tells it."""
 FEEDBACK = "feedback"
@@ -49,11 +66,26 @@ class Member(NamedTuple):
     """What its array is, where its class says so."""
 
 
+class FreeParameters(NamedTuple):
+    """Parameters of a filter that its user sets."""
+
+    declared: list[Declared]
+    """Arrays in the order of the rows of the argument ``PARAMETER``."""
+    derived: int
+    """Last rows of the state, which start derives of them and update leaves alone."""
+    usual: list[float | None]
+    """Values of these with the parameters in force, where the bits of a library's functions decide them."""
+    conditions: int
+    """Last results of start, in the argument ``CONDITION``: one where the program holds for these parameters."""
+    constant: list[str]
+    """Names of declared parameters that stay what they were when the filter was traced."""
+
+
 class TracedFilter(NamedTuple):
     """A filter as two programs."""
 
     start: StraightLineProgram
-    """From the initial estimate to the state."""
+    """From the initial estimate and the parameters to the state."""
     update: StraightLineProgram
     """From state and measurement to state and estimate; what a network is shown comes first among the results."""
     initial: list[Member]
@@ -66,6 +98,13 @@ class TracedFilter(NamedTuple):
     """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
     network: "LearnedPolicy | None"
     """That answers between the two parts of ``update``; None where none is asked."""
+    free: FreeParameters = FreeParameters([], 0, [], 0, [])
+    """What its user sets."""
+
+    @property
+    def values(self) -> list[float]:
+        """Parameters in force, row by row."""
+        return [value for one in self.free.declared for value in one.values]
 
 
 class FilterSteps:
@@ -164,18 +203,17 @@ def check_kind(name: str, maker: Any) -> None:
 
 
 def steps_of(
-    task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
+    traced: Task, control: str, maker: Any, plain: Model, graph: Graph
 ) -> tuple[FilterSteps, "AskedNetwork | None"]:
     """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
 
     Args:
-        task: class of the environment.
+        traced: task on traced arrays.
         control: of the competitor.
         maker: of it.
         plain: model of the same parameters on NumPy.
         graph: that is open.
     """
-    traced = task(plain.task.parameters, namespace)
     if _traced_as(maker) == "learned estimator":
         policy, network = with_asked_network(maker(plain.task).network, graph)
         steered = steer(Model(traced, maker.bank), policy, 1)
@@ -195,7 +233,8 @@ def steps_of(
         if own.in_python:
             raise NotTraceable("it does not say that it is traceable")
         return FilterSteps(own, traced.world.mask_missing), None
-    policy, network = with_asked_network(make_competitor(maker, plain), graph)
+    acting = plain if traced.parameters is plain.task.parameters else Model(traced, control)
+    policy, network = with_asked_network(make_competitor(maker, acting), graph)
     if isinstance(policy, RandomPolicy):
         raise NotTraceable("its actions are drawn")
     if not isinstance(policy, Policy):
@@ -335,7 +374,13 @@ def _is_constant(graph: Graph, node: int, value: Any) -> bool:
 
 
 def trace_filter(
-    task: type[Task], control: str, maker: Any, name: str, plain: Model, template: tuple[Any, Any]
+    task: type[Task],
+    control: str,
+    maker: Any,
+    name: str,
+    plain: Model,
+    template: tuple[Any, Any],
+    known: Mapping[str, Tunable] = MappingProxyType({}),
 ) -> TracedFilter:
     """Trace a competitor.
 
@@ -346,26 +391,82 @@ def trace_filter(
         name: of it, in errors.
         plain: model of the control on NumPy, with the parameters of the export.
         template: initial estimate and measurement, any numbers of any width.
+        known: what can be tuned, by the names of competitors: those parameters are free, and the task's.
 
     Raises:
         ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
     """
     check_kind(name, maker)
-    graph = Graph(callers=True)
-    try:
-        with namespace.tracing(graph):
-            return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
-    except NotTraceable as error:
-        raise ValueError(
-            f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
-        ) from error
+    found = declaration(plain.task, maker, known, name)
+    choices = [found.all, found.tuned, found.own, []]
+    for free in choices:
+        while True:
+            try:
+                traced = _trace_free(task, control, maker, plain, template, found, free)
+            except NotTraceable as error:
+                if not free:
+                    raise ValueError(
+                        f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
+                    ) from error
+                break
+            if isinstance(traced, TracedFilter):
+                return traced
+            free = [one for one in free if one.name not in traced]
+    raise AssertionError
+
+
+def _trace_free(
+    task: type[Task],
+    control: str,
+    maker: Any,
+    plain: Model,
+    template: tuple[Any, Any],
+    found: Declaration,
+    free: Sequence[Declared],
+) -> TracedFilter | set[str]:
+    """Trace a competitor with some of its parameters free; or the names of those that cannot be.
+
+    Args:
+        task: class of the environment.
+        control: of the competitor.
+        maker: of it.
+        plain: model of the control on NumPy.
+        template: as of :func:`trace_filter`.
+        found: all parameters.
+        free: those that are tried.
+    """
+    graph = ParameterGraph([value for one in free for value in one.values])
+    firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
+    with namespace.tracing(graph), traced_functions(graph):
+        values = {one.name: expressions(one, first, graph) for one, first in zip(free, firsts, strict=False)}
+        made = task(plain.task.parameters, namespace)
+        own = {one.name: values[one.name] for one in found.own if one.name in values}
+        if found.tunable is not None and any(one.name in values for one in found.tuned):
+            given = {one.name: values.get(one.name, one.values[0]) for one in found.tuned}
+            keywords, make = found.tunable.apply(given)
+            maker = TunedPolicy(keywords, found.tunable.control, make, "")
+            own |= {name: freeze(value) for name, value in keywords.items()}
+        if own:
+            made.parameters = with_parameters(made.parameters, own)
+            made.set_up()
+        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free)
+    names = [one.name for one in free for _ in one.values]
+    conditional = graph.rows(list(graph.conditions))
+    unused = {names[row] for row in conditional} - {one.name for one in traced.free.declared}
+    fixed = {names[row] for row in graph.settled} | unused
+    if fixed:
+        return fixed
+    left = {one.name for one in traced.free.declared}
+    constant = [one.name for one in found.tuned if one.name not in left]
+    return traced._replace(free=traced.free._replace(constant=constant))
 
 
 def _trace(
     steps: FilterSteps,
     asked: "AskedNetwork | None",
     template: tuple[Any, Any],
-    graph: Graph,
+    graph: ParameterGraph,
+    free: Sequence[Declared],
 ) -> TracedFilter:
     initial, measurement = (one_lane(part) for part in template)
     rows = count_from()
@@ -389,26 +490,87 @@ def _trace(
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])
     place = {member: row for row, member in enumerate(live)}
-    update = program(
-        graph,
-        [
-            *(ProgramResult(SHOWN, row, node) for row, node in enumerate(shown)),
-            *(ProgramResult(STATE, place[member], after[member]) for member in live),
-            *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
-        ],
-    )
-    start = program(graph, [ProgramResult(STATE, place[member], first[member]) for member in live])
+    written = [
+        *(ProgramResult(SHOWN, row, node) for row, node in enumerate(shown)),
+        *(ProgramResult(STATE, place[member], after[member]) for member in live),
+        *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
+    ]
+    derived = _derived(graph, [result.node for result in written])
+    begun = [ProgramResult(STATE, place[member], first[member]) for member in live]
+    begun += [
+        ProgramResult(STATE, len(live) + row, graph.node("number", node) if graph.logical[node] else node)
+        for row, node in enumerate(derived)
+    ]
+    used = graph.rows([result.node for result in begun])
+    declared, moved = _used_parameters(free, used)
+    if declared:
+        begun += [
+            ProgramResult(CONDITION, row, node if held else graph.node("logical_not", node))
+            for row, (node, held) in enumerate(graph.conditions.items())
+            if graph.rows([node]) <= moved.keys()
+        ]
+    start = _renumbered(program(graph, begun), PARAMETER, moved)
+    usual = [None if _is_exact(graph, node) else float(graph.value(node)) for node in derived]
+    for row, node in enumerate(derived):  # from here on they are read
+        if graph.logical[node]:
+            again = graph.input(STATE, DERIVED + row), graph.constant(0.0)
+            graph.operations[node], graph.arguments[node] = "not_equal", again
+        else:
+            graph.operations[node], graph.arguments[node] = "input", (STATE, DERIVED + row)
+    update = program(graph, written)
+    place |= {DERIVED + row: len(live) + row for row in range(len(derived))}
     listed = members_of(state)
+    kept = [listed[member] for member in live]
+    kept += [Member("derived", (len(derived),), row, DERIVED_WORDS) for row in range(len(derived))]
     return TracedFilter(
         start,
-        _renumbered(update, place),
+        _renumbered(update, STATE, place),
         members_of(initial),
         members_of(measurement),
-        [listed[member] for member in live],
+        kept,
         members_of(estimate),
         len(shown),
         asked.network if shown and asked is not None else None,
+        FreeParameters(declared, len(derived), usual, len(begun) - len(live) - len(derived), []),
     )
+
+
+DERIVED = 10**9
+"""First row of what is derived from parameters, while a filter is traced."""
+DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
+
+
+def _derived(graph: ParameterGraph, wanted: Sequence[int]) -> list[int]:
+    """Largest expressions of parameters alone that some expressions are made of."""
+    kinds: dict[int, int] = {}  # 0 constant, 1 of parameters alone, 2 of anything else
+    found: dict[int, None] = {}
+    for node in graph.live(wanted):
+        operation, parts = graph.operations[node], graph.parts(node)
+        if operation == "input":
+            kinds[node] = 1 if graph.arguments[node][0] == PARAMETER else 2
+        else:
+            kinds[node] = max((kinds[part] for part in parts), default=0) if graph.values[node] is None else 0
+        if kinds[node] == 2:
+            found |= dict.fromkeys(part for part in parts if kinds[part] == 1)
+    found |= dict.fromkeys(node for node in wanted if kinds[node] == 1)
+    return list(found)
+
+
+def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
+    """Parameters of which a row is used, and the rows that theirs become."""
+    declared, moved, first = [], {}, 0
+    for one in free:
+        rows = range(first, first + len(one.values))
+        first = rows.stop
+        if used.intersection(rows):
+            moved |= {row: len(moved) + i for i, row in enumerate(rows)}
+            declared.append(one)
+    return declared, moved
+
+
+def _is_exact(graph: Graph, node: int) -> bool:
+    """Whether an expression has the same bits whatever computes it."""
+    return all(graph.operations[part] in EXACT for part in graph.live([node]))
 
 
 def _live_members(
@@ -428,11 +590,11 @@ def _live_members(
         live = more
 
 
-def _renumbered(code: StraightLineProgram, place: dict[int, int]) -> StraightLineProgram:
-    """The program with the rows of the state that are kept."""
+def _renumbered(code: StraightLineProgram, argument: int, place: Mapping[int, int]) -> StraightLineProgram:
+    """The program with other numbers of the rows of an argument."""
     steps, arguments = code.steps, code.steps.arguments.copy()
     inputs = steps.begins[:-1][steps.which("input")]
-    rows = 1 + inputs[arguments[inputs] == STATE]
+    rows = 1 + inputs[arguments[inputs] == argument]
     arguments[rows] = [place[row] for row in arguments[rows].tolist()]
     renumbered = ProgramSteps(steps.names, steps.kinds, steps.begins, arguments, steps.logical)
     return code._replace(steps=renumbered)
