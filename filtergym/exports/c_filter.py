@@ -13,8 +13,10 @@ import numpy
 from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import helper_functions, write_program
 from ..compiler.c_text import Parameter, Scalar, comment, function_text, identifier, literal
+from .c_parameters import parameter_members, parameter_text, parameter_words
 from .c_network import memory_size, network_operations, network_text, scratch_size
 from .c_structs import struct_text, structure
+from .parameters import PARAMETER
 from .traced_filter import ANSWER, ESTIMATE, INITIAL, MEASUREMENT, SHOWN, STATE, TracedFilter, count_answers
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
@@ -46,7 +48,7 @@ class FilterText:
         self.about: list[str] = []
         self.name = own = file_stem(name)
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
-        parts["estimate"] = traced.estimate
+        parts |= {"estimate": traced.estimate, "parameters": parameter_members(traced.free.declared)}
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
         self.memory = memory_size(traced.network) if traced.network is not None else 0
         self.has_state = bool(traced.state or self.memory)
@@ -56,7 +58,7 @@ class FilterText:
     def _parameters(self, *parts: str) -> list[Parameter]:
         """Parameters that point to structs; ``const`` is what is only read."""
         return [
-            Parameter(f"{'const ' * (part in ('initial', 'measurement'))}{self.structs[part].name} *", part)
+            Parameter(f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *", part)
             for part in parts
         ]
 
@@ -67,22 +69,27 @@ class FilterText:
 
     def _start(self) -> tuple[str, Any]:
         to, given = self.structs["state"].places, self.structs["initial"].places
-        parameters = self._parameters("state", "initial")
+        parameters, own, free = self._parameters("state", "initial", "parameters"), self.name, self.traced.free
+        chosen = self.structs["parameters"].places
         source = write_program(
             self.traced.start,
-            f"{self.name}_start",
+            f"{own}_start",
             parameters,
-            lambda _, row: f"initial->{given[row]}",
+            lambda argument, row: f"initial->{given[row]}" if argument == INITIAL else f"parameters->{chosen[row]}",
             lambda _, row: f"state->{to[row]}",
             self.scalar,
-            arrays=Arrays({INITIAL: self._rows("initial")}, {STATE: self._rows("state", qualifier="")}),
+            arrays=Arrays(
+                {INITIAL: self._rows("initial"), PARAMETER: self._rows("parameters")},
+                {STATE: self._rows("state", qualifier="")},
+            ),
         )
         body = list(source.body)
         if self.memory:
             zero = literal(0.0, self.scalar)
-            body += [f"for (i = 0; i < {self.memory}; ++i) state->network[i] = {zero};"]
-            body.insert(0, "int i;")
-        return f"{source.functions}\n{function_text('void', f'{self.name}_start', parameters, body)}", source
+            body += [f"for (int k = 0; k < {self.memory}; ++k) state->network[k] = {zero};"]
+        before, checks, after = parameter_text(own, free, self.scalar)
+        body = [*checks, *body, *after, f"return {own.upper()}_TAKEN;"]
+        return f"{before}{source.functions}\n{function_text('int', f'{own}_start', parameters, body)}", source
 
     def _update(self) -> tuple[str, Any]:
         traced, real, own = self.traced, self.scalar.name, self.name
@@ -128,7 +135,7 @@ class FilterText:
         body = list(source.body)
         if self.has_state:
             # What is written is not what is read.
-            start = " = *state" if self.memory else ""
+            start = " = *state" if self.memory or traced.free.derived else ""
             body = [
                 f"{state.name} after{start};",
                 f"{state.name} *const next = &after;",
@@ -226,7 +233,12 @@ class FilterText:
         )
         refused = "its interval is negative or no number" if timed else "never, without an interval"
         functions = {
-            "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
+            "start": (
+                "Begins a track with an initial estimate and parameters; NULL in place of parameters: those of "
+                f"{own}_defaults. Returns {own.upper()}_TAKEN, or {own.upper()}_REFUSED where a parameter is outside its "
+                "limits: the state stays as it was.",
+                ("state", "initial", "parameters"),
+            ),
             "update": (
                 f"Takes in a measurement: {predicts}, and updates. The members of the measurement state what was "
                 "received, as in the environment. Returns what became of it; the state stays as it was where a "
@@ -239,6 +251,8 @@ class FilterText:
             f"#ifndef {guard}\n#define {guard}\n",
             '#ifdef __cplusplus\nextern "C" {\n#endif\n',
             struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
+            struct_text(structs["parameters"], scalar, parameter_words(self.traced.free)),
+            *([f"extern const {own}_parameters {own}_defaults;\n"] if self.traced.free.declared else []),
             struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
             struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
             struct_text(
@@ -261,8 +275,7 @@ class FilterText:
         )
         for name, (words, parts) in functions.items():
             arguments = ", ".join(f"{p.type}{p.name}" for p in self._parameters(*parts))
-            answer = "int" if name == "update" else "void"
-            text.append(f"{comment(words)}\n{answer} {own}_{name}({arguments});\n")
+            text.append(f"{comment(words)}\nint {own}_{name}({arguments});\n")
         text.append(f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n")
         return "\n".join(text)
 

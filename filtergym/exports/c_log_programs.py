@@ -677,7 +677,7 @@ static int follow(long n) {{
                 const double lasted = row->time - last;
                 {own}_initial initial;
                 {start}
-                {own}_start(&state, &initial);
+                {own}_start(&state, &initial, NULL);
             }}
             memcpy(p0, p, sizeof p0);
             memcpy(v0, v, sizeof v0);
@@ -732,7 +732,7 @@ static int follow(long n) {{
         held[c - RECEIVED] = own[k]->cell[c];
     }}
     set_initial(&initial, initial_estimate);
-    {own}_start(&state, &initial);
+    {own}_start(&state, &initial, NULL);
     before = own[0]->time - (FIRST > 0.0 ? FIRST : INTERVAL > 0.0 ? INTERVAL : usual_interval(n));
     for (i = 0; i < n; ++i) {{
         const Row *row = own[i];

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..compiler.functions import address_of, empty_lanes, leaves, round_up_lanes
-from ..compiler.interpretation import first_steps, interpret
+from ..compiler.interpretation import first_steps, in_range, interpret
 from ..compiler.library import portable
 from ..compiler.native import AVAILABLE, native
 from ..compiler.program import StraightLineProgram
@@ -172,12 +172,10 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64
     network = None if traced.network is None else _Network(traced.network, dtype)
-    given = {INITIAL: replayed.initial, PARAMETER: traced.values}
+    given = {INITIAL: replayed.initial, PARAMETER: traced.free.values}
     state = interpret(traced.start, lambda argument, row: given[argument][row], dtype)
-    state = state[: len(traced.state)]
-    derived = state[len(state) - traced.free.derived :]
-    for row, usual in enumerate(traced.free.usual):
-        derived[row] = derived[row] if usual is None else numpy.asarray(usual, dtype)
+    derived = list(in_range(numpy.array(traced.free.derived), dtype))
+    state = [*state[: len(state) - len(derived)], *derived]
     update = _CompiledUpdate(traced, E) if compiled else functools.partial(_interpret_update, traced, dtype)
     answers = []
     for measured in replayed.measurements:

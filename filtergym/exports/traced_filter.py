@@ -69,16 +69,22 @@ class Member(NamedTuple):
 class FreeParameters(NamedTuple):
     """Parameters of a filter that its user sets."""
 
-    declared: list[Declared]
+    declared: Sequence[Declared] = ()
     """Arrays in the order of the rows of the argument ``PARAMETER``."""
-    derived: int
-    """Last rows of the state, which start derives of them and update leaves alone."""
-    usual: list[float | None]
-    """Values of these with the parameters in force, where the bits of a library's functions decide them."""
-    conditions: int
-    """Last results of start, in the argument ``CONDITION``: one where the program holds for these parameters."""
-    constant: list[str]
+    derived: Sequence[float] = ()
+    """Values of the last rows of the state with the parameters in force: ``start`` derives these rows of the
+    parameters, and ``update`` leaves them alone."""
+    exact: int = 0
+    """First ones of them that have the same bits in double whatever computes them."""
+    condition: StraightLineProgram | None = None
+    """From the parameters to one result, whether the programs hold for them; None: for any within the limits."""
+    constant: Sequence[str] = ()
     """Names of declared parameters that stay what they were when the filter was traced."""
+
+    @property
+    def values(self) -> list[float]:
+        """Parameters in force, row by row."""
+        return [value for one in self.declared for value in one.values]
 
 
 class TracedFilter(NamedTuple):
@@ -98,13 +104,8 @@ class TracedFilter(NamedTuple):
     """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
     network: "LearnedPolicy | None"
     """That answers between the two parts of ``update``; None where none is asked."""
-    free: FreeParameters = FreeParameters([], 0, [], 0, [])
+    free: FreeParameters = FreeParameters()
     """What its user sets."""
-
-    @property
-    def values(self) -> list[float]:
-        """Parameters in force, row by row."""
-        return [value for one in self.free.declared for value in one.values]
 
 
 class FilterSteps:
@@ -398,19 +399,25 @@ def trace_filter(
     """
     check_kind(name, maker)
     found = declaration(plain.task, maker, known, name)
-    choices = [found.all, found.tuned, found.own, []]
-    for free in choices:
+    for free in (found.all, found.tuned, found.own, []):
         while True:
             try:
                 traced = _trace_free(task, control, maker, plain, template, found, free)
             except NotTraceable as error:
-                if not free:
-                    raise ValueError(
-                        f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
-                    ) from error
-                break
+                if free:
+                    break
+                raise ValueError(
+                    f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
+                ) from error
             if isinstance(traced, TracedFilter):
-                return traced
+                left = {one.name for one in traced.free.declared}
+                tried = {one.name for one in free}
+                constant = [
+                    one.name
+                    for one in found.all
+                    if one.name not in left and (one in found.tuned or one.name not in tried)
+                ]
+                return traced._replace(free=traced.free._replace(constant=constant))
             free = [one for one in free if one.name not in traced]
     raise AssertionError
 
@@ -454,11 +461,7 @@ def _trace_free(
     conditional = graph.rows(list(graph.conditions))
     unused = {names[row] for row in conditional} - {one.name for one in traced.free.declared}
     fixed = {names[row] for row in graph.settled} | unused
-    if fixed:
-        return fixed
-    left = {one.name for one in traced.free.declared}
-    constant = [one.name for one in found.tuned if one.name not in left]
-    return traced._replace(free=traced.free._replace(constant=constant))
+    return fixed or traced
 
 
 def _trace(
@@ -495,22 +498,24 @@ def _trace(
         *(ProgramResult(STATE, place[member], after[member]) for member in live),
         *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
     ]
-    derived = _derived(graph, [result.node for result in written])
+    exact, derived = _derived(graph, [result.node for result in written])
     begun = [ProgramResult(STATE, place[member], first[member]) for member in live]
     begun += [
         ProgramResult(STATE, len(live) + row, graph.node("number", node) if graph.logical[node] else node)
         for row, node in enumerate(derived)
     ]
-    used = graph.rows([result.node for result in begun])
-    declared, moved = _used_parameters(free, used)
-    if declared:
-        begun += [
-            ProgramResult(CONDITION, row, node if held else graph.node("logical_not", node))
-            for row, (node, held) in enumerate(graph.conditions.items())
-            if graph.rows([node]) <= moved.keys()
-        ]
+    declared, moved = _used_parameters(free, graph.rows([result.node for result in begun]))
+    conditions = [
+        node if held else graph.node("logical_not", node)
+        for node, held in graph.conditions.items()
+        if declared and graph.rows([node]) <= moved.keys()
+    ]
+    condition = None
+    if conditions:
+        whole = functools.reduce(functools.partial(graph.node, "logical_and"), conditions)
+        condition = _renumbered(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
     start = _renumbered(program(graph, begun), PARAMETER, moved)
-    usual = [None if _is_exact(graph, node) else float(graph.value(node)) for node in derived]
+    usual = [float(graph.value(node)) for node in derived]
     for row, node in enumerate(derived):  # from here on they are read
         if graph.logical[node]:
             again = graph.input(STATE, DERIVED + row), graph.constant(0.0)
@@ -531,7 +536,7 @@ def _trace(
         members_of(estimate),
         len(shown),
         asked.network if shown and asked is not None else None,
-        FreeParameters(declared, len(derived), usual, len(begun) - len(live) - len(derived), []),
+        FreeParameters(declared, usual, exact, condition),
     )
 
 
@@ -540,8 +545,10 @@ DERIVED = 10**9
 DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
 
 
-def _derived(graph: ParameterGraph, wanted: Sequence[int]) -> list[int]:
-    """Largest expressions of parameters alone that some expressions are made of."""
+def _derived(graph: ParameterGraph, wanted: Sequence[int]) -> tuple[int, list[int]]:
+    """Largest expressions of parameters alone that some expressions are made of, and how many of them have the same
+    bits whatever computes them: those are the first.
+    """
     kinds: dict[int, int] = {}  # 0 constant, 1 of parameters alone, 2 of anything else
     found: dict[int, None] = {}
     for node in graph.live(wanted):
@@ -553,7 +560,9 @@ def _derived(graph: ParameterGraph, wanted: Sequence[int]) -> list[int]:
         if kinds[node] == 2:
             found |= dict.fromkeys(part for part in parts if kinds[part] == 1)
     found |= dict.fromkeys(node for node in wanted if kinds[node] == 1)
-    return list(found)
+    inexact = [any(graph.operations[part] not in EXACT for part in graph.live([node])) for node in found]
+    ordered = sorted(zip(inexact, found, strict=True), key=lambda pair: pair[0])
+    return inexact.count(False), [node for _, node in ordered]
 
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
@@ -566,11 +575,6 @@ def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Dec
             moved |= {row: len(moved) + i for i, row in enumerate(rows)}
             declared.append(one)
     return declared, moved
-
-
-def _is_exact(graph: Graph, node: int) -> bool:
-    """Whether an expression has the same bits whatever computes it."""
-    return all(graph.operations[part] in EXACT for part in graph.live([node]))
 
 
 def _live_members(
