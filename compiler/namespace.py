@@ -80,6 +80,10 @@ def _refuse_number(self: Any) -> Any:
     )
 
 
+def _round(self: Any, digits: Any = None) -> Any:
+    return builtins.round(_number(self), digits)
+
+
 def _format(self: Any, form: str) -> str:
     known = _settled(self, "words")
     return str(self) if known is None else format(known, form)
@@ -104,6 +108,7 @@ class Traced:
     __float__ = _number
     __int__ = __complex__ = _refuse_number
     __format__ = _format
+    __round__ = _round
     __setitem__ = _refuse_entry
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
@@ -209,6 +214,10 @@ class Traced:
         from .numpy_functions import mean
 
         return mean(self, axis)
+
+    def item(self) -> "Traced":
+        """Return the only entry."""
+        return self.reshape(())
 
     def dot(self, other: Any) -> "Traced":
         """Product with a vector or a matrix."""

@@ -20,7 +20,7 @@ from ..baselines.table import Tunable
 from ..baselines.tuned_values import TunedPolicy
 from ..compiler import namespace
 from ..compiler.namespace import Traced
-from ..compiler.program import FUNCTIONS, OPERATIONS, Graph
+from ..compiler.program import COMPARISONS, FUNCTIONS, OPERATIONS, Graph
 from ..envs.contract.parameters import LARGEST, ParameterLimits, field_limits
 from ..envs.contract.task import Task, field_words
 
@@ -122,16 +122,17 @@ class ParameterGraph(Graph):
     """Expressions of which some depend on parameters alone.
 
     Args:
-        values: of the parameters, in force without a choice.
+        free: parameters whose numbers are the rows of ``PARAMETER``.
 
     Attributes:
         conditions: on which branches were decided, and how.
         settled: rows of parameters that became plain numbers.
     """
 
-    def __init__(self, values: Sequence[float]) -> None:
+    def __init__(self, free: Sequence[Declared]) -> None:
         super().__init__(callers=True)
-        self.given = values
+        self.given = [value for one in free for value in one.values]
+        self.limits = [(one.low, one.high) for one in free for _ in one.values]
         self.conditions: dict[int, bool] = {}
         self.settled: set[int] = set()
         self.usual: dict[int, Any] = {}
@@ -176,10 +177,31 @@ class ParameterGraph(Graph):
         if found is None:
             return None
         if use == "branch":
-            self.conditions[node] = bool(found)
+            if not self._is_limited(node, bool(found)):
+                self.conditions[node] = bool(found)
         elif use == "number":
             self.settled |= self.rows([node])
         return found
+
+
+    def _is_limited(self, node: int, holds: bool) -> bool:
+        """Whether the limits of a parameter alone decide its comparison with a constant."""
+        name, parts = self.operations[node], self.parts(node)
+        if name not in COMPARISONS:
+            return False
+        ends = []
+        for part in parts:
+            if self.values[part] is not None:
+                ends.append((self.values[part], self.values[part]))
+            elif self.operations[part] == "input":
+                ends.append(self.limits[self.arguments[part][1]])
+            else:
+                return False
+        compare = OPERATIONS[name]
+        if name == "not_equal" or name == "equal":
+            apart = ends[0][1] < ends[1][0] or ends[1][1] < ends[0][0]
+            return apart and holds == (name == "not_equal")
+        return all(bool(compare(one, other)) == holds for one in ends[0] for other in ends[1])
 
 
 def _power(base: float, exponent: float) -> float:
@@ -196,12 +218,14 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
 
     Anything else they compute as ever, also for other threads.
     """
-    original = {name: getattr(math, name) for name in NUMBERS} | {"sqrt": math.sqrt}
+    original = {name: getattr(math, name) for name in NUMBERS} | {"sqrt": math.sqrt, "isfinite": math.isfinite}
 
     def traced(name: str, compute: Callable[..., Any]) -> Callable[..., Any]:
         def function(*arguments: Any) -> Any:
             if not any(isinstance(argument, Traced) for argument in arguments):
                 return compute(*arguments)
+            if name == "isfinite":  # what is given is checked
+                return compute(graph.value(arguments[0].nodes.item()))
             if name == "log" and len(arguments) == 2:
                 return function(arguments[0]) / function(arguments[1])
             made = getattr(namespace, name)(*arguments)

@@ -442,7 +442,7 @@ def _trace_free(
         found: all parameters.
         free: those that are tried.
     """
-    graph = ParameterGraph([value for one in free for value in one.values])
+    graph = ParameterGraph(free)
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
     with namespace.tracing(graph), traced_functions(graph):
         values = {one.name: expressions(one, first, graph) for one, first in zip(free, firsts, strict=False)}
