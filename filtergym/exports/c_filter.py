@@ -16,8 +16,7 @@ from ..compiler.c_text import Parameter, Scalar, comment, function_text, identif
 from .c_parameters import parameter_members, parameter_text, parameter_words
 from .c_network import memory_size, network_operations, network_text, scratch_size
 from .c_structs import struct_text, structure
-from .parameters import PARAMETER
-from .traced_filter import ANSWER, ESTIMATE, INITIAL, MEASUREMENT, SHOWN, STATE, TracedFilter, count_answers
+from .traced_filter import ANSWER, DERIVED, ESTIMATE, INITIAL, MEASUREMENT, SHOWN, STATE, TracedFilter, count_answers
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
 """Names that a filter's files must not have: those of the others."""
@@ -70,16 +69,23 @@ class FilterText:
     def _start(self) -> tuple[str, Any]:
         to, given = self.structs["state"].places, self.structs["initial"].places
         parameters, own, free = self._parameters("state", "initial", "parameters"), self.name, self.traced.free
-        chosen = self.structs["parameters"].places
+        own_rows = Rows("own", range(len(free.usual)))
+        inner = [*parameters, Parameter(f"const {self.scalar.name} *", "own")] if free.usual else parameters
+
+        def read(argument: int, row: int) -> str:
+            if argument == INITIAL:
+                return f"initial->{given[row]}"
+            return f"state->{to[row]}" if argument == STATE else f"own[{row}]"
+
         source = write_program(
             self.traced.start,
             f"{own}_start",
-            parameters,
-            lambda argument, row: f"initial->{given[row]}" if argument == INITIAL else f"parameters->{chosen[row]}",
+            inner,
+            read,
             lambda _, row: f"state->{to[row]}",
             self.scalar,
             arrays=Arrays(
-                {INITIAL: self._rows("initial"), PARAMETER: self._rows("parameters")},
+                {INITIAL: self._rows("initial"), STATE: self._rows("state"), DERIVED: own_rows},
                 {STATE: self._rows("state", qualifier="")},
             ),
         )
@@ -87,8 +93,8 @@ class FilterText:
         if self.memory:
             zero = literal(0.0, self.scalar)
             body += [f"for (int k = 0; k < {self.memory}; ++k) state->network[k] = {zero};"]
-        before, checks, after = parameter_text(own, free, self.scalar)
-        body = [*checks, *body, *after, f"return {own.upper()}_TAKEN;"]
+        before, derived = parameter_text(own, free, self.scalar, self.structs["parameters"])
+        body = [*derived, *body, f"return {own.upper()}_TAKEN;"]
         return f"{before}{source.functions}\n{function_text('int', f'{own}_start', parameters, body)}", source
 
     def _update(self) -> tuple[str, Any]:
@@ -135,7 +141,7 @@ class FilterText:
         body = list(source.body)
         if self.has_state:
             # What is written is not what is read.
-            start = " = *state" if self.memory or traced.free.derived else ""
+            start = " = *state" if self.memory or traced.free.kept else ""
             body = [
                 f"{state.name} after{start};",
                 f"{state.name} *const next = &after;",

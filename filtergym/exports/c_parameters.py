@@ -5,11 +5,12 @@ from collections.abc import Sequence
 
 import numpy
 
+from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import write_program
 from ..compiler.c_text import DOUBLE, Parameter, Scalar, array_text, function_text, literal
-from .c_structs import structure
-from .parameters import SUMMED, Declared
-from .traced_filter import FreeParameters, Member
+from .c_structs import Structure
+from .parameters import PARAMETER, SUMMED, Declared
+from .traced_filter import DERIVED, FreeParameters, Member
 
 
 def parameter_members(declared: Sequence[Declared]) -> list[Member]:
@@ -41,64 +42,95 @@ def parameter_words(free: FreeParameters) -> str:
     return text
 
 
-def parameter_text(own: str, free: FreeParameters, scalar: Scalar) -> tuple[str, list[str], list[str]]:
-    """Return tables and functions of the parameters, and the statements at the beginning and the end of start.
+def parameter_text(
+    own: str, free: FreeParameters, scalar: Scalar, struct: Structure
+) -> tuple[str, list[str]]:
+    """Return tables and functions of the parameters, and the statements with which start begins: they refuse what is
+    outside the limits, and derive ``own``.
 
     Args:
         own: name of the filter.
         free: its parameters.
         scalar: kind of numbers.
+        struct: of the parameters.
     """
-    if not free.declared:
-        return "", [], []
-    real, refused, count = scalar.name, f"return {own.upper()}_REFUSED;", len(free.values)
-    members = structure("", parameter_members(free.declared))
+    if free.derive is None:
+        return "", []
+    real, refused, count = scalar.name, f"return {own.upper()}_REFUSED;", len(free.usual)
+    listed = [Parameter(f"const {own}_parameters *", "parameters"), Parameter(f"{real} *", "own")]
     values = ", ".join(_value(one, scalar) for one in free.declared)
-    limits = numpy.array([_limits(one, scalar) for one in free.declared for _ in one.values])
     before = [f"const {own}_parameters {own}_defaults = {{{values}}};\n"]
-    before.append(array_text(f"{own}_limits", limits, scalar))
-    checks = [
-        f"const {real} *const given = (const {real} *)(parameters ? parameters : &{own}_defaults);",
-        "int usual = 1;",
+    before.append(array_text(f"{own}_limits", numpy.array([_limits(one, scalar) for one in free.declared]), scalar))
+    lengths = [len(one.values) for one in free.declared]
+    inner = f"if (!(*number >= {own}_limits[k][0] && *number <= {own}_limits[k][1])) {refused}"
+    loop = [f"    {inner}", "    ++number;"]
+    if len(set(lengths)) > 1:
+        before.append(f"static const unsigned short {own}_lengths[{len(lengths)}] = {{{', '.join(map(str, lengths))}}};\n")
+    length = f"{own}_lengths[k]" if len(set(lengths)) > 1 else str(lengths[0])
+    if length != "1":
+        loop = [f"    for (int i = 0; i < {length}; ++i, ++number)", f"        {inner}"]
+    body = [
+        f"const {real} *number;",
+        f"{real} own[{max(count, 1)}];",
+        f"const int usual = !parameters;" if _stated(free, scalar) else "",
         f"if (!parameters) parameters = &{own}_defaults;",
-        f"for (int k = 0; k < {count}; ++k) {{",
-        f"    if (!(given[k] >= {own}_limits[k][0] && given[k] <= {own}_limits[k][1])) {refused}",
-        f"    if (given[k] != ((const {real} *)&{own}_defaults)[k]) usual = 0;",
+        f"number = (const {real} *)parameters;",
+        f"for (int k = 0; k < {len(lengths)}; ++k) {{",
+        *loop,
         "}",
+        *_row_checks(free, scalar, struct, refused),
     ]
-    places, row = members.places, 0
+
+    def read(_: int, row: int) -> str:
+        return f"parameters->{struct.places[row]}"
+
+    if free.condition is not None:
+        source = write_program(free.condition, f"{own}_holds", listed, read, lambda *_: "own[0]", scalar)
+        before += [source.functions, function_text("static void", f"{own}_holds", listed, source.body)]
+        body += [f"{own}_holds(parameters, own);", f"if (own[0] == {literal(0.0, scalar)}) {refused}"]
+    rows = Rows(f"((const {real} *)parameters)", struct.numbers), Rows("own", range(count))
+    arrays = Arrays({PARAMETER: rows[0]}, {DERIVED: rows[1]})
+    source = write_program(
+        free.derive, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
+    )
+    before += [source.functions, function_text("static void", f"{own}_derive", listed, source.body)]
+    body.append(f"{own}_derive(parameters, own);")
+    if stated := _stated(free, scalar):
+        # The same bits whatever the functions of a library give.
+        numbers = numpy.array([free.usual[row] for row in stated])
+        before.append(array_text(f"{own}_usual", numbers, scalar))
+        place = f"own[{stated.start} + k]" if stated.start else "own[k]"
+        body.append(f"for (int k = 0; usual && k < {len(stated)}; ++k) {place} = {own}_usual[k];")
+    if free.kept:
+        body.append(f"for (int k = 0; k < {free.kept}; ++k) state->derived[k] = own[k];")
+    return "\n".join(before), [line for line in body if line]
+
+
+def _stated(free: FreeParameters, scalar: Scalar) -> range:
+    """Rows that are stated where nothing is chosen; of float all, which the filter has from double."""
+    return free.stated if scalar is DOUBLE else range(len(free.usual))
+
+
+def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused: str) -> list[str]:
+    """Statements that refuse pairs that do not ascend, and rows of probabilities that do not sum to one."""
+    checks, row = [], 0
     for one in free.declared:
-        rows = [f"parameters->{places[row + i]}" for i in range(len(one.values))]
+        rows = [f"parameters->{struct.places[row + i]}" for i in range(len(one.values))]
         row += len(rows)
         if one.limits.ascending:
             checks.append(f"if ({rows[0]} > {rows[-1]}) {refused}")
         if one.limits.stochastic:
-            width = one.shape[-1]
-            summed = literal(SUMMED if scalar is DOUBLE else 1e-6, scalar)
-            for first in range(0, len(rows), width):
-                terms = " + ".join(rows[first : first + width])
-                checks.append(f"if (!(fabs{scalar.suffix}({terms} - {literal(1.0, scalar)}) <= {summed})) {refused}")
-    if free.condition is not None:
-        given = [Parameter(f"const {own}_parameters *", "parameters")]
-        source = write_program(
-            free.condition, f"{own}_holds", given, lambda _, r: f"parameters->{places[r]}", lambda *_: "held", scalar
-        )
-        body = [f"{real} held;", *source.body, f"return held != {literal(0.0, scalar)};"]
-        before += [source.functions, function_text("static int", f"{own}_holds", given, body)]
-        checks.append(f"if (!{own}_holds(parameters)) {refused}")
-    exact = free.exact if scalar is DOUBLE else 0
-    library = free.derived[exact:]
-    after = []
-    if library:
-        # The same bits whatever the functions of a library give.
-        before.append(array_text(f"{own}_derived", numpy.array(library), scalar))
-        after = [
-            "if (usual)",
-            f"    for (int k = 0; k < {len(library)}; ++k) state->derived[{exact} + k] = {own}_derived[k];",
-        ]
-    else:
-        checks = [line for line in checks if "usual" not in line]
-    return "\n".join(before), checks, after
+            width, real = one.shape[-1], scalar.name
+            least = literal(SUMMED if scalar is DOUBLE else 1e-6, scalar)
+            first = f"&{rows[0]} + {width} * k" if len(rows) > width else f"&{rows[0]}"
+            sums = [
+                f"const {real} *const row = {first};",
+                f"{real} sum = {literal(-1.0, scalar)};",
+                f"for (int i = 0; i < {width}; ++i) sum += row[i];",
+                f"if (!(fabs{scalar.suffix}(sum) <= {least})) {refused}",
+            ]
+            checks += [f"for (int k = 0; k < {len(rows) // width}; ++k) {{", *(f"    {line}" for line in sums), "}"]
+    return checks
 
 
 def _value(one: Declared, scalar: Scalar) -> str:

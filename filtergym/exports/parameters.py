@@ -6,7 +6,7 @@ which the program holds; a parameter that becomes a plain number, or that decide
 constant.
 """
 
-import copy
+import dataclasses
 import math
 import types
 import typing
@@ -123,14 +123,16 @@ class ParameterGraph(Graph):
 
     Args:
         free: parameters whose numbers are the rows of ``PARAMETER``.
+        rounded: whether the sizes that are declared by their logarithms are numbers of few digits.
 
     Attributes:
         conditions: on which branches were decided, and how.
         settled: rows of parameters that became plain numbers.
     """
 
-    def __init__(self, free: Sequence[Declared]) -> None:
+    def __init__(self, free: Sequence[Declared], rounded: bool = False) -> None:
         super().__init__(callers=True)
+        self.rounded = rounded
         self.given = [value for one in free for value in one.values]
         self.limits = [(one.low, one.high) for one in free for _ in one.values]
         self.conditions: dict[int, bool] = {}
@@ -166,7 +168,9 @@ class ParameterGraph(Graph):
             return float(table[min(max(int(parts[0] + len(table) * (parts[0] < 0.0)), 0), len(table) - 1)])
         with numpy.errstate(all="ignore"):
             if operation == "pow":  # as Python computes it
-                return _power(float(parts[0]), float(parts[1]))
+                found = _power(float(parts[0]), float(parts[1]))
+                declared = self.rounded and parts[0] == 10.0 and self.operations[self.parts(node)[1]] == "input"
+                return float(f"{found:.15g}") if declared else found
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:
@@ -183,6 +187,10 @@ class ParameterGraph(Graph):
             self.settled |= self.rows([node])
         return found
 
+
+    def is_exact(self, node: int) -> bool:
+        """Whether an expression has the same bits whatever computes it."""
+        return all(self.operations[part] in EXACT for part in self.live([node]))
 
     def _is_limited(self, node: int, holds: bool) -> bool:
         """Whether the limits of a parameter alone decide its comparison with a constant."""
@@ -259,8 +267,8 @@ def expressions(declared: Declared, first: int, graph: Graph) -> Any:
 
 
 def with_parameters(parameters: Any, values: Mapping[str, Any]) -> Any:
-    """Parameters of a task with others, which are not checked."""
-    changed = copy.copy(parameters)
-    for name, value in values.items():
-        object.__setattr__(changed, name, value)
+    """Parameters of a task with others, which are not checked, and without what was computed of the former ones."""
+    changed = object.__new__(type(parameters))
+    for field in dataclasses.fields(parameters):
+        object.__setattr__(changed, field.name, values.get(field.name, getattr(parameters, field.name)))
     return changed

@@ -20,10 +20,10 @@ from ..evaluation.competitors.kinds import kind_of
 from ..evaluation.running.evaluate import control_of
 from ..evaluation.running.rollout import rollout, start_lanes
 from ..evaluation.running.seeds import episode_seeds
-from .parameters import PARAMETER
 from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
+    DERIVED,
     INITIAL,
     MEASUREMENT,
     SHOWN,
@@ -172,10 +172,10 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     E = replayed.initial.shape[1]
     compiled = AVAILABLE and dtype is numpy.float64
     network = None if traced.network is None else _Network(traced.network, dtype)
-    given = {INITIAL: replayed.initial, PARAMETER: traced.free.values}
-    state = interpret(traced.start, lambda argument, row: given[argument][row], dtype)
-    derived = list(in_range(numpy.array(traced.free.derived), dtype))
-    state = [*state[: len(state) - len(derived)], *derived]
+    own = list(in_range(numpy.array(traced.free.usual), dtype))
+    derived = own[: traced.free.kept]
+    given = {INITIAL: replayed.initial, DERIVED: own, STATE: dict(enumerate(derived, len(traced.state) - len(derived)))}
+    state = interpret(traced.start, lambda argument, row: given[argument][row], dtype) + derived
     update = _CompiledUpdate(traced, E) if compiled else functools.partial(_interpret_update, traced, dtype)
     answers = []
     for measured in replayed.measurements:

@@ -30,7 +30,6 @@ from ..evaluation.competitors.filters import as_filter
 from ..evaluation.competitors.kinds import RANKED, Policy, RandomPolicy, kind_of, make_competitor
 from ..evaluation.competitors.steered_filter import Decider, steer
 from .parameters import (
-    EXACT,
     PARAMETER,
     Declaration,
     Declared,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs, beside :data:`~.parameters.PARAMETER`."""
-CONDITION = 7
+DERIVED, CONDITION = 7, 8
 LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
 """What is told beside an estimate, where the filter tells it."""
 FEEDBACK = "feedback"
@@ -67,15 +66,19 @@ class Member(NamedTuple):
 
 
 class FreeParameters(NamedTuple):
-    """Parameters of a filter that its user sets."""
+    """Parameters of a filter that its user sets, and what it derives of them when a track starts."""
 
     declared: Sequence[Declared] = ()
     """Arrays in the order of the rows of the argument ``PARAMETER``."""
-    derived: Sequence[float] = ()
-    """Values of the last rows of the state with the parameters in force: ``start`` derives these rows of the
-    parameters, and ``update`` leaves them alone."""
-    exact: int = 0
-    """First ones of them that have the same bits in double whatever computes them."""
+    derive: StraightLineProgram | None = None
+    """From the parameters to the rows of the argument ``DERIVED``; None where none is free."""
+    usual: Sequence[float] = ()
+    """Values of these rows with the parameters in force, as they are in the filter itself."""
+    kept: int = 0
+    """First of these rows that are the last rows of the state, too: ``update`` reads them and leaves them alone."""
+    stated: range = range(0)
+    """Rows that computing may not give as they are in the filter, in double: a library's functions decide their
+    bits."""
     condition: StraightLineProgram | None = None
     """From the parameters to one result, whether the programs hold for them; None: for any within the limits."""
     constant: Sequence[str] = ()
@@ -399,27 +402,30 @@ def trace_filter(
     """
     check_kind(name, maker)
     found = declaration(plain.task, maker, known, name)
-    for free in (found.all, found.tuned, found.own, []):
-        while True:
-            try:
-                traced = _trace_free(task, control, maker, plain, template, found, free)
-            except NotTraceable as error:
-                if free:
-                    break
-                raise ValueError(
-                    f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
-                ) from error
-            if isinstance(traced, TracedFilter):
-                left = {one.name for one in traced.free.declared}
-                tried = {one.name for one in free}
-                constant = [
-                    one.name
-                    for one in found.all
-                    if one.name not in left and (one in found.tuned or one.name not in tried)
-                ]
-                return traced._replace(free=traced.free._replace(constant=constant))
-            free = [one for one in free if one.name not in traced]
-    raise AssertionError
+    arguments = task, control, maker, plain, template, found
+    try:
+        fixed = _trace_free(*arguments, [], numpy.zeros(0))
+    except NotTraceable as error:
+        raise ValueError(
+            f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
+        ) from error
+    assert isinstance(fixed, TracedFilter)
+    numbers = numpy.concatenate([fixed.start.constants, fixed.update.constants])
+    traced: TracedFilter | set[str] = fixed
+    for tried in (found.all, found.tuned, found.own):
+        free = tried
+        try:
+            while isinstance(traced := _trace_free(*arguments, free, numbers), set):
+                free = [one for one in free if one.name not in traced]
+        except NotTraceable:
+            traced = fixed
+            continue
+        break
+    assert isinstance(traced, TracedFilter)
+    kept = {one.name for one in free} - {one.name for one in found.tuned}
+    left = kept | {one.name for one in traced.free.declared}
+    constant = [one.name for one in found.all if one.name not in left]
+    return traced._replace(free=traced.free._replace(constant=constant))
 
 
 def _trace_free(
@@ -430,6 +436,7 @@ def _trace_free(
     template: tuple[Any, Any],
     found: Declaration,
     free: Sequence[Declared],
+    numbers: numpy.ndarray,
 ) -> TracedFilter | set[str]:
     """Trace a competitor with some of its parameters free; or the names of those that cannot be.
 
@@ -441,8 +448,9 @@ def _trace_free(
         template: as of :func:`trace_filter`.
         found: all parameters.
         free: those that are tried.
+        numbers: constants of the filter traced without.
     """
-    graph = ParameterGraph(free)
+    graph = ParameterGraph(free, rounded=not isinstance(maker, TunedPolicy))
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
     with namespace.tracing(graph), traced_functions(graph):
         values = {one.name: expressions(one, first, graph) for one, first in zip(free, firsts, strict=False)}
@@ -456,7 +464,7 @@ def _trace_free(
         if own:
             made.parameters = with_parameters(made.parameters, own)
             made.set_up()
-        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free)
+        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free, numbers)
     names = [one.name for one in free for _ in one.values]
     conditional = graph.rows(list(graph.conditions))
     unused = {names[row] for row in conditional} - {one.name for one in traced.free.declared}
@@ -470,6 +478,7 @@ def _trace(
     template: tuple[Any, Any],
     graph: ParameterGraph,
     free: Sequence[Declared],
+    numbers: numpy.ndarray,
 ) -> TracedFilter:
     initial, measurement = (one_lane(part) for part in template)
     rows = count_from()
@@ -498,13 +507,9 @@ def _trace(
         *(ProgramResult(STATE, place[member], after[member]) for member in live),
         *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
     ]
-    exact, derived = _derived(graph, [result.node for result in written])
-    begun = [ProgramResult(STATE, place[member], first[member]) for member in live]
-    begun += [
-        ProgramResult(STATE, len(live) + row, graph.node("number", node) if graph.logical[node] else node)
-        for row, node in enumerate(derived)
-    ]
-    declared, moved = _used_parameters(free, graph.rows([result.node for result in begun]))
+    begun = [first[member] for member in live]
+    own = _Derived(graph, [result.node for result in written], begun, numbers)
+    declared, moved = _used_parameters(free, graph.rows(own.nodes))
     conditions = [
         node if held else graph.node("logical_not", node)
         for node, held in graph.conditions.items()
@@ -514,55 +519,100 @@ def _trace(
     if conditions:
         whole = functools.reduce(functools.partial(graph.node, "logical_and"), conditions)
         condition = _renumbered(program(graph, [ProgramResult(CONDITION, 0, whole)]), PARAMETER, moved)
-    start = _renumbered(program(graph, begun), PARAMETER, moved)
-    usual = [float(graph.value(node)) for node in derived]
-    for row, node in enumerate(derived):  # from here on they are read
-        if graph.logical[node]:
-            again = graph.input(STATE, DERIVED + row), graph.constant(0.0)
-            graph.operations[node], graph.arguments[node] = "not_equal", again
-        else:
-            graph.operations[node], graph.arguments[node] = "input", (STATE, DERIVED + row)
+    derive = _renumbered(own.program(), PARAMETER, moved) if declared else None
+    own.read()
+    start = program(graph, [ProgramResult(STATE, row, node) for row, node in enumerate(begun)])
     update = program(graph, written)
-    place |= {DERIVED + row: len(live) + row for row in range(len(derived))}
+    place |= {KEPT + row: len(live) + row for row in range(own.kept)}
     listed = members_of(state)
-    kept = [listed[member] for member in live]
-    kept += [Member("derived", (len(derived),), row, DERIVED_WORDS) for row in range(len(derived))]
+    members = [listed[member] for member in live]
+    members += [Member("derived", (own.kept,), row, DERIVED_WORDS) for row in range(own.kept)]
     return TracedFilter(
-        start,
+        _renumbered(start, STATE, place),
         _renumbered(update, STATE, place),
         members_of(initial),
         members_of(measurement),
-        kept,
+        members,
         members_of(estimate),
         len(shown),
         asked.network if shown and asked is not None else None,
-        FreeParameters(declared, usual, exact, condition),
+        FreeParameters(declared, derive, own.values, own.kept, own.stated, condition),
     )
 
 
-DERIVED = 10**9
-"""First row of what is derived from parameters, while a filter is traced."""
+KEPT = 10**9
+"""First row of what the state keeps of it, while a filter is traced."""
 DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
+CLOSE = 1e-13
+"""Relative difference of a derived number and that of the filter itself, which computes it in another order."""
 
 
-def _derived(graph: ParameterGraph, wanted: Sequence[int]) -> tuple[int, list[int]]:
-    """Largest expressions of parameters alone that some expressions are made of, and how many of them have the same
-    bits whatever computes them: those are the first.
+class _Derived:
+    """Largest expressions of parameters alone that a filter is made of, in the order of the rows of ``DERIVED``.
+
+    Args:
+        graph: of them.
+        update: results of an update, whose expressions come first.
+        start: results of the start of a track.
+        numbers: constants of the same filter traced without parameters.
+
+    Attributes:
+        nodes: the expressions.
+        values: of them in the filter itself, with the parameters in force.
+        kept: how many are of the update.
+        stated: rows whose bits a library decides, or that are computed in another order.
     """
-    kinds: dict[int, int] = {}  # 0 constant, 1 of parameters alone, 2 of anything else
-    found: dict[int, None] = {}
-    for node in graph.live(wanted):
-        operation, parts = graph.operations[node], graph.parts(node)
-        if operation == "input":
-            kinds[node] = 1 if graph.arguments[node][0] == PARAMETER else 2
-        else:
-            kinds[node] = max((kinds[part] for part in parts), default=0) if graph.values[node] is None else 0
-        if kinds[node] == 2:
-            found |= dict.fromkeys(part for part in parts if kinds[part] == 1)
-    found |= dict.fromkeys(node for node in wanted if kinds[node] == 1)
-    inexact = [any(graph.operations[part] not in EXACT for part in graph.live([node])) for node in found]
-    ordered = sorted(zip(inexact, found, strict=True), key=lambda pair: pair[0])
-    return inexact.count(False), [node for _, node in ordered]
+
+    def __init__(
+        self, graph: ParameterGraph, update: Sequence[int], start: Sequence[int], numbers: numpy.ndarray
+    ) -> None:
+        self.graph = graph
+        both = self._find(update), self._find(start)
+        parts = [both[0], [node for node in both[1] if node not in both[0]]]
+        values, known = {}, numpy.union1d(numbers[numpy.isfinite(numbers)], [-1.0, 0.0, 1.0])
+        stated = {node for part in parts for node in part if not graph.is_exact(node)}
+        for node in itertools.chain(*parts):
+            own = float(graph.value(node))
+            nearest = float(known[numpy.abs(known - own).argmin()]) if len(numbers) else own
+            values[node] = nearest if abs(nearest - own) <= CLOSE * abs(own) else own
+            stated |= {node} if values[node] != own else set()
+        # Those whose values are stated stand together.
+        parts = [sorted(part, key=lambda node: (node in stated) != last) for part, last in zip(parts, (False, True))]
+        self.nodes = [*parts[0], *parts[1]]
+        self.values, self.kept = [values[node] for node in self.nodes], len(parts[0])
+        first = sum(node not in stated for node in parts[0])
+        self.stated = range(first, first + len(stated))
+
+    def _find(self, wanted: Sequence[int]) -> list[int]:
+        graph, found = self.graph, dict[int, None]()
+        kinds: dict[int, int] = {}  # 0 constant, 1 of parameters alone, 2 of anything else
+        for node in graph.live(wanted):
+            parts = graph.parts(node)
+            if graph.operations[node] == "input":
+                kinds[node] = 1 if graph.arguments[node][0] == PARAMETER else 2
+            else:
+                constant = graph.values[node] is not None
+                kinds[node] = 0 if constant else max((kinds[part] for part in parts), default=0)
+            if kinds[node] == 2:
+                found |= dict.fromkeys(part for part in parts if kinds[part] == 1)
+        return list(found | dict.fromkeys(node for node in wanted if kinds[node] == 1))
+
+    def program(self) -> StraightLineProgram:
+        """Program from the parameters to these expressions."""
+        graph = self.graph
+        numbers = [graph.node("number", node) if graph.logical[node] else node for node in self.nodes]
+        return program(graph, [ProgramResult(DERIVED, row, node) for row, node in enumerate(numbers)])
+
+    def read(self) -> None:
+        """Let these expressions be read from then on: by the update from the state, where they are kept."""
+        graph = self.graph
+        for row, node in enumerate(self.nodes):
+            given = (STATE, KEPT + row) if row < self.kept else (DERIVED, row)
+            if graph.logical[node]:
+                again = graph.input(*given), graph.constant(0.0)
+                graph.operations[node], graph.arguments[node] = "not_equal", again
+            else:
+                graph.operations[node], graph.arguments[node] = "input", given
 
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
