@@ -8,6 +8,7 @@ import numpy
 from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import write_program
 from ..compiler.c_text import DOUBLE, Parameter, Scalar, array_text, function_text, literal
+from ..compiler.program import StraightLineProgram
 from .c_structs import Structure
 from .parameters import PARAMETER, SUMMED, Declared
 from .traced_filter import DERIVED, FreeParameters, Member
@@ -90,10 +91,12 @@ def parameter_text(
         body += [f"{own}_holds(parameters, own);", f"if (own[0] == {literal(0.0, scalar)}) {refused}"]
     rows = Rows(f"((const {real} *)parameters)", struct.numbers), Rows("own", range(count))
     arrays = Arrays({PARAMETER: rows[0]}, {DERIVED: rows[1]})
-    source = write_program(
-        free.derive, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
-    )
-    before += [source.functions, function_text("static void", f"{own}_derive", listed, source.body)]
+    sources = [
+        write_program(code, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays)
+        for code in (free.derive, _by_depth(free.derive))
+    ]
+    texts = [[s.functions, function_text("static void", f"{own}_derive", listed, s.body)] for s in sources]
+    before += min(texts, key=lambda parts: sum(map(len, parts)))
     body.append(f"{own}_derive(parameters, own);")
     if stated := _stated(free, scalar):
         # The same bits whatever the functions of a library give.
@@ -104,6 +107,19 @@ def parameter_text(
     if free.kept:
         body.append(f"for (int k = 0; k < {free.kept}; ++k) state->derived[k] = own[k];")
     return "\n".join(before), [line for line in body if line]
+
+
+def _by_depth(code: StraightLineProgram) -> StraightLineProgram:
+    """The program with what is as deep in the same operation as one array operation: numbers are derived one by one in
+    Python, and loops go over array operations.
+    """
+    depths: list[int] = []
+    groups: dict[tuple[int, str], int] = {}
+    own = []
+    for step in code.steps:
+        depths.append(1 + max((depths[part] for part in step.parts), default=0))
+        own.append(groups.setdefault((depths[-1], step.operation), len(groups)))
+    return code._replace(origins=numpy.column_stack([own, range(len(own))]), callers={})
 
 
 def _stated(free: FreeParameters, scalar: Scalar) -> range:

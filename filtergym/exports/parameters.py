@@ -7,6 +7,7 @@ constant.
 """
 
 import dataclasses
+import inspect
 import math
 import types
 import typing
@@ -47,6 +48,8 @@ class Declared(NamedTuple):
     words: str
     """What it is, with its unit."""
     limits: ParameterLimits = ParameterLimits()
+    size: float | None = None
+    """Whose decimal logarithm it is, where the filter itself has that."""
 
 
 class Declaration(NamedTuple):
@@ -81,12 +84,29 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
     tuned, taken = [], set()
     if tunable is not None:
         for key, (low, high) in tunable.limits.items():
-            value, unit = float(values[key]), tunable.units.get(key, "")
+            value, unit, size = float(values[key]), tunable.units.get(key, ""), None
+            if not isinstance(maker, TunedPolicy):
+                value, size = _in_force(maker, key, value)
             words = f"{key.removeprefix('log10_').replace('_', ' ')}{', ' if unit else ''}{unit}"
             words = f"decimal logarithm of {words}" if key.startswith("log10_") else words
-            tuned.append(Declared(key, (), (value,), min(low, value), max(high, value), words))
+            tuned.append(Declared(key, (), (value,), min(low, value), max(high, value), words, size=size))
         taken = {*tunable.apply(values)[0], *tunable.limits}
     return Declaration(tuned, [p for p in _of_task(task.parameters) if p.name not in taken], tunable)
+
+
+def _in_force(maker: Any, name: str, start: float) -> tuple[float, float | None]:
+    """Value of a tuning that an untuned filter has, and of a logarithm whose it is: what a search starts from may have
+    fewer digits.
+    """
+    is_log = name.startswith("log10_")
+    arguments = inspect.signature(getattr(maker, "func", maker)).parameters.values()
+    known = {one.name: one.default for one in arguments} | getattr(maker, "keywords", {})
+    prior = known.get("prior")
+    known |= prior._asdict() if hasattr(prior, "_asdict") else {}
+    size = known.get(name.removeprefix("log10_"))
+    if isinstance(size, int | float) and not (is_log and size <= 0.0):
+        return (math.log10(size), float(size)) if is_log else (float(size), None)
+    return start, float(f"{10.0**start:.15g}") if is_log else None
 
 
 def _of_task(parameters: Any) -> Iterator[Declared]:
@@ -123,16 +143,15 @@ class ParameterGraph(Graph):
 
     Args:
         free: parameters whose numbers are the rows of ``PARAMETER``.
-        rounded: whether the sizes that are declared by their logarithms are numbers of few digits.
 
     Attributes:
         conditions: on which branches were decided, and how.
         settled: rows of parameters that became plain numbers.
     """
 
-    def __init__(self, free: Sequence[Declared], rounded: bool = False) -> None:
+    def __init__(self, free: Sequence[Declared]) -> None:
         super().__init__(callers=True)
-        self.rounded = rounded
+        self.sizes = [one.size for one in free for _ in one.values]
         self.given = [value for one in free for value in one.values]
         self.limits = [(one.low, one.high) for one in free for _ in one.values]
         self.conditions: dict[int, bool] = {}
@@ -168,9 +187,9 @@ class ParameterGraph(Graph):
             return float(table[min(max(int(parts[0] + len(table) * (parts[0] < 0.0)), 0), len(table) - 1)])
         with numpy.errstate(all="ignore"):
             if operation == "pow":  # as Python computes it
-                found = _power(float(parts[0]), float(parts[1]))
-                declared = self.rounded and parts[0] == 10.0 and self.operations[self.parts(node)[1]] == "input"
-                return float(f"{found:.15g}") if declared else found
+                exponent = self.parts(node)[1]
+                size = self.sizes[self.arguments[exponent][1]] if self.operations[exponent] == "input" else None
+                return _power(float(parts[0]), float(parts[1])) if size is None or parts[0] != 10.0 else size
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
     def settle(self, node: int, use: str) -> Any:

@@ -404,28 +404,27 @@ def trace_filter(
     found = declaration(plain.task, maker, known, name)
     arguments = task, control, maker, plain, template, found
     try:
-        fixed = _trace_free(*arguments, [], numpy.zeros(0))
+        fixed = _trace_free(*arguments, [])
     except NotTraceable as error:
         raise ValueError(
             f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
         ) from error
-    assert isinstance(fixed, TracedFilter)
-    numbers = numpy.concatenate([fixed.start.constants, fixed.update.constants])
-    traced: TracedFilter | set[str] = fixed
+    assert isinstance(fixed, tuple)
+    traced, free = fixed, list[Declared]()
     for tried in (found.all, found.tuned, found.own):
         free = tried
         try:
-            while isinstance(traced := _trace_free(*arguments, free, numbers), set):
-                free = [one for one in free if one.name not in traced]
+            while isinstance(answer := _trace_free(*arguments, free, fixed[1]), set):
+                free = [one for one in free if one.name not in answer]
         except NotTraceable:
-            traced = fixed
+            free = []
             continue
+        traced = answer
         break
-    assert isinstance(traced, TracedFilter)
     kept = {one.name for one in free} - {one.name for one in found.tuned}
-    left = kept | {one.name for one in traced.free.declared}
+    left = kept | {one.name for one in traced[0].free.declared}
     constant = [one.name for one in found.all if one.name not in left]
-    return traced._replace(free=traced.free._replace(constant=constant))
+    return traced[0]._replace(free=traced[0].free._replace(constant=constant))
 
 
 def _trace_free(
@@ -436,8 +435,8 @@ def _trace_free(
     template: tuple[Any, Any],
     found: Declaration,
     free: Sequence[Declared],
-    numbers: numpy.ndarray,
-) -> TracedFilter | set[str]:
+    fixed: "_Nodes | None" = None,
+) -> "tuple[TracedFilter, _Nodes] | set[str]":
     """Trace a competitor with some of its parameters free; or the names of those that cannot be.
 
     Args:
@@ -448,9 +447,9 @@ def _trace_free(
         template: as of :func:`trace_filter`.
         found: all parameters.
         free: those that are tried.
-        numbers: constants of the filter traced without.
+        fixed: expressions of the filter traced without.
     """
-    graph = ParameterGraph(free, rounded=not isinstance(maker, TunedPolicy))
+    graph = ParameterGraph(free)
     firsts = [0, *itertools.accumulate(len(one.values) for one in free)]
     with namespace.tracing(graph), traced_functions(graph):
         values = {one.name: expressions(one, first, graph) for one, first in zip(free, firsts, strict=False)}
@@ -464,12 +463,11 @@ def _trace_free(
         if own:
             made.parameters = with_parameters(made.parameters, own)
             made.set_up()
-        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free, numbers)
+        traced = _trace(*steps_of(made, control, maker, plain, graph), template, graph, free, fixed)
     names = [one.name for one in free for _ in one.values]
     conditional = graph.rows(list(graph.conditions))
-    unused = {names[row] for row in conditional} - {one.name for one in traced.free.declared}
-    fixed = {names[row] for row in graph.settled} | unused
-    return fixed or traced
+    unused = {names[row] for row in conditional} - {one.name for one in traced[0].free.declared}
+    return {names[row] for row in graph.settled} | unused or traced
 
 
 def _trace(
@@ -478,8 +476,8 @@ def _trace(
     template: tuple[Any, Any],
     graph: ParameterGraph,
     free: Sequence[Declared],
-    numbers: numpy.ndarray,
-) -> TracedFilter:
+    plain: "_Nodes | None",
+) -> tuple[TracedFilter, "_Nodes"]:
     initial, measurement = (one_lane(part) for part in template)
     rows = count_from()
     begin = fill(initial, [graph.input(INITIAL, next(rows)) for _ in nodes_of(initial)], graph)
@@ -508,7 +506,8 @@ def _trace(
         *(ProgramResult(ESTIMATE, row, node) for row, node in enumerate(results)),
     ]
     begun = [first[member] for member in live]
-    own = _Derived(graph, [result.node for result in written], begun, numbers)
+    nodes = _Nodes(graph, [*first, *after, *shown, *results])
+    own = _Derived(nodes, [result.node for result in written], begun, plain)
     declared, moved = _used_parameters(free, graph.rows(own.nodes))
     conditions = [
         node if held else graph.node("logical_not", node)
@@ -527,7 +526,7 @@ def _trace(
     listed = members_of(state)
     members = [listed[member] for member in live]
     members += [Member("derived", (own.kept,), row, DERIVED_WORDS) for row in range(own.kept)]
-    return TracedFilter(
+    found = TracedFilter(
         _renumbered(start, STATE, place),
         _renumbered(update, STATE, place),
         members_of(initial),
@@ -538,23 +537,48 @@ def _trace(
         asked.network if shown and asked is not None else None,
         FreeParameters(declared, derive, own.values, own.kept, own.stated, condition),
     )
+    return found, nodes
 
 
 KEPT = 10**9
 """First row of what the state keeps of it, while a filter is traced."""
 DERIVED_WORDS = "Derived from the parameters at the start, constant from then on."
-CLOSE = 1e-13
-"""Relative difference of a derived number and that of the filter itself, which computes it in another order."""
+CLOSE = 1e-9
+"""Difference of a derived number and that of the filter itself, which computes it in another order, at most."""
+
+
+class _Nodes(NamedTuple):
+    """Expressions that a filter is made of."""
+
+    graph: ParameterGraph
+    wanted: list[int]
+    """In an order that does not depend on its parameters."""
+
+
+def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
+    """Constants of a filter that stand where expressions of the same filter with free parameters stand."""
+    one, other, found = plain.graph, free.graph, dict[int, float]()
+    waiting = list(zip(plain.wanted, free.wanted, strict=True))
+    seen = set(waiting)
+    while waiting:
+        p, q = waiting.pop()
+        if one.values[p] is not None:
+            found.setdefault(q, float(one.values[p]))
+        elif one.operations[p] == other.operations[q] and len(one.parts(p)) == len(other.parts(q)):
+            pairs = [pair for pair in zip(one.parts(p), other.parts(q), strict=True) if pair not in seen]
+            seen.update(pairs)
+            waiting += pairs
+    return found
 
 
 class _Derived:
     """Largest expressions of parameters alone that a filter is made of, in the order of the rows of ``DERIVED``.
 
     Args:
-        graph: of them.
+        nodes: of the filter.
         update: results of an update, whose expressions come first.
         start: results of the start of a track.
-        numbers: constants of the same filter traced without parameters.
+        plain: expressions of the same filter traced without parameters.
 
     Attributes:
         nodes: the expressions.
@@ -564,17 +588,17 @@ class _Derived:
     """
 
     def __init__(
-        self, graph: ParameterGraph, update: Sequence[int], start: Sequence[int], numbers: numpy.ndarray
+        self, nodes: "_Nodes", update: Sequence[int], start: Sequence[int], plain: "_Nodes | None"
     ) -> None:
-        self.graph = graph
+        self.graph = graph = nodes.graph
         both = self._find(update), self._find(start)
         parts = [both[0], [node for node in both[1] if node not in both[0]]]
-        values, known = {}, numpy.union1d(numbers[numpy.isfinite(numbers)], [-1.0, 0.0, 1.0])
+        values, known = {}, {} if plain is None else _constants_in_place(plain, nodes)
         stated = {node for part in parts for node in part if not graph.is_exact(node)}
         for node in itertools.chain(*parts):
             own = float(graph.value(node))
-            nearest = float(known[numpy.abs(known - own).argmin()]) if len(numbers) else own
-            values[node] = nearest if abs(nearest - own) <= CLOSE * abs(own) else own
+            there = known.get(node, own)
+            values[node] = there if abs(there - own) <= CLOSE * max(abs(own), 1.0) else own
             stated |= {node} if values[node] != own else set()
         # Those whose values are stated stand together.
         parts = [sorted(part, key=lambda node: (node in stated) != last) for part, last in zip(parts, (False, True))]
