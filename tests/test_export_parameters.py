@@ -9,6 +9,7 @@ from test_exports_c import SANITIZERS, compiler
 
 from filtergym.baselines.problem import problem_of
 from filtergym.compiler.functions import map_arrays
+from filtergym.envs.contract.parameters import freeze
 from filtergym.envs.engine.backend import make_model
 from filtergym.evaluation.competitors.filters import as_filter
 from filtergym.evaluation.running.evaluate import control_of
@@ -190,16 +191,20 @@ def test_parameters_of_a_model_of_ones_own(state_space, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("environment", "name", "keywords"),
+    ("environment", "name", "changed"),
     [
-        ("ManeuveringTarget", "adaptive", {"gains": (0.2, 0.8), "alpha_range": (0.1, 0.9)}),
-        ("LooselyCoupledNavigation", "time-varying", {"drift": 0.02, "correlation_time": 55.0}),
-        ("RadarEsmTracking", "joint-type", {"esm_bearing_sigma": 1.5}),
-        ("TightlyCoupledNavigation", "singer", {"singer_alpha": 0.7, "rate_sigma": 0.3}),
+        ("ManeuveringTarget", "adaptive", ["gains", "alpha_range", "sampling_interval"]),
+        ("LooselyCoupledNavigation", "time-varying", ["coloured", "white_intensity"]),
+        pytest.param("RadarEsmTracking", "exact-bayes-9", ["esm_bearing_sigma"], marks=pytest.mark.slow),
+        pytest.param(
+            "TightlyCoupledNavigation", "singer", ["singer_alpha", "rate_sigma"], marks=pytest.mark.slow
+        ),
     ],
 )
-def test_parameters_of_the_task(environment, name, keywords, tmp_path):
+def test_parameters_of_the_task(environment, name, changed, tmp_path):
     exported = Exported(tmp_path, problem_of(f"filtergym/{environment}-v0"), name)
+    own = {one.name: one for one in exported.declared}
+    keywords = {key: freeze(1.03 * np.reshape(own[key].values, own[key].shape)) for key in changed}
     (status,), (found,) = exported.answers([row_of(exported, keywords)])
     assert status == 0.0
     check_alike(found, exported.made_anew(keywords))
@@ -227,7 +232,10 @@ def test_what_is_outside_the_limits_leaves_the_state_alone(scalar, tmp_path):
     statuses, given = exported.answers([usual])
     _, none = exported.answers([usual], "NULL")
     assert statuses == 0.0
-    assert np.array_equal(given, none, equal_nan=True)
+    if scalar is DOUBLE:
+        assert np.array_equal(given, none, equal_nan=True)
+    else:  # what is derived in float is not quite what was derived in double
+        check_alike(given, none, 1e-3)
 
 
 @pytest.mark.parametrize("name", ["kalman-imm-turn", "kalman-imm-tuned", "imm", "semi-markov-3"])

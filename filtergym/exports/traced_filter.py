@@ -546,6 +546,9 @@ DERIVED_WORDS = "Derived from the parameters at the start, constant from then on
 CLOSE = 1e-9
 """Difference of a derived number and that of the filter itself, which computes it in another order, at most."""
 
+SMALL = 1e-15
+"""The same of numbers that may be zero."""
+
 
 class _Nodes(NamedTuple):
     """Expressions that a filter is made of."""
@@ -564,6 +567,13 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
         p, q = waiting.pop()
         if one.values[p] is not None:
             found.setdefault(q, float(one.values[p]))
+        elif one.operations[p] == "take":  # of a table whose entries are chosen one by one where they vary
+            table = one.tables[one.arguments[p][0]]
+            while other.operations[q] == "where":
+                condition, entry, q = other.parts(q)
+                if (place := other.values[other.parts(condition)[-1]]) is not None:
+                    found.setdefault(entry, float(table[int(place)]))
+            found.setdefault(q, float(table[0]))
         elif one.operations[p] == other.operations[q] and len(one.parts(p)) == len(other.parts(q)):
             pairs = [pair for pair in zip(one.parts(p), other.parts(q), strict=True) if pair not in seen]
             seen.update(pairs)
@@ -598,7 +608,7 @@ class _Derived:
         for node in itertools.chain(*parts):
             own = float(graph.value(node))
             there = known.get(node, own)
-            values[node] = there if abs(there - own) <= CLOSE * max(abs(own), 1.0) else own
+            values[node] = there if abs(there - own) <= max(CLOSE * abs(own), SMALL) else own
             stated |= {node} if values[node] != own else set()
         # Those whose values are stated stand together.
         parts = [sorted(part, key=lambda node: (node in stated) != last) for part, last in zip(parts, (False, True))]
