@@ -187,7 +187,7 @@ def test_parameters_of_a_model_of_ones_own(state_space, tmp_path):
     )  # fmt: skip
     exported = Exported(tmp_path, problem_of(walk.id), "extended")
     check_200_sets(exported)
-    assert "decimal logarithm of process noise. Default 0, from -4 to 4." in exported.header
+    assert "Decimal logarithm: process noise. Default 0, from -4 to 4." in exported.header
 
 
 @pytest.mark.parametrize(

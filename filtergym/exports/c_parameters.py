@@ -9,6 +9,7 @@ from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import write_program
 from ..compiler.c_text import DOUBLE, Parameter, Scalar, array_text, function_text, literal
 from ..compiler.program import StraightLineProgram
+from ..envs.contract.parameters import LARGEST, ParameterLimits
 from .c_structs import Structure
 from .parameters import PARAMETER, SUMMED, Declared
 from .traced_filter import DERIVED, FreeParameters, Member
@@ -19,11 +20,24 @@ def parameter_members(declared: Sequence[Declared]) -> list[Member]:
     found = []
     for one in declared:
         values = [f"{value:.6g}" for value in one.values]
-        default = f"Default {', '.join(values)}, from {one.low:.6g} to {one.high:.6g}"
+        if one.limits == ParameterLimits():
+            limits = [f"from {one.low:.6g} to {one.high:.6g}"] if abs(one.high) < LARGEST else []
+        else:
+            limits = [f"{word} {limit:g}" for word, limit in _limit_words(one.limits) if limit is not None]
+        default = ", ".join([f"Default {', '.join(values)}", *limits])
         also = ", ascending" * one.limits.ascending + ", each row sums to 1" * one.limits.stochastic
         words = f"{one.words.strip(' .')}. {default}{also}."
         found += [Member(one.name, one.shape, place, words) for place in range(len(one.values))]
     return found
+
+
+def _limit_words(limits: ParameterLimits) -> list[tuple[str, float | None]]:
+    return [
+        ("above", limits.above),
+        ("at least", limits.at_least),
+        ("below", limits.below),
+        ("at most", limits.at_most),
+    ]
 
 
 def parameter_words(free: FreeParameters) -> str:
@@ -35,11 +49,12 @@ def parameter_words(free: FreeParameters) -> str:
     )
     if free.condition is not None:
         text += (
-            " Values that order numbers otherwise than the defaults, or make zero what is not, are refused, too, where "
-            "another program would follow."
+            " Refused are also values that decide a branch of the filter's own code otherwise than the defaults, such as "
+            "their order: another program would follow."
         )
     if free.constant:
-        text += f" Constant here, since they decide the form of the program: {', '.join(free.constant)}."
+        text += " Constant here, since the form of the program, or a computation without one, such as that of a matrix "
+            f"equation, depends on them: {', '.join(free.constant)}."
     return text
 
 
@@ -166,8 +181,9 @@ def _limits(one: Declared, scalar: Scalar) -> tuple[float, float]:
         return one.low, one.high
     largest = float(numpy.finfo(scalar.dtype).max)
     found = []
-    for limit, towards in ((one.low, math.inf), (one.high, -math.inf)):
-        near = scalar.dtype(min(max(limit, -largest), largest))
-        inside = near >= limit if towards > 0.0 else near <= limit
-        found.append(float(near if inside else numpy.nextafter(near, scalar.dtype(towards))))
+    with numpy.errstate(all="ignore"):
+        for limit, towards in ((one.low, math.inf), (one.high, -math.inf)):
+            near = scalar.dtype(min(max(limit, -largest), largest))
+            inside = near >= limit if towards > 0.0 else near <= limit
+            found.append(float(near if inside else numpy.nextafter(near, scalar.dtype(towards))))
     return found[0], found[1]

@@ -7,6 +7,7 @@ constant.
 """
 
 import dataclasses
+import functools
 import inspect
 import math
 import types
@@ -82,28 +83,39 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
         tunable = known.get(name)
         values = tunable.start if tunable is not None else {}
     tuned, taken = [], set()
+    arguments = _arguments(maker.make if isinstance(maker, TunedPolicy) else maker)
+    prior = arguments.get("prior")
+    described = field_words(type(prior)) if hasattr(prior, "_asdict") else {}
     if tunable is not None:
         for key, (low, high) in tunable.limits.items():
-            value, unit, size = float(values[key]), tunable.units.get(key, ""), None
+            value, size, base = float(values[key]), None, key.removeprefix("log10_")
             if not isinstance(maker, TunedPolicy):
-                value, size = _in_force(maker, key, value)
-            words = f"{key.removeprefix('log10_').replace('_', ' ')}{', ' if unit else ''}{unit}"
-            words = f"decimal logarithm of {words}" if key.startswith("log10_") else words
+                value, size = _in_force(arguments, key, value)
+            unit = tunable.units.get(base, "")
+            words = described.get(base, f"{base.replace('_', ' ')}{', ' if unit else ''}{unit}")
+            words = f"Decimal logarithm: {words}" if base != key else words
             tuned.append(Declared(key, (), (value,), min(low, value), max(high, value), words, size=size))
         taken = {*tunable.apply(values)[0], *tunable.limits}
     return Declaration(tuned, [p for p in _of_task(task.parameters) if p.name not in taken], tunable)
 
 
-def _in_force(maker: Any, name: str, start: float) -> tuple[float, float | None]:
+def _arguments(maker: Any) -> dict[str, Any]:
+    """Arguments that a competitor is made with, and the fields of its prior."""
+    given: dict[str, Any] = {}
+    while isinstance(maker, functools.partial):
+        maker, given = maker.func, {**maker.keywords, **given}
+    if callable(maker):
+        given = {one.name: one.default for one in inspect.signature(maker).parameters.values()} | given
+    prior = given.get("prior")
+    return {**(prior._asdict() if hasattr(prior, "_asdict") else {}), **given}
+
+
+def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[float, float | None]:
     """Value of a tuning that an untuned filter has, and of a logarithm whose it is: what a search starts from may have
     fewer digits.
     """
     is_log = name.startswith("log10_")
-    arguments = inspect.signature(getattr(maker, "func", maker)).parameters.values()
-    known = {one.name: one.default for one in arguments} | getattr(maker, "keywords", {})
-    prior = known.get("prior")
-    known |= prior._asdict() if hasattr(prior, "_asdict") else {}
-    size = known.get(name.removeprefix("log10_"))
+    size = arguments.get(name.removeprefix("log10_"))
     if isinstance(size, int | float) and not (is_log and size <= 0.0):
         return (math.log10(size), float(size)) if is_log else (float(size), None)
     return start, float(f"{10.0**start:.15g}") if is_log else None
