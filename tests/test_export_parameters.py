@@ -8,6 +8,7 @@ from own_models import make_models
 from test_exports_c import SANITIZERS, compiler
 
 from filtergym.baselines.problem import problem_of
+from filtergym.compiler.c_text import DOUBLE, FLOAT
 from filtergym.compiler.functions import map_arrays
 from filtergym.envs.contract.parameters import freeze
 from filtergym.envs.engine.backend import make_model
@@ -19,7 +20,6 @@ from filtergym.exports.c_source import FLAGS, Writer, export_c, files_of
 from filtergym.exports.replay import replay, run_filter
 from filtergym.exports.request import ExportRequest
 from filtergym.exports.traced_filter import FilterSteps, trace_filter
-from filtergym.compiler.c_text import DOUBLE, FLOAT
 from filtergym.names import find_competitor
 
 SETS, MEASUREMENTS = 200, 12
@@ -88,14 +88,18 @@ class Exported:
     def answers(self, rows, *arguments):
         """Statuses of sets ``(S, numbers)``, and estimates ``(sets that are taken, T, numbers)``."""
         given = np.asarray(rows, dtype=self.scalar.dtype).tobytes()
-        said = subprocess.run([self.folder / "driver", *arguments], input=given, capture_output=True, check=True).stdout
+        said = subprocess.run(
+            [self.folder / "driver", *arguments], input=given, capture_output=True, check=True
+        ).stdout
         statuses, estimates, size = [], [], len(self.traced.estimate)
         while said:
             statuses.append(np.frombuffer(said[:8])[0])
             said = said[8:]
             if statuses[-1] == 0.0:
                 count = MEASUREMENTS * size * self.scalar.dtype().itemsize
-                estimates.append(np.frombuffer(said[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size))
+                estimates.append(
+                    np.frombuffer(said[:count], dtype=self.scalar.dtype).reshape(MEASUREMENTS, size)
+                )
                 said = said[count:]
         return np.array(statuses), np.array(estimates)
 
@@ -221,7 +225,11 @@ def test_what_is_outside_the_limits_leaves_the_state_alone(scalar, tmp_path):
     exported = Exported(tmp_path, problem_of("filtergym/ManeuveringTarget-v0"), "imm-steady-state", scalar)
     usual, refused, at = np.array(exported.traced.free.values), [], 0
     for one in exported.declared:
-        for wrong in (one.low - 1e-3 - 1e-3 * abs(one.low), one.high * 1.001 if one.high < 1e38 else np.inf, np.nan):
+        for wrong in (
+            one.low - 1e-3 - 1e-3 * abs(one.low),
+            one.high * 1.001 if one.high < 1e38 else np.inf,
+            np.nan,
+        ):
             refused.append(usual.copy())
             refused[-1][at + len(one.values) - 1] = wrong
         at += len(one.values)

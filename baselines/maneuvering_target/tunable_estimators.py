@@ -140,7 +140,9 @@ _UNITS = {
     **dict.fromkeys(("turn_rate_start", "turn_rate_change"), "degrees/s"),
     **dict.fromkeys(("leave", "leave_quiet", "leave_noisy", "leave_turn"), "probability from scan to scan"),
     **dict.fromkeys(("stay_quiet", "stay_noisy"), "probability from scan to scan"),
-    **dict.fromkeys(("acceleration", "acceleration_quiet", "acceleration_noisy", "acceleration_turn"), "m/s^2"),
+    **dict.fromkeys(
+        ("acceleration", "acceleration_quiet", "acceleration_noisy", "acceleration_turn"), "m/s^2"
+    ),
     **dict.fromkeys(("turn", "turn_gentle", "turn_steep"), "mean acceleration, m/s^2"),
 }
 

@@ -429,9 +429,7 @@ class FaultHypotheses(SteerableFilter[NavigationProblem, Measurement, FaultState
         L = levels.shape[0]
         return self.xp.stack(
             [
-                ordered_sum(
-                    [self.level_chain[i][j] * levels[i] for i in range(L) if self.level_chain[i][j]]
-                )
+                ordered_sum([self.level_chain[i][j] * levels[i] for i in range(L) if self.level_chain[i][j]])
                 for j in range(L)
             ]
         )

@@ -13,10 +13,20 @@ import numpy
 from ..compiler.c_loops import Arrays, Rows
 from ..compiler.c_source import helper_functions, write_program
 from ..compiler.c_text import Parameter, Scalar, comment, function_text, identifier, literal
-from .c_parameters import parameter_members, parameter_text, parameter_words
 from .c_network import memory_size, network_operations, network_text, scratch_size
+from .c_parameters import parameter_members, parameter_text, parameter_words
 from .c_structs import struct_text, structure
-from .traced_filter import ANSWER, DERIVED, ESTIMATE, INITIAL, MEASUREMENT, SHOWN, STATE, TracedFilter, count_answers
+from .traced_filter import (
+    ANSWER,
+    DERIVED,
+    ESTIMATE,
+    INITIAL,
+    MEASUREMENT,
+    SHOWN,
+    STATE,
+    TracedFilter,
+    count_answers,
+)
 
 TAKEN = ("rows", "vectors", "test", "log", "math", "float", "stdio", "stdlib", "string", "time")
 """Names that a filter's files must not have: those of the others."""
@@ -57,7 +67,10 @@ class FilterText:
     def _parameters(self, *parts: str) -> list[Parameter]:
         """Parameters that point to structs; ``const`` is what is only read."""
         return [
-            Parameter(f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *", part)
+            Parameter(
+                f"{'const ' * (part in ('initial', 'measurement', 'parameters'))}{self.structs[part].name} *",
+                part,
+            )
             for part in parts
         ]
 
@@ -68,7 +81,11 @@ class FilterText:
 
     def _start(self) -> tuple[str, Any]:
         to, given = self.structs["state"].places, self.structs["initial"].places
-        parameters, own, free = self._parameters("state", "initial", "parameters"), self.name, self.traced.free
+        parameters, own, free = (
+            self._parameters("state", "initial", "parameters"),
+            self.name,
+            self.traced.free,
+        )
         own_rows = Rows("own", range(len(free.usual)))
         inner = [*parameters, Parameter(f"const {self.scalar.name} *", "own")] if free.usual else parameters
 

@@ -49,12 +49,14 @@ def parameter_words(free: FreeParameters) -> str:
     )
     if free.condition is not None:
         text += (
-            " Refused are also values that decide a branch of the filter's own code otherwise than the defaults, such as "
-            "their order: another program would follow."
+            " Refused are also values that decide a branch of the filter's own code otherwise than the defaults, such "
+            "as their order: another program would follow."
         )
     if free.constant:
-        text += " Constant here, since the form of the program, or a computation without one, such as that of a matrix "
-            f"equation, depends on them: {', '.join(free.constant)}."
+        text += (
+            " Constant here, since the form of the program depends on them, or they enter through a computation without "
+            f"one, such as that of a matrix equation: {', '.join(free.constant)}."
+        )
     return text
 
 
@@ -76,12 +78,15 @@ def parameter_text(
     listed = [Parameter(f"const {own}_parameters *", "parameters"), Parameter(f"{real} *", "own")]
     values = ", ".join(_value(one, scalar) for one in free.declared)
     before = [f"const {own}_parameters {own}_defaults = {{{values}}};\n"]
-    before.append(array_text(f"{own}_limits", numpy.array([_limits(one, scalar) for one in free.declared]), scalar))
+    before.append(
+        array_text(f"{own}_limits", numpy.array([_limits(one, scalar) for one in free.declared]), scalar)
+    )
     lengths = [len(one.values) for one in free.declared]
     inner = f"if (!(*number >= {own}_limits[k][0] && *number <= {own}_limits[k][1])) {refused}"
     loop = [f"    {inner}", "    ++number;"]
     if len(set(lengths)) > 1:
-        before.append(f"static const unsigned short {own}_lengths[{len(lengths)}] = {{{', '.join(map(str, lengths))}}};\n")
+        inside = ", ".join(map(str, lengths))
+        before.append(f"static const unsigned short {own}_lengths[{len(lengths)}] = {{{inside}}};\n")
     length = f"{own}_lengths[k]" if len(set(lengths)) > 1 else str(lengths[0])
     if length != "1":
         loop = [f"    for (int i = 0; i < {length}; ++i, ++number)", f"        {inner}"]
@@ -107,7 +112,9 @@ def parameter_text(
     rows = Rows(f"((const {real} *)parameters)", struct.numbers), Rows("own", range(count))
     arrays = Arrays({PARAMETER: rows[0]}, {DERIVED: rows[1]})
     sources = [
-        write_program(code, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays)
+        write_program(
+            code, f"{own}_derive", listed, read, lambda _, row: f"own[{row}]", scalar, arrays=arrays
+        )
         for code in (free.derive, _by_depth(free.derive))
     ]
     texts = [[s.functions, function_text("static void", f"{own}_derive", listed, s.body)] for s in sources]
@@ -160,7 +167,11 @@ def _row_checks(free: FreeParameters, scalar: Scalar, struct: Structure, refused
                 f"for (int i = 0; i < {width}; ++i) sum += row[i];",
                 f"if (!(fabs{scalar.suffix}(sum) <= {least})) {refused}",
             ]
-            checks += [f"for (int k = 0; k < {len(rows) // width}; ++k) {{", *(f"    {line}" for line in sums), "}"]
+            checks += [
+                f"for (int k = 0; k < {len(rows) // width}; ++k) {{",
+                *(f"    {line}" for line in sums),
+                "}",
+            ]
     return checks
 
 

@@ -123,7 +123,9 @@ def _in_force(arguments: Mapping[str, Any], name: str, start: float) -> tuple[fl
 
 def _of_task(parameters: Any) -> Iterator[Declared]:
     """Numbers among the parameters of a task."""
-    words = {name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()}
+    words = {
+        name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()
+    }
     for name, (hint, limits) in field_limits(type(parameters)).items():
         value = getattr(parameters, name)
         if value is None or float not in _kinds(hint):
@@ -139,7 +141,9 @@ def _of_task(parameters: Any) -> Iterator[Declared]:
         if limits.at_most is not None:
             high = limits.at_most
         if array.size:
-            yield Declared(name, array.shape, tuple(array.ravel().tolist()), low, high, words.get(name, ""), limits)
+            yield Declared(
+                name, array.shape, tuple(array.ravel().tolist()), low, high, words.get(name, ""), limits
+            )
 
 
 def _kinds(hint: Any) -> set[Any]:
@@ -200,7 +204,9 @@ class ParameterGraph(Graph):
         with numpy.errstate(all="ignore"):
             if operation == "pow":  # as Python computes it
                 exponent = self.parts(node)[1]
-                size = self.sizes[self.arguments[exponent][1]] if self.operations[exponent] == "input" else None
+                size = (
+                    self.sizes[self.arguments[exponent][1]] if self.operations[exponent] == "input" else None
+                )
                 return _power(float(parts[0]), float(parts[1])) if size is None or parts[0] != 10.0 else size
             return ({**OPERATIONS, **FUNCTIONS}[operation])(*parts)
 
@@ -217,7 +223,6 @@ class ParameterGraph(Graph):
         elif use == "number":
             self.settled |= self.rows([node])
         return found
-
 
     def is_exact(self, node: int) -> bool:
         """Whether an expression has the same bits whatever computes it."""
@@ -257,7 +262,10 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
 
     Anything else they compute as ever, also for other threads.
     """
-    original = {name: getattr(math, name) for name in NUMBERS} | {"sqrt": math.sqrt, "isfinite": math.isfinite}
+    original = {name: getattr(math, name) for name in NUMBERS} | {
+        "sqrt": math.sqrt,
+        "isfinite": math.isfinite,
+    }
 
     def traced(name: str, compute: Callable[..., Any]) -> Callable[..., Any]:
         def function(*arguments: Any) -> Any:
@@ -269,7 +277,9 @@ def traced_functions(graph: ParameterGraph) -> Iterator[None]:
                 return function(arguments[0]) / function(arguments[1])
             made = getattr(namespace, name)(*arguments)
             if made.nodes.size == 1:
-                values = [graph.value(int(namespace.asarray(argument).nodes.ravel()[0])) for argument in arguments]
+                values = [
+                    graph.value(int(namespace.asarray(argument).nodes.ravel()[0])) for argument in arguments
+                ]
                 if None not in values:
                     graph.usual.setdefault(int(made.nodes.ravel()[0]), compute(*values))
             return made

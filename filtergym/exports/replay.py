@@ -174,7 +174,11 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     network = None if traced.network is None else _Network(traced.network, dtype)
     own = list(in_range(numpy.array(traced.free.usual), dtype))
     derived = own[: traced.free.kept]
-    given = {INITIAL: replayed.initial, DERIVED: own, STATE: dict(enumerate(derived, len(traced.state) - len(derived)))}
+    given = {
+        INITIAL: replayed.initial,
+        DERIVED: own,
+        STATE: dict(enumerate(derived, len(traced.state) - len(derived))),
+    }
     state = interpret(traced.start, lambda argument, row: given[argument][row], dtype) + derived
     update = _CompiledUpdate(traced, E) if compiled else functools.partial(_interpret_update, traced, dtype)
     answers = []

@@ -611,7 +611,10 @@ class _Derived:
             values[node] = there if abs(there - own) <= max(CLOSE * abs(own), SMALL) else own
             stated |= {node} if values[node] != own else set()
         # Those whose values are stated stand together.
-        parts = [sorted(part, key=lambda node: (node in stated) != last) for part, last in zip(parts, (False, True))]
+        parts = [
+            sorted(part, key=lambda node: (node in stated) != last)
+            for part, last in zip(parts, (False, True), strict=True)
+        ]
         self.nodes = [*parts[0], *parts[1]]
         self.values, self.kept = [values[node] for node in self.nodes], len(parts[0])
         first = sum(node not in stated for node in parts[0])
