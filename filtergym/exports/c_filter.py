@@ -258,8 +258,8 @@ class FilterText:
         functions = {
             "start": (
                 "Begins a track with an initial estimate and parameters; NULL in place of parameters: those of "
-                f"{own}_defaults. Returns {own.upper()}_TAKEN, or {own.upper()}_REFUSED where a parameter is outside its "
-                "limits: the state stays as it was.",
+                f"{own}_defaults. Returns {own.upper()}_TAKEN, or {own.upper()}_REFUSED where a parameter is outside "
+                "its limits: the state stays as it was.",
                 ("state", "initial", "parameters"),
             ),
             "update": (

@@ -54,8 +54,8 @@ def parameter_words(free: FreeParameters) -> str:
         )
     if free.constant:
         text += (
-            " Constant here, since the form of the program depends on them, or they enter through a computation without "
-            f"one, such as that of a matrix equation: {', '.join(free.constant)}."
+            " Constant here, since the form of the program depends on them, or they enter through a computation "
+            f"without one, such as that of a matrix equation: {', '.join(free.constant)}."
         )
     return text
 
@@ -93,7 +93,7 @@ def parameter_text(
     body = [
         f"const {real} *number;",
         f"{real} own[{max(count, 1)}];",
-        f"const int usual = !parameters;" if _stated(free, scalar) else "",
+        "const int usual = !parameters;" if _stated(free, scalar) else "",
         f"if (!parameters) parameters = &{own}_defaults;",
         f"number = (const {real} *)parameters;",
         f"for (int k = 0; k < {len(lengths)}; ++k) {{",

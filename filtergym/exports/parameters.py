@@ -84,7 +84,7 @@ def declaration(task: Task, maker: Any, known: Mapping[str, Tunable], name: str)
         values = tunable.start if tunable is not None else {}
     tuned, taken = [], set()
     arguments = _arguments(maker.make if isinstance(maker, TunedPolicy) else maker)
-    prior = arguments.get("prior")
+    prior: Any = arguments.get("prior")
     described = field_words(type(prior)) if hasattr(prior, "_asdict") else {}
     if tunable is not None:
         for key, (low, high) in tunable.limits.items():
@@ -106,7 +106,7 @@ def _arguments(maker: Any) -> dict[str, Any]:
         maker, given = maker.func, {**maker.keywords, **given}
     if callable(maker):
         given = {one.name: one.default for one in inspect.signature(maker).parameters.values()} | given
-    prior = given.get("prior")
+    prior: Any = given.get("prior")
     return {**(prior._asdict() if hasattr(prior, "_asdict") else {}), **given}
 
 
@@ -126,7 +126,8 @@ def _of_task(parameters: Any) -> Iterator[Declared]:
     words = {
         name: text for base in reversed(type(parameters).__mro__) for name, text in field_words(base).items()
     }
-    for name, (hint, limits) in field_limits(type(parameters)).items():
+    cls: Any = type(parameters)
+    for name, (hint, limits) in field_limits(cls).items():
         value = getattr(parameters, name)
         if value is None or float not in _kinds(hint):
             continue
@@ -233,7 +234,7 @@ class ParameterGraph(Graph):
         name, parts = self.operations[node], self.parts(node)
         if name not in COMPARISONS:
             return False
-        ends = []
+        ends: list[tuple[Any, Any]] = []
         for part in parts:
             if self.values[part] is not None:
                 ends.append((self.values[part], self.values[part]))

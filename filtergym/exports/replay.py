@@ -174,7 +174,7 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
     network = None if traced.network is None else _Network(traced.network, dtype)
     own = list(in_range(numpy.array(traced.free.usual), dtype))
     derived = own[: traced.free.kept]
-    given = {
+    given: dict[int, Any] = {
         INITIAL: replayed.initial,
         DERIVED: own,
         STATE: dict(enumerate(derived, len(traced.state) - len(derived))),

@@ -565,8 +565,8 @@ def _constants_in_place(plain: _Nodes, free: _Nodes) -> dict[int, float]:
     seen = set(waiting)
     while waiting:
         p, q = waiting.pop()
-        if one.values[p] is not None:
-            found.setdefault(q, float(one.values[p]))
+        if (constant := one.values[p]) is not None:
+            found.setdefault(q, float(constant))
         elif one.operations[p] == "take":  # of a table whose entries are chosen one by one where they vary
             table = one.tables[one.arguments[p][0]]
             while other.operations[q] == "where":
@@ -654,7 +654,8 @@ class _Derived:
 
 def _used_parameters(free: Sequence[Declared], used: set[int]) -> tuple[list[Declared], dict[int, int]]:
     """Parameters of which a row is used, and the rows that theirs become."""
-    declared, moved, first = [], {}, 0
+    declared, first = list[Declared](), 0
+    moved: dict[int, int] = {}
     for one in free:
         rows = range(first, first + len(one.values))
         first = rows.stop
