@@ -175,6 +175,7 @@ class ParameterGraph(Graph):
         self.settled: set[int] = set()
         self.usual: dict[int, Any] = {}
         """Values of expressions with the usual parameters, where they are known."""
+        self.ends: dict[int, tuple[float, float] | None] = {}
 
     def rows(self, nodes: Sequence[int]) -> set[int]:
         """Rows of the parameters that expressions depend on."""
@@ -230,23 +231,35 @@ class ParameterGraph(Graph):
         return all(self.operations[part] in EXACT for part in self.live([node]))
 
     def _is_limited(self, node: int, holds: bool) -> bool:
-        """Whether the limits of a parameter alone decide its comparison with a constant."""
-        name, parts = self.operations[node], self.parts(node)
-        if name not in COMPARISONS:
+        """Whether the limits of parameters alone decide a comparison."""
+        name = self.operations[node]
+        ends = [self._ends(part) for part in self.parts(node)]
+        if name not in COMPARISONS or None in ends:
             return False
-        ends: list[tuple[Any, Any]] = []
-        for part in parts:
-            if self.values[part] is not None:
-                ends.append((self.values[part], self.values[part]))
-            elif self.operations[part] == "input":
-                ends.append(self.limits[self.arguments[part][1]])
-            else:
-                return False
-        compare = OPERATIONS[name]
-        if name == "not_equal" or name == "equal":
-            apart = ends[0][1] < ends[1][0] or ends[1][1] < ends[0][0]
-            return apart and holds == (name == "not_equal")
-        return all(bool(compare(one, other)) == holds for one in ends[0] for other in ends[1])
+        one, other = typing.cast("list[tuple[float, float]]", ends)
+        if name in ("equal", "not_equal"):
+            return (one[1] < other[0] or other[1] < one[0]) and holds == (name == "not_equal")
+        return all(bool(OPERATIONS[name](x, y)) == holds for x in one for y in other)
+
+    def _ends(self, node: int) -> tuple[float, float] | None:
+        """Between what an expression is for all parameters within their limits; None: that is not known."""
+        if node not in self.ends:
+            self.ends[node] = self._ends_of_parts(node)
+        return self.ends[node]
+
+    def _ends_of_parts(self, node: int) -> tuple[float, float] | None:
+        name, value = self.operations[node], self.values[node]
+        if value is not None:
+            return float(value), float(value)
+        if name == "input":
+            return self.limits[self.arguments[node][1]]
+        if name not in ("add", "subtract", "multiply"):
+            return None
+        one, other = (self._ends(part) for part in self.parts(node))
+        if one is None or other is None:
+            return None
+        found = [float(OPERATIONS[name](x, y)) for x in one for y in other]
+        return min(found), max(found)
 
 
 def _power(base: float, exponent: float) -> float:
